@@ -1,0 +1,42 @@
+# Two commands are all a newcomer needs: `make demo` and `make test`.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+RUN    := runs/demo
+
+.PHONY: help demo test check format scenes bench clean
+
+help:            ## list the commands
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 18
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "viapoint needs Python 3.11 or newer; name one with: make PYTHON=python3.12")'
+	@echo "making the virtual environment in $(VENV) (once, about two minutes)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(READY)   ## train, evaluate, draw and film an agent
+	@$(BIN)/viapoint demo --out $(RUN)
+
+test: $(READY)   ## the whole test suite
+	@$(BIN)/python -m pytest --numprocesses 2 --quiet
+
+check: $(READY)  ## format, lint and strict types
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+
+format: $(READY) ## let ruff put the source in order
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+scenes: $(READY) ## make the frozen scenes again and compare their hashes
+	@$(BIN)/python -m viapoint.training.make_scenes
+
+bench: $(READY)  ## throughput as ratios
+	@$(BIN)/viapoint bench
+
+clean:           ## remove the virtual environment, caches and runs
+	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

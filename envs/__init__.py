@@ -1,0 +1,1 @@
+"""Gymnasium environments whose actions are via-points and durations."""

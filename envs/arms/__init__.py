@@ -1,0 +1,1 @@
+"""The arms: one record each."""

@@ -1,0 +1,1 @@
+"""Minimum-jerk movements through via-points: numbers in, trajectories out."""

@@ -1,0 +1,1 @@
+"""Learning to place via-points, and measuring how well it was learnt."""
