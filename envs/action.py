@@ -1,0 +1,193 @@
+"""From an action to via-points and durations, and back."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from viapoint import primitives
+
+Array = Any
+Timing = Literal["optimal", "learned"]
+
+LOG_SPLIT = float(np.log(4.0))
+"""What an action of 1 adds to the log ratio of two neighbouring segments' durations: a factor of four."""
+
+
+class Plan(NamedTuple):
+    """A movement as a person would write it down."""
+
+    waypoints: Array
+    """Start, via-points and goal, shape (..., K + 2, D), [m]."""
+    durations: Array
+    """Of the segments between them, shape (..., K + 1), [s]."""
+
+    def take(self, rows: Any) -> Plan:
+        """The movements at `rows`, an index, slice or mask."""
+        return Plan(self.waypoints[rows], self.durations[rows])
+
+    def trajectory(self) -> primitives.Trajectory:
+        """The minimum-jerk movement through the waypoints."""
+        return primitives.through(self.waypoints, self.durations)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionLayout:
+    """What each component of an action means.
+
+    An action is a vector in [-1, 1]^m: for each of K via-points its offset from the k-th of K evenly spaced points of
+    the straight line, in the frame of start and goal; then the duration; then, with `timing="learned"`, how it is
+    split between the segments. The zero action is the straight minimum-jerk movement.
+    """
+
+    dimension: int = 2
+    """Spatial dimension D."""
+    n_via: int = 1
+    """Number of via-points K, 0 or more."""
+    timing: Timing = "optimal"
+    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: the action says."""
+    duration_range: tuple[float, float] = (0.6, 1.2)
+    """Shortest and longest total duration, [s]; an action of 0 is their geometric mean."""
+    via_scale: tuple[float, ...] = (0.15, 0.25, 0.25)
+    """Largest offset along, across and above the straight line, [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        if self.dimension not in (2, 3):
+            raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
+        if not isinstance(self.n_via, int | np.integer) or isinstance(self.n_via, bool) or self.n_via < 0:
+            raise ValueError(f"n_via must be a whole number, 0 or more, got {self.n_via!r}")
+        if self.timing not in get_args(Timing):
+            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
+        check_increasing_pair("duration_range", self.duration_range)
+
+    @property
+    def size(self) -> int:
+        """Number of components m."""
+        return len(self.names)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the components, in order."""
+        axes = ("along", "across", "above")[: self.dimension]
+        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in axes]
+        splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
+        return (*vias, "duration", *splits)
+
+    @functools.cached_property
+    def units(self) -> tuple[str, ...]:
+        """What an action of 1 in each component stands for."""
+        scale = [f"{s:g} m" for s in self.via_scale[: self.dimension]] * self.n_via
+        low, high = self.duration_range
+        splits = ["factor 4 between the segments before and after"] * (
+            self.n_via if self.timing == "learned" else 0
+        )
+        return (*scale, f"factor {(high / low) ** 0.5:.4g} on {self.centre_duration:.4g} s", *splits)
+
+    @property
+    def centre_duration(self) -> float:
+        """Duration of the zero action, [s]."""
+        low, high = self.duration_range
+        return float((low * high) ** 0.5)
+
+    @functools.cached_property
+    def _straight_split(self) -> tuple[float, ...]:
+        """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""
+        waypoints = np.linspace(0.0, 1.0, self.n_via + 2)[:, None]
+        durations = primitives.passage_durations(waypoints, np.asarray(1.0))
+        return tuple(float(r) for r in np.diff(np.log(durations)))
+
+    def decode(self, action: Array, start: Array, goal: Array) -> Plan:
+        """The movement that an action stands for.
+
+        Args:
+            action: Shape (..., m), in [-1, 1].
+            start: Shape (..., D), [m].
+            goal: Shape (..., D), [m], apart from the start.
+        """
+        xp = array_namespace(action, start, goal)
+        line = goal - start
+        axes = frame(line)
+        ends = self.n_via * self.dimension
+        waypoints = [start]
+        for k in range(self.n_via):
+            via = start + line * ((k + 1) / (self.n_via + 1))
+            for i, axis in enumerate(axes):
+                component = k * self.dimension + i
+                via = via + axis * (action[..., component : component + 1] * self.via_scale[i])
+            waypoints.append(via)
+        waypoints.append(goal)
+        duration = self.centre_duration * xp.exp(action[..., ends] * self._log_half_range)
+        points = xp.stack(waypoints, axis=-2)
+        return Plan(points, self._durations(points, duration, action[..., ends + 1 :]))
+
+    def encode(self, plan: Plan) -> Array:
+        """The action that stands for a movement: the inverse of :meth:`decode`.
+
+        Components outside [-1, 1] say that the movement lies outside the action space.
+        """
+        waypoints, durations = plan
+        xp = array_namespace(waypoints, durations)
+        start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
+        line = goal - start
+        components = []
+        for k in range(self.n_via):
+            offset = waypoints[..., k + 1, :] - (start + line * ((k + 1) / (self.n_via + 1)))
+            components += [xp.sum(offset * a, axis=-1) / s for a, s in zip(frame(line), self.via_scale, strict=False)]
+        total = xp.sum(durations, axis=-1)
+        components.append(xp.log(total / self.centre_duration) / self._log_half_range)
+        if self.timing == "learned":
+            ratios = xp.log(durations[..., 1:] / durations[..., :-1])
+            components += [(ratios[..., k] - r) / LOG_SPLIT for k, r in enumerate(self._straight_split)]
+        return xp.stack(components, axis=-1)
+
+    @property
+    def _log_half_range(self) -> float:
+        low, high = self.duration_range
+        return float(np.log(high / low) / 2.0)
+
+    def _durations(self, waypoints: Array, duration: Array, split: Array) -> Array:
+        if self.timing == "optimal":
+            return primitives.passage_durations(waypoints, duration)
+        xp = array_namespace(waypoints, duration)
+        logs = [xp.zeros_like(duration)]
+        for k, ratio in enumerate(self._straight_split):
+            logs.append(logs[-1] + ratio + LOG_SPLIT * split[..., k])
+        shares = xp.exp(xp.stack(logs, axis=-1))
+        return duration[..., None] * shares / xp.sum(shares, axis=-1, keepdims=True)
+
+
+def frame(line: Array) -> list[Array]:
+    """Unit vectors along a line, across it (to its left, horizontal) and above it, each of shape (..., D).
+
+    In space a vertical line has no left; the x axis stands in.
+    """
+    xp = array_namespace(line)
+    along = line / xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
+    x, y = along[..., 0], along[..., 1]
+    if line.shape[-1] == 2:
+        return [along, xp.stack((-y, x), axis=-1)]
+    level = xp.sqrt(x * x + y * y)
+    vertical = level < 1e-9
+    safe = xp.where(vertical, xp.ones_like(level), level)
+    zero = xp.zeros_like(level)
+    left_x = xp.where(vertical, xp.ones_like(level), -y / safe)
+    left_y = xp.where(vertical, zero, x / safe)
+    across = xp.stack((left_x, left_y, zero), axis=-1)
+    z = along[..., 2]
+    above = xp.stack((-z * left_y, z * left_x, x * left_y - y * left_x), axis=-1)
+    return [along, across, above]
+
+
+def check_increasing_pair(name: str, pair: Any) -> None:
+    """Refuse anything but two positive finite numbers in increasing order."""
+    try:
+        low, high = (float(value) for value in pair)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be two numbers, got {pair!r}") from None
+    if not (0.0 < low < high < float("inf")):
+        raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")

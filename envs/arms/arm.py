@@ -1,0 +1,52 @@
+"""What the environment needs to know of an arm."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import mujoco
+
+Array = Any
+"""A NumPy array or a torch tensor; what comes in decides what goes out."""
+
+
+class Arm(Protocol):
+    """An arm: its size, its reach, its two kinematic directions and its inverse side.
+
+    The kinematic functions are batched over leading dimensions and accept NumPy arrays and torch tensors.
+    Positions are in the frame of the arm's base, which is the world's.
+    """
+
+    name: str
+    dimension: int
+    """Spatial dimension D of the hand's movement: 2 or 3."""
+    hand_radius: float
+    """Radius of the sphere that is the hand, [m]."""
+    link_radii: tuple[float, ...]
+    """Radii of the L link capsules, [m]."""
+    joint_range: tuple[tuple[float, float], ...]
+    """Lowest and highest angle of each of the J joints, [rad]."""
+
+    workspace: tuple[tuple[float, ...], tuple[float, ...]]
+    """Two opposite corners of the box in which movements start and end, [m]."""
+
+    def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
+        """The MuJoCo model of the arm with `n_obstacles` movable capsules.
+
+        `whole_arm`: every link collides with the obstacles, not the hand alone.
+        """
+
+    def hand(self, joints: Array) -> Array:
+        """Hand position, shape (..., D), [m], at `joints`, shape (..., J), [rad]."""
+
+    def links(self, joints: Array) -> Array:
+        """End points of the links' axes, shape (..., L, 2, D), [m], at `joints`, shape (..., J), [rad]."""
+
+    def posture(self, hand: Array) -> Array:
+        """Joint angles, shape (..., J), [rad], that put the hand at `hand`, shape (..., D), [m]."""
+
+    def reach_margin(self, hand: Array) -> Array:
+        """How far inside its reach the hand is, shape (...,), [m]; negative where no posture gets there."""
+
+    def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Actuator controls, shape (..., U), that make the hand follow the references, each of shape (..., D)."""

@@ -1,0 +1,240 @@
+"""Two joints in the horizontal plane: shoulder and elbow."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import mujoco
+import numpy as np
+from array_api_compat import array_namespace
+
+Array = Any
+
+
+
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanarArm:
+    """An arm of two links, described by numbers; see :class:`~viapoint.envs.arms.arm.Arm` for the functions.
+
+    The elbow bends one way only, so a hand position has one posture.
+    Every number is read from the MJCF file, where its source stands.
+    """
+
+    name: str
+    model_file: str
+    lengths: tuple[float, float]
+    """Shoulder to elbow and elbow to handle, [m]."""
+    masses: tuple[float, float]
+    """Of the two links, [kg]."""
+    centres: tuple[float, float]
+    """From each link's proximal joint to its centre of mass, [m]."""
+    inertias: tuple[float, float]
+    """About each link's centre of mass, [kg m^2]."""
+    viscosity: tuple[float, float]
+    """Of the joints, [N m s/rad]."""
+    torque_limit: tuple[float, float]
+    """[N m]."""
+    joint_range: tuple[tuple[float, float], ...]
+    hand_radius: float
+    link_radii: tuple[float, ...]
+    workspace: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.45, 0.15), (0.35, 0.60))
+    bandwidth: float = 40.0
+    """Natural frequency of the joints' servo, critically damped, [rad/s]."""
+    dimension: int = 2
+
+    @classmethod
+    def from_file(cls, model_file: str) -> PlanarArm:
+        """The record of the arm in an MJCF file of the package's `assets`."""
+        model = _read(model_file).compile()
+        joints = [model.joint(name) for name in ("shoulder", "elbow")]
+        links = [model.body(name) for name in ("upper_arm", "forearm")]
+        return cls(
+            name=model_file.removesuffix(".xml"),
+            model_file=model_file,
+            lengths=(float(links[1].pos[0]), float(model.site("hand").pos[0])),
+            masses=_pair(link.mass[0] for link in links),
+            centres=_pair(link.ipos[0] for link in links),
+            inertias=_pair(link.inertia[2] for link in links),
+            viscosity=_pair(joint.damping[0] for joint in joints),
+            torque_limit=_pair(model.actuator(name).forcerange[1] for name in ("shoulder", "elbow")),
+            joint_range=tuple((float(j.range[0]), float(j.range[1])) for j in joints),
+            hand_radius=float(model.geom("hand").size[0]),
+            link_radii=_pair(model.geom(name).size[0] for name in ("upper_arm", "forearm")),
+        )
+
+    @functools.cached_property
+    def _inertia(self) -> tuple[float, float, float]:
+        """The constants A, B, C of the mass matrix [[A + 2 B cos, C + B cos], [C + B cos, C]], [kg m^2]."""
+        (m1, m2), (r1, r2), (i1, i2) = self.masses, self.centres, self.inertias
+        elbow = i2 + m2 * r2**2
+        return i1 + m1 * r1**2 + m2 * self.lengths[0] ** 2 + elbow, m2 * self.lengths[0] * r2, elbow
+
+    @functools.cached_property
+    def stiffness(self) -> tuple[float, float]:
+        """Of the joints' servo at the posture of greatest inertia, [N m/rad]."""
+        a, b, c = self._inertia
+        return (a + 2.0 * b) * self.bandwidth**2, c * self.bandwidth**2
+
+    @functools.cached_property
+    def damping(self) -> tuple[float, float]:
+        """Of the joints' servo, critical together with the joints' viscosity, [N m s/rad]."""
+        return _pair(2.0 * k / self.bandwidth - v for k, v in zip(self.stiffness, self.viscosity, strict=True))
+
+    @functools.cached_property
+    def reach(self) -> tuple[float, float]:
+        """Least and greatest distance of the hand from the shoulder, [m]."""
+        low, high = self.joint_range[1]
+        upper, fore = self.lengths
+        near, far = (upper**2 + fore**2 + 2 * upper * fore * np.cos([high, low])) ** 0.5
+        return float(near), float(far)
+
+    def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
+        """See :meth:`viapoint.envs.arms.arm.Arm.compile`."""
+        spec = _read(self.model_file)
+        if whole_arm:
+            _lower_into_plane(spec)
+        for actuator, stiffness, damping in zip(spec.actuators, self.stiffness, self.damping, strict=True):
+            actuator.biasprm[1:3] = -stiffness, -damping
+        for geom in (spec.geom("upper_arm"), spec.geom("forearm")):
+            geom.contype = int(whole_arm)
+        for row in range(n_obstacles):
+            _add_obstacle(spec, row)
+        return spec.compile()
+
+    def hand(self, joints: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.arm.Arm.hand`."""
+        xp = array_namespace(joints)
+        upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
+        l1, l2 = self.lengths
+        return xp.stack((l1 * xp.cos(upper) + l2 * xp.cos(both), l1 * xp.sin(upper) + l2 * xp.sin(both)), axis=-1)
+
+    def links(self, joints: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
+        xp = array_namespace(joints)
+        upper = joints[..., 0]
+        elbow = self.lengths[0] * xp.stack((xp.cos(upper), xp.sin(upper)), axis=-1)
+        shoulder = xp.zeros_like(elbow)
+        ends = (xp.stack((shoulder, elbow), axis=-2), xp.stack((elbow, self.hand(joints)), axis=-2))
+        return xp.stack(ends, axis=-3)
+
+    def posture(self, hand: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.arm.Arm.posture`; out of reach, the elbow is as straight or bent as it goes."""
+        return self._postures(hand)[0]
+
+    def reach_margin(self, hand: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.arm.Arm.reach_margin`.
+
+        The least of the distances to the inner and outer circle of the reach and, as arcs, to the shoulder's limits.
+        """
+        xp = array_namespace(hand)
+        distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
+        near, far = self.reach
+        low, high = self.joint_range[0]
+        shoulder = self.posture(hand)[..., 0]
+        arc = xp.minimum(shoulder - low, high - shoulder) * distance
+        return xp.minimum(xp.minimum(distance - near, far - distance), arc)
+
+    def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Computed torque: see :meth:`viapoint.envs.arms.arm.Arm.controls`.
+
+        The actuator's torque is control - stiffness x angle - damping x velocity, limited to `torque_limit`. So the
+        control carries the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
+        """
+        xp = array_namespace(position)
+        joints, upper_arm, forearm, sine = self._postures(position)
+        rates = self._rates(position, upper_arm, forearm, sine, velocity)
+        centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
+        pull = tuple(
+            acceleration[..., i] + centripetal[0] * upper_arm[i] + centripetal[1] * forearm[i] for i in (0, 1)
+        )
+        accelerations = self._rates(position, upper_arm, forearm, sine, xp.stack(pull, axis=-1))
+        cosine = upper_arm[0] * forearm[0] + upper_arm[1] * forearm[1]
+        torques = self._torques(cosine, sine, rates, accelerations)
+        return xp.stack(
+            [
+                torques[i]
+                + self.stiffness[i] * joints[..., i]
+                + (self.damping[i] + self.viscosity[i]) * rates[i]
+                for i in (0, 1)
+            ],
+            axis=-1,
+        )
+
+    def _postures(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
+        """Joint angles, unit vectors along upper arm and forearm, and the sine of the elbow angle."""
+        xp = array_namespace(hand)
+        l1, l2 = self.lengths
+        low, high = self.joint_range[1]
+        x, y = hand[..., 0], hand[..., 1]
+        cosine = (x * x + y * y - (l1**2 + l2**2)) * (0.5 / (l1 * l2))
+        cosine = xp.clip(cosine, float(np.cos(high)), float(np.cos(low)))
+        sine = xp.sqrt(1.0 - cosine * cosine)
+        along, across = l1 + l2 * cosine, l2 * sine
+        scale = 1.0 / (along * along + across * across)
+        c1, s1 = (along * x + across * y) * scale, (along * y - across * x) * scale
+        joints = xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine)), axis=-1)
+        return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
+
+    def _rates(
+        self, hand: Array, upper_arm: tuple[Array, Array], forearm: tuple[Array, Array], sine: Array, rate: Array
+    ) -> tuple[Array, Array]:
+        """Joint rates that give the hand `rate`: the inverse of the Jacobian, applied."""
+        l1, l2 = self.lengths
+        scale = 1.0 / (l1 * sine)
+        shoulder = (forearm[0] * rate[..., 0] + forearm[1] * rate[..., 1]) * scale
+        elbow = -(hand[..., 0] * rate[..., 0] + hand[..., 1] * rate[..., 1]) * (scale / l2)
+        return shoulder, elbow
+
+    def _torques(
+        self, cosine: Array, sine: Array, rates: tuple[Array, Array], accelerations: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Inverse dynamics of the two links without viscosity, [N m]."""
+        a, b, c = self._inertia
+        coupling = c + b * cosine
+        coriolis = b * sine
+        shoulder = (
+            (a + 2.0 * b * cosine) * accelerations[0]
+            + coupling * accelerations[1]
+            - coriolis * rates[1] * (2.0 * rates[0] + rates[1])
+        )
+        elbow = coupling * accelerations[0] + c * accelerations[1] + coriolis * rates[0] ** 2
+        return shoulder, elbow
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    first, second = values
+    return float(first), float(second)
+
+
+def _read(model_file: str) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string((files("viapoint.envs") / "assets" / model_file).read_text(encoding="utf-8"))
+
+
+def _lower_into_plane(spec: mujoco.MjSpec) -> None:
+    """Put links and hand at the height of the obstacles, so that all of them collide."""
+    spec.body("upper_arm").pos[2] = 0.0
+    for handle in (spec.geom("hand"), spec.site("hand")):
+        handle.pos[2] = 0.0
+
+
+def _add_obstacle(spec: mujoco.MjSpec, row: int) -> None:
+    """A capsule of no fixed place, size or direction: the simulator sets them for each simulation."""
+    body = spec.worldbody.add_body(name=f"obstacle_{row}", mocap=True, pos=(0.0, 0.0, -10.0))
+    body.add_geom(
+        name=f"obstacle_{row}",
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=(0.02, 0.02, 0.0),
+        contype=0,
+        conaffinity=1,
+        condim=1,
+        rgba=(0.83, 0.52, 0.30, 1.0),
+    )
+
+
+ADULT = PlanarArm.from_file("planar.xml")
+"""An adult's right arm, its shoulder at the origin, x to the right and y forwards."""

@@ -1,0 +1,161 @@
+"""Carrying plans out: references, controls, physics, outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.action import Plan
+from viapoint.envs.clearance import FAR
+from viapoint.envs.outcome import Outcome, blank, least_clearance, measure, norm, refused
+from viapoint.envs.scenes import Scenes
+from viapoint.envs.simulator import Record, Simulator
+
+Float = NDArray[np.float64]
+T = TypeVar("T")
+R = TypeVar("R")
+
+SETTLING = 0.1
+"""Time after the movement in which the hand must come to rest, [s]."""
+GROUP = 64
+"""Movements carried out together: few enough for the cache, many enough for the threads."""
+
+
+class Rollout(NamedTuple):
+    """One movement at its T physics steps."""
+
+    time: Float
+    """Shape (T,), [s]."""
+    planned: Float
+    """Hand positions of the plan, shape (T, D), [m]."""
+    joints: Float
+    """Shape (T, J), [rad]."""
+    hand: Float
+    """Shape (T, D), [m]."""
+    contact: NDArray[np.bool_]
+    """Whether the arm touched an obstacle at the state before the step, shape (T,)."""
+    clearance: Float
+    """From the nearest obstacle, shape (T,), [m]."""
+
+
+class References(NamedTuple):
+    """Plans of one group at the physics rate, ready for the arm."""
+
+    sims: NDArray[np.int64]
+    """The simulations, shape (n,)."""
+    steps: NDArray[np.int64]
+    """Physics steps of each, shape (n,)."""
+    planned: Float
+    """Hand position after each step, shape (n, T, D), [m]."""
+    controls: Float
+    """Shape (n, T, U)."""
+    reachable: NDArray[np.bool_]
+    """Shape (n,)."""
+    jerk_cost: Float
+    """Shape (n,), [m^2/s^5]."""
+
+
+class Executor:
+    """Carries out plans in a simulator, in groups of similar length so that short movements cost less."""
+
+    def __init__(self, simulator: Simulator, *, whole_arm: bool, threads: int) -> None:
+        self.simulator = simulator
+        self.arm = simulator.arm
+        self.whole_arm = whole_arm
+        self._threads = threads
+        self._pool: ThreadPoolExecutor | None = None
+        self._groups: list[References] = []
+        self._records: list[Record | None] = []
+
+    def __call__(self, plan: Plan, scenes: Scenes) -> Outcome:
+        """Carry out one plan in each simulation, which must have been placed at its start."""
+        duration = np.asarray(plan.durations.sum(axis=-1))
+        steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
+        order = np.argsort(steps, kind="stable")
+        groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
+        self._groups = self._map(lambda sims: self._refer(sims, steps[sims], plan), groups)
+        self._records = [self._simulate(group) for group in self._groups]
+        outcomes = self._map(lambda i: self._measure(i, scenes), list(range(len(groups))))
+        together = blank(len(duration))
+        for group, outcome in zip(self._groups, outcomes, strict=True):
+            for mine, theirs in zip(together, outcome, strict=True):
+                mine[group.sims] = theirs
+        straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
+        jerk_ratio = np.maximum(together.jerk_cost / straight, 1.0)
+        return together._replace(duration=duration, jerk_ratio=jerk_ratio)
+
+    def final_joints(self, scenes: Scenes) -> Float:
+        """Where the arms ended, shape (N, J), [rad]."""
+        joints = np.array(self.arm.posture(scenes.start))
+        for group, record in zip(self._groups, self._records, strict=True):
+            if record is not None:
+                run = group.reachable
+                joints[group.sims[run]] = record.joints[np.arange(run.sum()), group.steps[run] - 1]
+        return joints
+
+    def rollout(self, sim: int, scenes: Scenes) -> Rollout:
+        """The last movement of one simulation, step by step; `scenes` are those it took place in."""
+        index = next(i for i, group in enumerate(self._groups) if sim in group.sims)
+        group, record = self._groups[index], self._records[index]
+        row = int(np.flatnonzero(group.sims == sim)[0])
+        steps, scene = int(group.steps[row]), scenes.take([sim])
+        joints = np.repeat(np.asarray(self.arm.posture(scene.start)), steps, axis=0)
+        contact = np.zeros(steps, dtype=bool)
+        if record is not None and group.reachable[row]:
+            ran = int(group.reachable[:row].sum())
+            joints, contact = record.joints[ran, :steps].copy(), record.contact[ran, :steps].copy()
+        hand = np.asarray(self.arm.hand(joints))
+        each = Scenes(*(np.repeat(field, steps, axis=0) for field in scene))
+        clearance = least_clearance(self.arm, joints[:, None], hand[:, None], each, whole_arm=self.whole_arm)
+        time = self.simulator.timestep * np.arange(1, steps + 1)
+        return Rollout(time, group.planned[row, :steps].copy(), joints, hand, contact, clearance)
+
+    def close(self) -> None:
+        """Let the threads go."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def _map(self, function: Callable[[T], R], items: list[T]) -> list[R]:
+        """`function` of each item, on the threads where there is more than one of both."""
+        if len(items) < 2 or self._threads == 1:
+            return [function(item) for item in items]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self._threads or None, thread_name_prefix="viapoint")
+        return list(self._pool.map(function, items))
+
+    def _refer(self, sims: NDArray[np.int64], steps: NDArray[np.int64], plan: Plan) -> References:
+        """References at the physics rate, and the controls that follow them."""
+        trajectory = plan.take(sims).trajectory()
+        time = self.simulator.timestep * np.arange(steps.max() + 1)
+        position, velocity, acceleration = (trajectory(time, nu) for nu in (0, 1, 2))
+        reachable = (self.arm.reach_margin(position) >= 0.0).all(axis=-1)
+        controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])
+        return References(sims, steps, position[:, 1:], controls, reachable, np.asarray(trajectory.cost()))
+
+    def _simulate(self, group: References) -> Record | None:
+        run = group.reachable
+        return self.simulator.rollout(group.sims[run], group.controls[run]) if run.any() else None
+
+    def _measure(self, index: int, scenes: Scenes) -> Outcome:
+        """The outcome of one group, but for duration and jerk ratio."""
+        group, record = self._groups[index], self._records[index]
+        scene, run = scenes.take(group.sims), group.reachable
+        outcome = refused(scene, self.arm, whole_arm=self.whole_arm)
+        if record is not None:
+            done = measure(
+                record,
+                group.steps[run],
+                group.planned[run],
+                scene.take(run),
+                self.arm,
+                whole_arm=self.whole_arm,
+                timestep=self.simulator.timestep,
+            )
+            for mine, theirs in zip(outcome, done, strict=True):
+                mine[run] = theirs
+        return outcome._replace(jerk_cost=group.jerk_cost)

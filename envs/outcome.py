@@ -1,0 +1,137 @@
+"""What came of a movement."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.clearance import FAR, arm_clearance, hand_clearance
+from viapoint.envs.scenes import Scenes
+from viapoint.envs.simulator import Record
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+GOAL_TOLERANCE = 0.01
+"""Greatest distance from the goal that counts as success, [m]."""
+REST_SPEED = 0.02
+"""Greatest hand speed at the end that counts as rest, [m/s]."""
+LIMIT_TOLERANCE = 1e-3
+"""How far MuJoCo's soft limits may give way, [rad]."""
+
+
+class Outcome(NamedTuple):
+    """What came of N movements, shape (N,) each."""
+
+    is_success: Bool
+    """No contact, joint limits kept, at rest within 1 cm of the goal after the settling time."""
+    collision: Bool
+    """Contact at any physics step."""
+    first_contact_time: Float
+    """[s]; -1 without contact."""
+    min_clearance: Float
+    """[m], exact, over all physics steps; at most 1."""
+    goal_error: Float
+    """[m], after the settling time."""
+    duration: Float
+    """[s], planned."""
+    path_length: Float
+    """[m], of the hand."""
+    jerk_cost: Float
+    """Half the integral of the planned squared jerk, [m^2/s^5]."""
+    jerk_ratio: Float
+    """Jerk cost relative to the straight movement's of the same duration."""
+    peak_speed: Float
+    """[m/s], of the hand."""
+    tracking_error: Float
+    """[m], root mean square of hand minus plan."""
+    reachable: Bool
+    """Whether the whole plan is within the arm's reach; if not, the arm does not start."""
+    unstable: Bool
+    """Whether the physics broke down."""
+
+
+def measure(
+    record: Record, steps: NDArray[np.int64], planned: Float, scenes: Scenes, arm: Arm, *, whole_arm: bool, timestep: float
+) -> Outcome:
+    """The outcome of n movements that were carried out, all but what the plan alone decides.
+
+    Args:
+        record: Of T physics steps.
+        steps: How many of them belong to each movement, shape (n,).
+        planned: Hand position of the plan after each step, shape (n, T, D), [m].
+        scenes: Where they took place.
+        arm: That moved.
+        whole_arm: Whether its links count.
+        timestep: Of the physics, [s].
+    """
+    after = np.arange(record.joints.shape[1]) >= steps[:, None]
+    last = np.arange(len(steps)), steps - 1
+    joints, contact = record.joints, record.contact
+    if after.any():
+        joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
+    hand = np.asarray(arm.hand(joints))
+    moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
+    deviation = np.where(after, 0.0, ((hand - planned) ** 2).sum(axis=-1))
+    low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
+    within = (joints.min(axis=1) >= low - LIMIT_TOLERANCE) & (joints.max(axis=1) <= high + LIMIT_TOLERANCE)
+    goal_error = norm(hand[last] - scenes.goal)
+    collision = contact.any(axis=-1)
+    at_rest = moved[last] < REST_SPEED * timestep
+    arrived = at_rest & (goal_error < GOAL_TOLERANCE)
+    return blank(len(steps))._replace(
+        is_success=arrived & ~collision & ~record.unstable & within.all(axis=-1),
+        collision=collision,
+        first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
+        min_clearance=least_clearance(arm, joints, hand, scenes, whole_arm=whole_arm),
+        goal_error=goal_error,
+        path_length=moved.sum(axis=-1),
+        peak_speed=moved.max(axis=-1) / timestep,
+        tracking_error=np.sqrt(deviation.sum(axis=-1) / steps),
+        reachable=np.ones(len(steps), dtype=bool),
+        unstable=record.unstable,
+    )
+
+
+def refused(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
+    """The outcome of plans out of the arm's reach: it stays at rest at the start."""
+    joints = np.asarray(arm.posture(scenes.start))[:, None]
+    return blank(len(joints))._replace(
+        min_clearance=least_clearance(arm, joints, scenes.start[:, None], scenes, whole_arm=whole_arm),
+        goal_error=norm(scenes.goal - scenes.start),
+    )
+
+
+def blank(number: int) -> Outcome:
+    """`number` movements of which nothing is known."""
+    fields: dict[str, Any] = {name: np.zeros(number) for name in Outcome._fields}
+    for name in ("is_success", "collision", "reachable", "unstable"):
+        fields[name] = np.zeros(number, dtype=bool)
+    return Outcome(**{**fields, "first_contact_time": np.full(number, -1.0)})
+
+
+def least_clearance(arm: Arm, joints: Float, hand: Float, scenes: Scenes, *, whole_arm: bool) -> Float:
+    """Least clearance over time and obstacles, shape (N,), [m].
+
+    Args:
+        arm: That moves.
+        joints: Shape (N, T, J), [rad].
+        hand: Its positions there, shape (N, T, D), [m].
+        scenes: N of them.
+        whole_arm: Whether the links count.
+    """
+    if not scenes.obstacles.shape[1]:
+        return np.full(len(joints), FAR)
+    present = scenes.present
+    each = hand_clearance(hand, arm.hand_radius, scenes.obstacles, present)
+    if whole_arm:
+        each = np.minimum(each, arm_clearance(arm.links(joints), arm.link_radii, scenes.obstacles, present))
+    return np.asarray(each.min(axis=-1))
+
+
+def norm(vectors: Float) -> Float:
+    """Euclidean length along the last axis."""
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1)))

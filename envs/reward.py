@@ -1,0 +1,102 @@
+"""What a movement is worth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.outcome import Outcome
+
+Float = NDArray[np.float64]
+
+CLEARANCE_RANGE = (-0.05, 0.01)
+"""Clearance beyond which nothing more is lost or won, [m]."""
+CLEARANCE_UNIT = 0.05
+"""[m]."""
+GOAL_ERROR_UNIT = 0.1
+"""Goal error at which all is lost, [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeights:
+    """How much each term counts, 0 or more."""
+
+    success: float = 1.0
+    """+ 1[success]."""
+    collision: float = 0.5
+    """- 1[contact at any physics step]."""
+    clearance: float = 0.5
+    """+ clip(min_clearance, -0.05 m, 0.01 m) / 0.05 m."""
+    goal_error: float = 0.5
+    """- min(goal_error / 0.1 m, 1)."""
+    smoothness: float = 0.05
+    """- log(jerk cost / jerk cost of the zero action), never less than 0 for the same duration."""
+    duration: float = 0.25
+    """- (duration / duration of the zero action - 1)."""
+
+    def __post_init__(self) -> None:
+        """Refuse a weight that turns its term round."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
+                raise ValueError(f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}")
+
+    @classmethod
+    def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:
+        """Weights from a record, from a mapping of some of them, or the defaults."""
+        if isinstance(weights, RewardWeights):
+            return weights
+        given = dict(weights or {})
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(given) - set(known))
+        if unknown:
+            raise ValueError(f"reward_weights knows {', '.join(known)}, not {', '.join(map(repr, unknown))}")
+        return cls(**given)
+
+
+class RewardTerms(NamedTuple):
+    """The weighted terms, shape (N,) each; the reward is their sum."""
+
+    success: Float
+    collision: Float
+    clearance: Float
+    goal_error: Float
+    smoothness: Float
+    duration: Float
+
+    def total(self) -> Float:
+        """The reward, shape (N,): the terms added in order."""
+        return np.asarray(sum(self))
+
+    def as_info(self) -> dict[str, Any]:
+        """The terms as `reward_*`."""
+        return {f"reward_{name}": term for name, term in self._asdict().items()}
+
+
+def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeights) -> RewardTerms:
+    """The weighted terms of movements.
+
+    Every term is bounded, so that no movement outweighs all others. With the default weights a crash is worth less
+    than a movement that the arm refuses, and that less than any success; and among straight movements the one of the
+    centre duration is best: there a longer one costs as much time as it saves jerk.
+
+    Args:
+        outcome: Of N movements.
+        centre_duration: Duration of the zero action, [s].
+        weights: Of the terms.
+    """
+    relative = outcome.duration / centre_duration
+    log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
+    return RewardTerms(
+        success=weights.success * outcome.is_success,
+        collision=-weights.collision * outcome.collision,
+        clearance=weights.clearance * np.clip(outcome.min_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
+        goal_error=-weights.goal_error * np.minimum(outcome.goal_error / GOAL_ERROR_UNIT, 1.0),
+        smoothness=-weights.smoothness * log_jerk,
+        duration=-weights.duration * (relative - 1.0),
+    )

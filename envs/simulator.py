@@ -1,0 +1,125 @@
+"""Many simulations of one arm among obstacles, run by one call into C."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import batch
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.arm import Arm
+
+Float = NDArray[np.float64]
+
+OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
+"""Where an absent obstacle waits, [m]."""
+
+
+class Record(NamedTuple):
+    """What a rollout of n simulations over T physics steps left behind."""
+
+    joints: Float
+    """Angles after each step, shape (n, T, J), [rad]."""
+    contact: NDArray[np.bool_]
+    """Whether arm and obstacle touched at the state before each step, shape (n, T)."""
+    unstable: NDArray[np.bool_]
+    """Whether MuJoCo raised a warning, shape (n,); such a simulation stopped there."""
+
+
+class Simulator:
+    """MuJoCo's batch engine with the arm in its posture and capsules of any place and size around it."""
+
+    def __init__(self, arm: Arm, *, n_obstacles: int, whole_arm: bool, num_envs: int, threads: int) -> None:
+        """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
+        self.arm = arm
+        self.model = arm.compile(n_obstacles, whole_arm)
+        self.physics_steps = 0
+        """Physics steps simulated so far, all simulations together."""
+        self._batch = batch.Batch(self.model, num_envs, threads)
+        self._rest_state = self._batch.state[0].copy()
+        self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
+        if n_obstacles:
+            self._sizes = self._batch.expand("geom_size")
+            self._bounds = self._batch.expand("geom_rbound")
+            self._boxes = self._batch.expand("geom_aabb")
+
+    @property
+    def timestep(self) -> float:
+        """Length of a physics step, [s]."""
+        return float(self.model.opt.timestep)
+
+    def place(self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]) -> None:
+        """Put arms at rest and obstacles where they belong.
+
+        Args:
+            sims: The simulations, shape (n,).
+            joints: Shape (n, J), [rad].
+            obstacles: Rows (centre D, half-axis D, radius), shape (n, rows, 2 D + 1), [m].
+            present: Whether a row is an obstacle, shape (n, rows).
+        """
+        self._batch.state[sims] = self._rest_state
+        self._batch.bind("qpos")[sims] = joints
+        if not self._geoms:
+            return
+        dimension = (obstacles.shape[-1] - 1) // 2
+        centre = _in_space(obstacles[..., :dimension])
+        axis = _in_space(obstacles[..., dimension : 2 * dimension])
+        half = np.sqrt((axis * axis).sum(axis=-1))
+        radius = obstacles[..., -1]
+        self._batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
+        self._batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
+        self._resize(sims, np.where(present, radius, 0.01), np.where(present, half, 0.0))
+
+    def rollout(self, sims: NDArray[np.int64], controls: Float) -> Record:
+        """Run simulations under controls, all for the same number of steps.
+
+        Args:
+            sims: The simulations in increasing order, shape (n,).
+            controls: Shape (n, T, U).
+        """
+        steps = controls.shape[1]
+        warnings = self._warnings(sims)
+        out = self._batch.rollout(steps, controls, record=("qpos", "ncon"), ids=sims)
+        self.physics_steps += steps * len(sims)
+        return Record(out["qpos"], out["ncon"] > 0, (self._warnings(sims) > warnings) | ~_finite(out["qpos"]))
+
+    def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of one simulation with the arm at `joints`, to draw them."""
+        model, data = self._batch.get_model(sim), self._batch.get_data(sim)
+        data.qpos[:] = joints
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def _warnings(self, sims: NDArray[np.int64]) -> Any:
+        return self._batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
+
+    def _resize(self, sims: NDArray[np.int64], radius: Float, half: Float) -> None:
+        """Set the sizes of the capsules and everything that MuJoCo derived from them when it compiled the model."""
+        rows = np.ix_(sims, self._geoms)
+        length = half + radius
+        self._sizes[rows] = np.stack((radius, half, np.zeros_like(half)), axis=-1)
+        self._bounds[rows] = length
+        self._boxes[rows] = np.stack((*[np.zeros_like(half)] * 3, radius, radius, length), axis=-1)
+
+
+def _in_space(vectors: Float) -> Float:
+    """Vectors of the plane as vectors of space, at height zero; those of space as they are."""
+    if vectors.shape[-1] == 3:
+        return vectors
+    return np.concatenate((vectors, np.zeros_like(vectors[..., :1])), axis=-1)
+
+
+def _turn_up_to(axis: Float, half: Float) -> Float:
+    """Quaternion that turns the z axis, along which MuJoCo lays its capsules, towards `axis`."""
+    lying = half > 1e-9
+    unit = np.where(lying[..., None], axis / np.where(lying, half, 1.0)[..., None], (0.0, 0.0, 1.0))
+    unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction
+    x, y, z = (unit[..., i] for i in range(3))
+    norm = np.sqrt(2.0 * (1.0 + z))
+    return np.stack(((1.0 + z) / norm, -y / norm, x / norm, np.zeros_like(z)), axis=-1)
+
+
+def _finite(joints: Float) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(joints).all(axis=(1, 2)))
