@@ -1,0 +1,102 @@
+"""Free passage times of any number of via-points: damped Newton on the logarithm of the reduced jerk cost.
+
+The durations are h_i = exp(z_i) / sum_j exp(z_j) in unit total time, positive by construction; the logarithm of the cost spans
+few units where the cost spans decades. Rest to rest only one minimum has ever been seen; with moving ends there can be
+several, so that case starts from several points and compares.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ._newton import Floats, Minima, minimise
+from ._passage_cost import PassageCost
+
+_STARTS = 10
+"""Starts with moving ends: even, by chord, and eight drawn from the flat Dirichlet distribution with a fixed seed."""
+
+
+def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
+    """Fractions of the duration per segment, (N, S), and whether the iteration converged, (N,)."""
+    starts = _starts(cost.steps, several)
+    best, fractions = None, None
+    for start in starts:
+        minima = _from_start(cost, start)
+        found = _softmax(minima.z)
+        if best is None:
+            best, fractions = minima, found
+        else:
+            # A later start must be better by more than rounding, else ties would be decided by noise.
+            better = (minima.value < best.value - 1e-9) & (minima.converged | ~best.converged)
+            fractions = np.where(better, found, fractions)
+            best = Minima(
+                np.where(better, minima.z, best.z),
+                np.where(better, minima.value, best.value),
+                np.where(better, minima.converged, best.converged),
+            )
+    assert best is not None and fractions is not None
+    return np.ascontiguousarray(fractions.T), best.converged
+
+
+def _from_start(cost: PassageCost, start: Floats) -> Minima:
+    reference = 1e-3 * cost.scale()
+
+    def evaluate(z: Floats, items: Any) -> tuple[Floats, Floats, Floats]:
+        return log_cost(cost.chosen(items), z, reference[items])
+
+    return minimise(evaluate, np.log(start))
+
+
+def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
+    """log(J + reference) with gradient and Hessian with respect to z; the Hessian's null direction (1, ..., 1) is filled."""
+    h = _softmax(z)
+    j, first, second = cost.derivatives(h)
+    scale = 1.0 / (j + reference)
+    first = first * h * scale
+    mean = first[0]
+    for row in first[1:]:
+        mean = mean + row
+    gradient = first - h * mean
+    # d2J/dz2 = M^T J_hh M + sum_i J_i d2h_i/dz2 with M = diag(h) - h h^T, written out.
+    curved = scale * second * h * h[:, None]
+    along = curved[0]
+    for row in curved[1:]:
+        along = along + row
+    both = along[0]
+    for entry in along[1:]:
+        both = both + entry
+    hessian = curved - _outer(h, along) - _outer(along, h) + both * _outer(h, h)
+    hessian = hessian - _outer(h, first) - _outer(first, h) + 2.0 * mean * _outer(h, h)
+    for i in range(len(h)):
+        hessian[i, i] += first[i] - h[i] * mean
+    return np.log(j + reference), gradient, hessian - _outer(gradient, gradient) + 1.0
+
+
+def _outer(p: Floats, q: Floats) -> Floats:
+    return p[:, None] * q[None, :]
+
+
+def _softmax(z: Floats) -> Floats:
+    largest = z.max(axis=0)
+    h = np.exp(z - largest)
+    total = h[0]
+    for row in h[1:]:
+        total = total + row
+    return h / total
+
+
+def _starts(steps: Floats, several: bool) -> list[Floats]:
+    """Durations to start from, each (S, N)."""
+    square = steps[:, 0] * steps[:, 0]
+    for d in range(1, steps.shape[1]):
+        square = square + steps[:, d] * steps[:, d]
+    chord = np.cbrt(np.sqrt(square))
+    starts = [chord / chord.max(axis=0)]
+    if several:
+        segments, count = chord.shape
+        starts.append(np.ones_like(chord))
+        drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
+        starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
+    return [start / start.sum(axis=0) for start in starts]

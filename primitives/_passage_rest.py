@@ -1,0 +1,138 @@
+"""The free passage time of one via-point, rest to rest: the root of a polynomial that has exactly one.
+
+Substituting the movement into Flash & Hogan's Eq. C16, pi . v(t1) = 0, gives with E = x1 - x0, D = xf - x0 and
+
+    a = E.D,   b = D.D,   c = E.E,   q = 10 t^3 - 15 t^4 + 6 t^5,   w = t^3 (2 - t)
+
+the equation F(t) = (E - D q).(E (1 - 2t) + D w) = c (1 - 2t) + a w - q (a (1 - 2t) + b w) = 0, of degree 9. It has one root
+in (0, 1), simple, the global minimum of the jerk cost; it lies below 1/2 exactly if x1 is nearer to x0 than to xf.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ._arrays import Array, detach
+
+Number: TypeAlias = Any
+"""A float, or an array with one entry per movement: the same operations, the same bits."""
+
+_STEPS = 5
+"""Newton steps: the start is within 34 % everywhere, after five the error is 2e-16 (measured over all cases)."""
+
+_FLOOR = 1e-5
+"""Distance of the via-point from an end point, relative to the movement's extent, below which the gradient is clipped."""
+
+
+class _Functions(NamedTuple):
+    where: Callable[[Any, Any, Any], Any]
+    sqrt: Callable[[Any], Any]
+    cube_root: Callable[[Any], Any]
+    clip: Callable[[Any, Any, Any], Any]
+
+
+_ARRAYS = _Functions(np.where, np.sqrt, np.cbrt, lambda x, low, high: np.minimum(np.maximum(x, low), high))
+_FLOATS = _Functions(
+    lambda condition, yes, no: yes if condition else no,
+    math.sqrt,
+    lambda x: float(np.cbrt(x)),
+    lambda x, low, high: min(max(x, low), high),
+)
+
+
+def fractions_at_rest(points: Any) -> Any:
+    """Fractions of the duration before and after the via-point.
+
+    Args:
+        points: (N, 3, D) NumPy float64: start, via-point, goal [m].
+
+    Returns:
+        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start or goal has
+        fraction 0 there.
+    """
+    if len(points) == 1:  # Python floats spare a batch of one the overhead of 200 array operations
+        rows, math_functions = points[0].tolist(), _FLOATS
+    else:
+        rows, math_functions = np.ascontiguousarray(points.transpose(1, 2, 0)), _ARRAYS
+    a, b, c, is_late = _invariants(*rows, math_functions)
+    smaller = _root(a, b, c, math_functions)
+    larger = 1.0 - smaller
+    before = math_functions.where(is_late, larger, smaller)
+    after = math_functions.where(is_late, smaller, larger)
+    return np.array([[before, after]]) if len(points) == 1 else np.stack([before, after], axis=-1)
+
+
+def _invariants(
+    start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: _Functions
+) -> tuple[Number, ...]:
+    """a, b, c as seen from the nearer end point, and whether that is the goal."""
+    first = [x1 - x0 for x0, x1 in zip(start, via, strict=True)]
+    second = [x1 - x0 for x0, x1 in zip(via, goal, strict=True)]
+    whole = [x1 - x0 for x0, x1 in zip(start, goal, strict=True)]
+    c_first, c_second = dot(first, first), dot(second, second)
+    is_late = c_second < c_first
+    a = f.where(is_late, dot(second, whole), dot(first, whole))
+    return a, dot(whole, whole), f.where(is_late, c_second, c_first), is_late
+
+
+def dot(x: Sequence[Number], y: Sequence[Number]) -> Number:
+    """Sum over the dimensions of space in a fixed order (NumPy's own order depends on the memory layout)."""
+    total = x[0] * y[0]
+    for p, q in zip(x[1:], y[1:], strict=True):
+        total = total + p * q
+    return total
+
+
+def _root(a: Number, b: Number, c: Number, f: _Functions) -> Number:
+    """The root of F in (0, 1/2]."""
+    # For small t, c = 4 a z + 10 b z^2 + ... with z = t^3; t = 1/2 for far via-points.
+    root = f.sqrt(4.0 * a * a + 5.0 * b * c)
+    top = f.where(a >= 0, c, root - 2.0 * a)
+    bottom = f.where(a >= 0, 4.0 * a + 2.0 * root + 8.0 * c, 10.0 * b + 8.0 * top)
+    t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
+    t = f.clip(t, 0.0, 0.5)
+    for _ in range(_STEPS):
+        value, slope = residual(t, a, b, c)
+        t = f.clip(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t, 0.5)
+    return t
+
+
+def residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number]:
+    """F and dF/dt."""
+    square = t * t
+    cube = square * t
+    s = 1.0 - 2.0 * t
+    w = cube * (2.0 - t)
+    q = cube * (10.0 + t * (6.0 * t - 15.0))
+    dw = square * (6.0 - 4.0 * t)
+    dq = 30.0 * square * ((1.0 - t) * (1.0 - t))
+    m = a * s + b * w
+    return c * s + a * w - q * m, a * dw - 2.0 * c - dq * m - q * (b * dw - 2.0 * a)
+
+
+def attach_gradient(fractions: Array, waypoints: Array) -> Array:
+    """Make the fractions differentiable by the implicit function theorem, dt/dp = -(dF/dp) / (dF/dt).
+
+    The gradient grows without bound, like |E|^(-2/3), as the via-point meets an end point; it is clipped there, and stays
+    finite when all points coincide.
+    """
+    first = waypoints[..., 1, :] - waypoints[..., 0, :]
+    second = waypoints[..., 2, :] - waypoints[..., 1, :]
+    whole = waypoints[..., 2, :] - waypoints[..., 0, :]
+    is_late = (fractions[..., 1] < fractions[..., 0])[..., None]
+    near = is_late * second + ~is_late * first
+    t = fractions.min(-1).values
+    a, b, c = (near * whole).sum(-1), (whole * whole).sum(-1), (near * near).sum(-1)
+    _, slope = residual(t, detach(a), detach(b), detach(c))
+    extent = detach(b + c)
+    floor = _FLOOR ** (5 / 3) * extent  # |dF/dt| falls like |E|^(5/3)
+    slope = -(-slope).clip(min=floor + (extent <= 0))
+    value, _ = residual(t, a, b, c)
+    step = -value / slope
+    step = step - detach(step)  # the value is exact already: only the gradient is wanted
+    sign = 1.0 - 2.0 * is_late[..., 0].to(step.dtype)
+    return fractions + (sign * step)[..., None] * fractions.new_tensor([1.0, -1.0])

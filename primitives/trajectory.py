@@ -1,0 +1,259 @@
+"""A trajectory: position as a piecewise polynomial of time; a value that any number of callers may share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._arrays import (
+    Array,
+    Namespace,
+    as_floats,
+    broadcast_batch,
+    broadcast_to,
+    constant,
+    error_state,
+    require,
+    require_vectors,
+)
+from ._hermite import energy_table
+from ._sampling import evaluate
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory:
+    """Movements x(t), 0 <= t <= duration, each a chain of S polynomials; made by point_to_point, through, retarget.
+
+    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in its own unit time u = (t - t_s) / h_s, so that no
+    duration, short or long, over- or underflows.
+
+    Attributes:
+        coefficients: (..., 2 order, S, D), c_k of segment s [m].
+        durations: (..., S) the segments' durations h [s]; its leading shape may be shorter than the coefficients' (shared).
+        order: order of the derivative whose square is least: 2 acceleration, 3 jerk, 4 snap.
+        starts: (..., S) first instant of each segment [s].
+        rates: (..., S) 1 / h [1/s].
+        end: (..., 1) the last instant [s].
+        namespace: the Array API functions of the arrays.
+    """
+
+    coefficients: Array
+    durations: Array
+    order: int
+    starts: Array
+    rates: Array
+    end: Array
+    namespace: Namespace
+
+    @classmethod
+    def from_segments(cls, coefficients: Array, durations: Array, xp: Namespace) -> Trajectory:
+        """Join segments; a duration may be 0 where nothing moves (a via-point that equals its neighbour)."""
+        order = coefficients.shape[-3] // 2
+        if durations.shape[-1] == 1:
+            return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations, xp)
+        ends = xp.cumulative_sum(durations, axis=-1)
+        end = ends[..., -1:]
+        starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
+        empty = durations <= 0
+        if empty.any():
+            # An empty segment at the very end must not take over the last instant from the one before it.
+            starts = xp.where(starts >= end, 2 * end, starts)
+            rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
+        else:
+            rates = 1.0 / durations
+        return cls(coefficients, durations, order, starts, rates, end, xp)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading shape `...`."""
+        return tuple(self.coefficients.shape[:-3])
+
+    @property
+    def dimension(self) -> int:
+        """D, the dimension of space."""
+        return int(self.coefficients.shape[-1])
+
+    @property
+    def duration(self) -> Array:
+        """(...,) total duration [s]."""
+        return broadcast_to(self.namespace, self.end[..., 0], self.batch_shape)
+
+    @property
+    def knots(self) -> Array:
+        """(..., S + 1) the times at start, via-points and goal [s]."""
+        xp = self.namespace
+        inner = xp.cumulative_sum(self.durations[..., :-1], axis=-1)
+        knots = xp.concat([0.0 * self.end, inner, self.end], axis=-1)
+        return broadcast_to(xp, knots, (*self.batch_shape, knots.shape[-1]))
+
+    def __repr__(self) -> str:
+        segments = self.durations.shape[-1]
+        return f"Trajectory(batch {self.batch_shape}, {segments} segments, dimension {self.dimension}, order {self.order})"
+
+    def __call__(self, time: Array, nu: int = 0) -> Array:
+        """The nu-th time derivative.
+
+        Args:
+            time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0 and after the
+                duration the end point is held at rest.
+            nu: order of the derivative, at least 0 (from 2 order on it is zero).
+
+        Returns:
+            (..., T, D) [m/s^nu]. At a knot the segment that begins there counts, at the end the last one.
+
+        Raises:
+            ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
+        """
+        if isinstance(time, int | float):
+            return self.sample([time], nu)[0][..., 0, :]
+        return self.sample(time, nu)[0]
+
+    def sample(
+        self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
+    ) -> tuple[Array, ...]:
+        """Several derivatives at once, optionally into the caller's buffers.
+
+        Args:
+            time: as in a call; or a whole number of at least 2: so many evenly spaced times from 0 to the duration of each
+                trajectory, both included.
+            nu: the orders of derivative; one number counts as a sequence of one.
+            out: one array per order, each (..., T, D) with the full batch shape, for example the planes of one array
+                (len(nu), ..., T, D). Written without intermediate copies where they are NumPy arrays of the trajectory's
+                dtype and the batch has one dimension.
+
+        Returns:
+            One array (..., T, D) per order [m/s^nu], the given buffers if there are any.
+
+        Raises:
+            ValueError: bad time or nu, or buffers of a wrong number or shape.
+        """
+        xp = self.namespace
+        orders = _whole_orders(nu)
+        time, inside = self._times(time)
+        batch = broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
+        shape = (*batch, time.shape[-1], self.dimension)
+        if out is not None:
+            _check_buffers(out, len(orders), shape)
+        kept = [min(order, 2 * self.order - 1) for order in orders]
+        results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
+        return tuple(
+            self._held(value, order, inside, out is not None)
+            for value, order in zip(results, orders, strict=True)
+        )
+
+    def _times(self, time: Array | int) -> tuple[Array, Array | None]:
+        """Times (..., T) within the movement, and where the given ones were inside (None: everywhere)."""
+        xp = self.namespace
+        end = self.end
+        if isinstance(time, int | np.integer):
+            if time < 2:
+                raise ValueError(f"time as a number of samples must be at least 2, got {time}")
+            grid = xp.arange(int(time), dtype=end.dtype, device=getattr(end, "device", None)) / (
+                int(time) - 1
+            )
+            return end * grid, None
+        _, (time, _) = as_floats(time=time, coefficients=self.coefficients[..., 0, 0, 0])
+        if time.dtype != end.dtype:
+            time = xp.astype(time, end.dtype)
+        if time.ndim < 1:
+            raise ValueError(f"time must have shape (T,) or (..., T), got shape {tuple(time.shape)}")
+        inside = (time >= 0) & (time <= end)
+        if inside.all():
+            return time, None
+        return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
+
+    def _held(self, value: Array, order: int, inside: Array | None, in_place: bool) -> Array:
+        """Zero derivatives outside the movement and beyond the polynomial's degree."""
+        if order == 0 or (inside is None and order < 2 * self.order):
+            return value
+        factor = 0.0 if order >= 2 * self.order else self.namespace.astype(inside, value.dtype)[..., None]
+        if in_place:
+            value *= factor
+            return value
+        return value * factor
+
+    def cost(self) -> Array:
+        """(...,) 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], exact (Flash & Hogan's Eq. 1 for order 3)."""
+        return 0.5 * self.energy(self.order)
+
+    def energy(self, nu: int) -> Array:
+        """(...,) integral of |x^(nu)|^2 over the movement [m^2 / s^(2 nu - 1)], exact, as a sum of squares."""
+        xp = self.namespace
+        if not 0 <= nu < 2 * self.order:
+            raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
+        upper = self.coefficients[..., nu:, :, :]
+        flat = xp.reshape(upper, (*upper.shape[:-2], -1))
+        modes = xp.reshape(xp.matmul(constant(energy_table(self.order, nu), flat), flat), upper.shape)
+        scale = self.durations if nu == 0 else self.rates
+        for _ in range(2 * nu - 2):
+            scale = scale * self.rates
+        return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
+
+    def stretched(self, duration: Array) -> Trajectory:
+        """The same path at another pace: all times scaled to a new total duration (...,) [s].
+
+        Raises:
+            ValueError: duration is not finite, not positive, or does not broadcast.
+        """
+        xp, (duration, coefficients) = as_floats(duration=duration, coefficients=self.coefficients)
+        require(xp, duration > 0, "duration", duration, "must be positive")
+        batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
+        end = duration[..., None]
+        factor = end / self.end
+        empty = self.rates <= 0
+        with error_state(xp):
+            rates = xp.where(empty, 0.0 * factor, self.rates / factor)
+        coefficients = broadcast_to(xp, coefficients, (*batch, *coefficients.shape[-3:]))
+        return Trajectory(
+            coefficients, self.durations * factor, self.order, self.starts * factor, rates, end, xp
+        )
+
+    def transformed(
+        self, rotation: Array | None = None, translation: Array | None = None, scale: Array | None = None
+    ) -> Trajectory:
+        """scale * rotation @ x(t) + translation: the movement elsewhere, turned and resized.
+
+        Args:
+            rotation: (..., D', D) matrix (any linear map), default the identity.
+            translation: (..., D') [m], default zero.
+            scale: (...,) factor, default one.
+
+        Raises:
+            ValueError: an argument is not finite or has a wrong shape.
+        """
+        named = {"rotation": rotation, "translation": translation, "scale": scale}
+        xp, (rotation, translation, scale, moved) = as_floats(**named, coefficients=self.coefficients)
+        if rotation is not None:
+            if rotation.ndim < 2 or rotation.shape[-1] != self.dimension:
+                raise ValueError(
+                    f"rotation must have shape (..., D, {self.dimension}), got {tuple(rotation.shape)}"
+                )
+            broadcast_batch(trajectory=self.batch_shape, rotation=tuple(rotation.shape[:-2]))
+            moved = xp.matmul(moved, rotation[..., None, :, :].mT)
+        if scale is not None:
+            broadcast_batch(trajectory=self.batch_shape, scale=tuple(scale.shape))
+            moved = moved * scale[..., None, None, None]
+        if translation is not None:
+            require_vectors("translation", translation, moved.shape[-1])
+            batch = broadcast_batch(
+                trajectory=tuple(moved.shape[:-3]), translation=tuple(translation.shape[:-1])
+            )
+            moved = broadcast_to(xp, moved, (*batch, *moved.shape[-3:]))
+            first = moved[..., :1, :, :] + translation[..., None, None, :]
+            moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
+        return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end, xp)
+
+
+def _whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
+    orders = (nu,) if isinstance(nu, int | np.integer) else tuple(nu)
+    if not orders or any(not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 0 for n in orders):
+        raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
+    return tuple(int(order) for order in orders)
+
+
+def _check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...]) -> None:
+    shapes = [tuple(buffer.shape) for buffer in out]
+    if shapes != [shape] * count:
+        raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")

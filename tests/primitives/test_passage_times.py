@@ -1,0 +1,126 @@
+"""Free passage times: the only root, its limits, and no better neighbour."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from viapoint.primitives import FREE, passage_durations, through
+
+RNG = np.random.default_rng(20)
+
+
+def residual(t, start, via, goal):
+    """Flash & Hogan's Eq. C16 as derived: (E - D q).(E (1 - 2 t) + D t^3 (2 - t))."""
+    q = 10 * t**3 - 15 * t**4 + 6 * t**5
+    first, whole = via - start, goal - start
+    return np.sum((first - whole * q) * (first * (1 - 2 * t) + whole * t**3 * (2 - t)), axis=-1)
+
+
+def via_families():
+    yield "box", RNG.uniform(-2, 2, (500, 2))
+    yield "tiny", RNG.normal(size=(500, 2)) * 10.0 ** RNG.uniform(-9, 0, (500, 1))
+    yield "far", RNG.normal(size=(500, 2)) * 10.0 ** RNG.uniform(0, 6, (500, 1))
+    yield "on the line", np.stack([RNG.uniform(-1, 2, 500), np.zeros(500)], axis=-1)
+    yield (
+        "near the goal",
+        np.array([1.0, 0.0]) + RNG.normal(size=(500, 2)) * 10.0 ** RNG.uniform(-6, 0, (500, 1)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "via"), list(via_families()), ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_one_via_point_is_passed_where_eq_c16_changes_sign(name, via):
+    start, goal = np.zeros(2), np.array([1.0, 0.0])
+    waypoints = np.stack([np.broadcast_to(start, via.shape), via, np.broadcast_to(goal, via.shape)], axis=1)
+    fractions = passage_durations(waypoints, 1.0)
+    np.testing.assert_allclose(fractions.sum(-1), 1.0, rtol=1e-15)
+    # Looked at from the nearer end the root is a sign change within 1e-12 of its own size.
+    late = fractions[:, 1] < fractions[:, 0]
+    via = np.where(late[:, None], goal - via, via)
+    t = fractions.min(axis=-1)[:, None]
+    low, high = t * (1 - 1e-12), t * (1 + 1e-12)
+    assert (residual(low, start, via, goal) >= 0).all()
+    assert (residual(np.where(t == 0.5, 0.5, high), start, via, goal) <= 0).all()
+
+
+def test_limits_of_one_via_point():
+    points = {
+        "on the start": ([[0, 0], [0, 0], [1, 0]], [0, 1]),
+        "on the goal": ([[0, 0], [1, 0], [1, 0]], [1, 0]),
+        "out and back": ([[0, 0], [1, 2], [0, 0]], [0.5, 0.5]),
+        "nowhere to go": ([[1, 1], [1, 1], [1, 1]], [0, 1]),
+        "halfway": ([[0, 0], [0.5, 0], [1, 0]], [0.5, 0.5]),
+    }
+    for name, (waypoints, expected) in points.items():
+        np.testing.assert_array_equal(passage_durations(waypoints, 1.0), expected, err_msg=name)
+
+
+@pytest.mark.parametrize("vias", [1, 2, 3, 5])
+def test_no_shift_of_a_passage_time_lowers_the_cost(vias):
+    waypoints = RNG.normal(size=(40, vias + 2, 2))
+    durations = passage_durations(waypoints, 1.3)
+    best = through(waypoints, durations).cost()
+    for s, t in pairwise(range(vias + 1)):
+        for shift in (-1e-3, -1e-5, 1e-5, 1e-3):
+            moved = durations.copy()
+            moved[:, s] += shift * durations.min(axis=-1)
+            moved[:, t] -= shift * durations.min(axis=-1)
+            assert (through(waypoints, moved).cost() >= best * (1 - 1e-13)).all()
+
+
+@pytest.mark.parametrize("vias", [1, 2, 3])
+def test_no_shift_lowers_the_cost_with_moving_or_free_ends(vias):
+    waypoints = RNG.normal(size=(20, vias + 2, 2))
+    ends = {"start_velocity": RNG.normal(size=(20, 2)), "goal_velocity": FREE}
+    durations = passage_durations(waypoints, 0.8, **ends)
+    best = through(waypoints, durations, **ends).cost()
+    for s, t in pairwise(range(vias + 1)):
+        for shift in (-1e-2, -1e-4, 1e-4, 1e-2):
+            moved = durations.copy()
+            moved[:, s] += shift * durations.min(axis=-1)
+            moved[:, t] -= shift * durations.min(axis=-1)
+            assert (through(waypoints, moved, **ends).cost() >= best * (1 - 1e-12)).all()
+
+
+@pytest.mark.parametrize("vias", [1, 3])
+def test_points_of_the_straight_movement_are_passed_when_it_passes_them(vias):
+    times = np.sort(RNG.uniform(0.05, 0.95, (30, vias)), axis=-1)
+    along = 10 * times**3 - 15 * times**4 + 6 * times**5
+    along = np.concatenate([np.zeros((30, 1)), along, np.ones((30, 1))], axis=-1)
+    waypoints = along[..., None] * np.array([3.0, -4.0])
+    durations = passage_durations(waypoints, 2.0)
+    expected = 2.0 * np.diff(times, axis=-1, prepend=0.0, append=1.0)
+    np.testing.assert_allclose(durations, expected, rtol=1e-6)
+    np.testing.assert_allclose(through(waypoints, durations).cost(), 360 * 25 / 2.0**5, rtol=1e-12)
+
+
+def test_equal_neighbours_are_merged():
+    waypoints = np.array([[0.0, 0], [1, 1], [1, 1], [2, -1], [3, 0], [3, 0]])
+    durations = passage_durations(waypoints, 1.0)
+    merged = passage_durations(waypoints[[0, 1, 3, 4]], 1.0)
+    np.testing.assert_array_equal(durations[[0, 2, 3]], merged)
+    np.testing.assert_array_equal(durations[[1, 4]], 0.0)
+
+
+@pytest.mark.parametrize("vias", [1, 2, 4])
+def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias):
+    waypoints = RNG.normal(size=(30, vias + 2, 3))
+    waypoints[3, 1] = waypoints[3, 0]
+    waypoints[4, -2] = waypoints[4, -1]
+    duration = RNG.uniform(0.5, 2, 30)
+    velocity = RNG.normal(size=(30, 3)) * (RNG.uniform(size=(30, 1)) < 0.5)
+    for given in (False, True):
+        ends = {"start_velocity": velocity} if given else {}
+        batch = passage_durations(waypoints, duration, **ends)
+        for i in range(30):
+            own = {name: value[i] for name, value in ends.items()}
+            np.testing.assert_array_equal(passage_durations(waypoints[i], duration[i], **own), batch[i])
+
+
+def test_single_precision_is_accurate():
+    waypoints = RNG.uniform(-1, 1, (300, 3, 2)).astype(np.float32)
+    single = passage_durations(waypoints, 1.0)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, passage_durations(waypoints.astype(float), 1.0), rtol=2e-7)

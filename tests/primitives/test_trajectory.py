@@ -1,0 +1,237 @@
+"""Laws of a trajectory: what it passes, how smooth it is, that nothing near it costs less."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import make_interp_spline
+
+from viapoint.primitives import FREE, passage_durations, point_to_point, through
+
+RNG = np.random.default_rng(30)
+
+
+def random_movement(vias, order=3, batch=(), dimension=2, moving=True):
+    waypoints = RNG.normal(size=(*batch, vias + 2, dimension))
+    durations = RNG.uniform(0.2, 1.0, (*batch, vias + 1))
+    ends = {}
+    if moving:
+        ends = {
+            "start_velocity": RNG.normal(size=(*batch, dimension)),
+            "goal_velocity": RNG.normal(size=(*batch, dimension)),
+        }
+        if order > 2:
+            ends["start_acceleration"] = RNG.normal(size=(*batch, dimension))
+            ends["goal_acceleration"] = RNG.normal(size=(*batch, dimension))
+    return waypoints, durations, ends
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("vias", [0, 1, 2, 7])
+def test_points_and_boundary_values_are_hit(order, vias):
+    waypoints, durations, ends = random_movement(vias, order, batch=(4,))
+    trajectory = through(waypoints, durations, order=order, **ends)
+    np.testing.assert_allclose(trajectory(trajectory.knots), waypoints, atol=1e-11)
+    edges = trajectory.knots[:, [0, -1]]
+    for nu, what in ((1, "velocity"), (2, "acceleration")):
+        for place, end in enumerate(("start", "goal")):
+            if f"{end}_{what}" in ends:
+                np.testing.assert_allclose(trajectory(edges, nu)[:, place], ends[f"{end}_{what}"], atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_all_but_the_highest_derivatives_are_continuous_at_via_points(order):
+    waypoints, durations, ends = random_movement(3, order)
+    trajectory = through(waypoints, durations, order=order, **ends)
+    c, rates = trajectory.coefficients, trajectory.rates
+    for nu in range(2 * order - 1):
+        size = np.abs(trajectory(np.linspace(0, float(trajectory.duration), 50), nu)).max()
+        for s in range(3):
+            left = np.polynomial.Polynomial(c[:, s, 0]).deriv(nu)(1.0) * rates[s] ** nu
+            right = np.polynomial.Polynomial(c[:, s + 1, 0]).deriv(nu)(0.0) * rates[s + 1] ** nu
+            assert abs(left - right) < 1e-10 * size, nu
+
+
+def test_given_via_velocities_are_met_with_continuous_acceleration():
+    waypoints, durations, ends = random_movement(2)
+    velocities = RNG.normal(size=(2, 2))
+    trajectory = through(waypoints, durations, via_velocities=velocities, **ends)
+    knots = trajectory.knots[1:-1]
+    np.testing.assert_allclose(trajectory(knots, 1), velocities, atol=1e-12)
+    np.testing.assert_allclose(trajectory(knots, 2), trajectory(knots - 1e-10, 2), atol=1e-6)
+    free = through(waypoints, durations, **ends)
+    assert trajectory.cost() > free.cost()
+    best = through(waypoints, durations, via_velocities=free(knots, 1), **ends)
+    np.testing.assert_allclose(best.coefficients, free.coefficients, atol=1e-11)
+
+
+@pytest.mark.parametrize("vias", [0, 1, 3, 12])
+def test_equals_scipys_quintic_spline_with_clamped_ends(vias):
+    waypoints, durations, ends = random_movement(vias)
+    trajectory = through(waypoints, durations, **ends)
+    left = [(1, ends["start_velocity"]), (2, ends["start_acceleration"])]
+    right = [(1, ends["goal_velocity"]), (2, ends["goal_acceleration"])]
+    spline = make_interp_spline(trajectory.knots, waypoints, k=5, bc_type=(left, right))
+    time = np.linspace(0, float(trajectory.duration), 101)
+    for nu in range(5):
+        reference = spline(time, nu)
+        np.testing.assert_allclose(trajectory(time, nu), reference, atol=1e-9 * np.abs(reference).max())
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_no_admissible_perturbation_lowers_the_cost(order):
+    waypoints, durations, ends = random_movement(2, order)
+    trajectory = through(waypoints, durations, order=order, **ends)
+    end = float(trajectory.duration)
+    time, weight = np.polynomial.legendre.leggauss(60)
+    # A bump that keeps every point and boundary value: product of the knots' factors, flat enough at the ends.
+    t = np.polynomial.Polynomial([0, 1])
+    bump = (t * (end - t)) ** order
+    for knot in trajectory.knots[1:-1]:
+        bump = bump * (t - knot)
+    for shape in (bump, bump * t, bump * (1 - t * t)):
+        cross, own = 0.0, 0.0
+        for left, right in zip(trajectory.knots[:-1], trajectory.knots[1:], strict=True):
+            at = (left + right) / 2 + (right - left) / 2 * time
+            w = weight * (right - left) / 2
+            change = shape.deriv(order)(at)
+            cross += np.sum(w * change * trajectory(at, order)[:, 0])
+            own += 0.5 * np.sum(w * change**2)
+        assert own > 0
+        # cost(x + e bump) - cost(x) = e cross + e^2 own, so least cost means cross = 0
+        assert abs(cross) < 1e-8 * np.sqrt(own * float(trajectory.cost()))
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_cost_is_the_integral(order):
+    waypoints, durations, ends = random_movement(2, order)
+    trajectory = through(waypoints, durations, order=order, **ends)
+    knots = trajectory.knots
+    total = sum(
+        quad(lambda t: 0.5 * np.sum(trajectory(t, order) ** 2), a, b, epsabs=0, epsrel=1e-12)[0]
+        for a, b in zip(knots[:-1], knots[1:], strict=True)
+    )
+    np.testing.assert_allclose(trajectory.cost(), total, rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_each_derivative_is_the_difference_quotient_of_the_one_before(order):
+    waypoints, durations, ends = random_movement(2, order)
+    trajectory = through(waypoints, durations, order=order, **ends)
+    time = (trajectory.knots[:-1] + 0.37 * durations)[:, None] + np.array([-1e-5, 0, 1e-5])
+    for nu in range(1, 2 * order):
+        before, at, after = (trajectory(time[:, i], nu - int(i != 1)) for i in range(3))
+        scale = np.abs(at).max() + np.abs(before).max() * 1e-2
+        np.testing.assert_allclose(
+            (after - before) / 2e-5, at, atol=1e-5 * scale + 1e-10 / 1e-5 * np.abs(before).max() * 1e-5
+        )
+    assert (trajectory(time, 2 * order) == 0).all()
+
+
+def test_movement_turns_shifts_grows_and_stretches_with_its_points():
+    waypoints, durations, ends = random_movement(2)
+    angle = 0.7
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shift, scale, pace = np.array([100.0, -3.0]), 2.5, 1.7
+    plain = through(waypoints, durations, **ends)
+    turned = {name: scale * value @ rotation.T for name, value in ends.items()}
+    elsewhere = through(scale * waypoints @ rotation.T + shift, durations, **turned)
+    time = np.linspace(-0.1, float(plain.duration) + 0.1, 33)
+    moved = plain.transformed(rotation, shift, scale)
+    for nu in range(4):
+        size = np.abs(elsewhere(time, nu)).max()
+        np.testing.assert_allclose(moved(time, nu), elsewhere(time, nu), atol=1e-11 * size)
+    slow = plain.stretched(pace * plain.duration)
+    for nu in range(4):
+        np.testing.assert_allclose(slow(pace * time, nu), plain(time, nu) / pace**nu, atol=1e-10)
+    np.testing.assert_allclose(slow.cost(), plain.cost() / pace**5, rtol=1e-13)
+
+
+def test_outside_the_movement_the_end_points_are_held_at_rest():
+    waypoints, durations, ends = random_movement(1)
+    trajectory = through(waypoints, durations, **ends)
+    end = float(trajectory.duration)
+    outside = np.array([-5.0, -1e-9, end + 1e-9, end + 9.0])
+    np.testing.assert_allclose(trajectory(outside), waypoints[[0, 0, -1, -1]], atol=1e-14)
+    assert (trajectory(outside, 1) == 0).all()
+    np.testing.assert_allclose(trajectory([end], 1)[0], ends["goal_velocity"], atol=1e-12)
+
+
+def test_zero_offsets_give_the_straight_movement_to_rounding():
+    for vias in (1, 2, 3):
+        waypoints = np.linspace([0.1, 0.4], [0.5, -0.3], vias + 2)
+        durations = passage_durations(waypoints, 0.8)
+        bent = through(waypoints, durations)
+        straight = point_to_point(waypoints[0], waypoints[-1], 0.8)
+        for nu in range(4):
+            reference = straight.sample(101, nu)[0]
+            np.testing.assert_allclose(
+                bent.sample(101, nu)[0], reference, atol=3e-13 * np.abs(reference).max()
+            )
+
+
+@pytest.mark.parametrize("vias", [0, 1, 3])
+def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias):
+    waypoints, durations, ends = random_movement(vias, batch=(70,))
+    batch = through(waypoints, durations, **ends)
+    times = RNG.uniform(-0.1, 4, (70, 50))
+    whole = batch.sample(200), batch.sample(times), batch.sample(times[0], nu=(0, 4))
+    costs = batch.cost()
+    for i in (0, 1, 33, 69):
+        alone = through(waypoints[i], durations[i], **{name: value[i] for name, value in ends.items()})
+        single = through(
+            waypoints[i : i + 1], durations[i : i + 1], **{n: v[i : i + 1] for n, v in ends.items()}
+        )
+        np.testing.assert_array_equal(alone.coefficients, batch.coefficients[i])
+        np.testing.assert_array_equal(single.coefficients[0], batch.coefficients[i])
+        assert alone.cost() == costs[i]
+        parts = alone.sample(200), alone.sample(times[i]), alone.sample(times[0], nu=(0, 4))
+        ones = single.sample(200), single.sample(times[i : i + 1]), single.sample(times[0], nu=(0, 4))
+        for together, lonely, one in zip(whole, parts, ones, strict=True):
+            for a, b, c in zip(together, lonely, one, strict=True):
+                np.testing.assert_array_equal(a[i], b)
+                np.testing.assert_array_equal(a[i], c[0])
+
+
+def test_shared_and_own_durations_agree_bit_for_bit():
+    waypoints, _, _ = random_movement(2, batch=(20,))
+    shared = np.array([0.3, 0.5, 0.4])
+    together = through(waypoints, shared)
+    own = through(waypoints, np.tile(shared, (20, 1)))
+    assert together.knots.shape == own.knots.shape == (20, 4)
+    for a, b in zip(together.sample(50), own.sample(50), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_sample_fills_given_buffers():
+    waypoints, durations, ends = random_movement(2, batch=(9,))
+    trajectory = through(waypoints, durations, **ends)
+    buffers = np.full((3, 9, 40, 2), np.nan)
+    filled = trajectory.sample(40, out=buffers)
+    for nu, (given, expected) in enumerate(zip(filled, trajectory.sample(40), strict=True)):
+        assert np.shares_memory(given, buffers)
+        np.testing.assert_array_equal(buffers[nu], expected)
+    interleaved = np.full((9, 40, 3, 2), np.nan)
+    trajectory.sample(40, out=[interleaved[..., nu, :] for nu in range(3)])
+    np.testing.assert_array_equal(interleaved[..., 2, :], buffers[2])
+    time = np.linspace(-1, 9, 40)
+    trajectory.sample(time, out=buffers)
+    np.testing.assert_array_equal(buffers[1], trajectory(time, 1))
+
+
+def test_a_dropped_via_point_leaves_the_others():
+    waypoints = np.array([[0.0, 0], [0, 0], [1, 1], [2, 0], [2, 0]])
+    trajectory = through(waypoints, [0.0, 0.4, 0.6, 0.0])
+    plain = through(waypoints[[0, 2, 3]], [0.4, 0.6])
+    time = np.linspace(-0.1, 1.1, 61)
+    for nu in range(6):
+        np.testing.assert_allclose(trajectory(time, nu), plain(time, nu), atol=1e-9)
+    np.testing.assert_allclose(trajectory.cost(), plain.cost(), rtol=1e-13)
+    moving = through(waypoints, [0.0, 0.4, 0.6, 0.0], goal_velocity=np.ones(2))
+    np.testing.assert_allclose(moving([1.0], 1), [[1.0, 1.0]], atol=1e-12)
+
+
+def test_a_free_goal_velocity_and_acceleration_is_the_hitting_movement():
+    hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
+    np.testing.assert_allclose(hit.coefficients[:, 0, 0], np.array([0, 0, 0, 10, -5, 1]) / 6, atol=1e-15)
+    np.testing.assert_allclose(hit.cost(), 10.0, rtol=1e-14)
+    np.testing.assert_allclose(hit(1.0, 1), 2.5, rtol=1e-14)
