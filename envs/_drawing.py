@@ -1,0 +1,132 @@
+"""A palette, and shapes added to a MuJoCo scene for the eye alone."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Colour = tuple[float, float, float]
+Geom = mujoco.mjtGeom
+
+MATT, GLOWING = 0.0, 1.0
+"""How much of its colour a thing shows without light: lines are ink, things are lit."""
+
+
+class Palette(NamedTuple):
+    """Colours of everything that is drawn, so that pictures, plots and films agree; red, green, blue in [0, 1]."""
+
+    plan: Colour = (0.36, 0.62, 0.90)
+    executed: Colour = (0.07, 0.13, 0.27)
+    via: Colour = (0.96, 0.56, 0.08)
+    goal: Colour = (0.15, 0.64, 0.38)
+    start: Colour = (0.42, 0.45, 0.50)
+    obstacle: Colour = (0.80, 0.53, 0.41)
+    contact: Colour = (0.86, 0.10, 0.14)
+    arm: Colour = (0.63, 0.69, 0.77)
+    joint: Colour = (0.30, 0.35, 0.44)
+    table: Colour = (0.965, 0.96, 0.945)
+
+
+PALETTE = Palette()
+
+
+class Pencil:
+    """Adds shapes to a scene until its room is used up."""
+
+    def __init__(self, scene: mujoco.MjvScene) -> None:
+        self._scene = scene
+
+    def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
+        """A sphere at `centre` (3,) [m]."""
+        self._add(Geom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+
+    def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
+        """A flat cylinder that stands on `centre` (3,) [m]."""
+        self._add(
+            Geom.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), centre + (0, 0, height / 2.0), colour, glow
+        )
+
+    def rod(
+        self,
+        first: Float,
+        second: Float,
+        radius: float,
+        colour: Colour,
+        glow: float = MATT,
+        *,
+        flat: bool = False,
+    ) -> None:
+        """A capsule, or a cylinder with `flat` ends, from `first` (3,) to `second` (3,) [m]."""
+        kind = Geom.mjGEOM_CYLINDER if flat else Geom.mjGEOM_CAPSULE
+        geom = self._add(kind, (radius,) * 3, first, colour, glow)
+        if geom is not None:
+            mujoco.mjv_connector(geom, kind, radius, first, second)
+
+    def line(self, points: Float, radius: float, colour: Colour) -> None:
+        """A tube through `points` (n, 3) [m] that throws no shadow."""
+        for first, second in zip(points[:-1], points[1:], strict=True):
+            geom = self._add(Geom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
+            if geom is not None:
+                geom.castshadow = False
+                mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, radius, first, second)
+
+    def ring(self, centre: Float, radius: float, thickness: float, colour: Colour) -> None:
+        """A circle painted on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
+        self.disc(centre, radius, 0.001, colour, GLOWING)
+        self.disc(centre, radius - thickness, 0.002, PALETTE.table)
+
+    def post(self, foot: Float, top: float, radius: float, colour: Colour) -> None:
+        """An upright rounded post from `foot` (3,) up to the height `top` [m]."""
+        self.rod(foot, np.array([*foot[:2], top - radius]), radius, colour)
+
+    def wall(self, foot: Float, half_axis: Float, top: float, radius: float, colour: Colour) -> None:
+        """A rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
+        crest = top - radius
+        ends = foot - half_axis, foot + half_axis
+        for end in ends:
+            self.post(end, top, radius, colour)
+        self.rod(*(np.array([*end[:2], crest]) for end in ends), radius, colour)
+        half = float(np.linalg.norm(half_axis))
+        along = half_axis / half
+        turn = np.stack((along, (-along[1], along[0], 0.0), (0.0, 0.0, 1.0)), axis=-1)
+        middle = np.array([*foot[:2], (foot[2] + crest) / 2.0])
+        self._add(Geom.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
+
+    def _add(
+        self,
+        kind: Geom,
+        size: tuple[float, ...],
+        centre: Float,
+        colour: Colour,
+        glow: float,
+        turn: Float | None = None,
+    ) -> mujoco.MjvGeom | None:
+        if self._scene.ngeom >= self._scene.maxgeom:
+            return None
+        geom = self._scene.geoms[self._scene.ngeom]
+        turn = np.eye(3) if turn is None else turn
+        lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, turn.flatten(), lit)
+        geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
+        self._scene.ngeom += 1
+        return geom
+
+
+def resampled(points: Float, spacing: float) -> Float:
+    """A polyline through `points` (n, D) with points about `spacing` apart, [m]; both ends are kept."""
+    steps = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=-1))
+    length = np.concatenate(([0.0], np.cumsum(steps)))
+    count = max(int(np.ceil(length[-1] / spacing)), 1) + 1
+    places = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
+
+
+def in_space(points: Float, height: float) -> Float:
+    """Points (..., D) of the plane at `height` [m]; those of space as they are."""
+    if points.shape[-1] == 3:
+        return points
+    return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)

@@ -1,0 +1,73 @@
+"""A movement as it is drawn, and what it touched."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.action import Plan
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.clearance import arm_clearance, hand_clearance
+from viapoint.envs.execution import Rollout
+from viapoint.envs.scenes import Scenes
+
+Float = NDArray[np.float64]
+
+
+class Touch(NamedTuple):
+    """What touched what, and when."""
+
+    step: int
+    """Physics step of the first contact: the index into a rollout of the state in which they touched."""
+    obstacle: int
+    """Row of the obstacle."""
+    link: int | None
+    """Index of the link; None is the hand."""
+
+
+class Movement(NamedTuple):
+    """A movement as it is drawn: its states from the start on, one more than physics steps."""
+
+    planned: Float
+    """Hand path of the plan, shape (T + 1, D), [m]."""
+    vias: Float
+    """Shape (K, D), [m]."""
+    joints: Float
+    """Shape (T + 1, J), [rad]."""
+    hand: Float
+    """Shape (T + 1, D), [m]."""
+    touch: Touch | None
+    """The first contact."""
+
+    @classmethod
+    def of(cls, arm: Arm, scene: Scenes, plan: Plan, rollout: Rollout, *, whole_arm: bool) -> Movement:
+        """The movement of one plan in one scene; both have one row."""
+        start = np.asarray(arm.posture(scene.start))
+        joints = np.concatenate((start, rollout.joints))
+        return cls(
+            planned=np.concatenate((scene.start, rollout.planned)),
+            vias=np.asarray(plan.waypoints).reshape(-1, arm.dimension)[1:-1],
+            joints=joints,
+            hand=np.concatenate((scene.start, rollout.hand)),
+            touch=first_touch(arm, scene, joints, rollout.contact, whole_arm=whole_arm),
+        )
+
+
+def first_touch(
+    arm: Arm, scene: Scenes, joints: Float, contact: NDArray[np.bool_], *, whole_arm: bool
+) -> Touch | None:
+    """What the arm touched first: the nearest pair of part and obstacle where the physics first reports contact."""
+    if not contact.any():
+        return None
+    step = int(contact.argmax())
+    posture = joints[None, step : step + 1]
+    rows, present = scene.obstacles, scene.present
+    parts = [hand_clearance(np.asarray(arm.hand(posture)), arm.hand_radius, rows, present)]
+    if whole_arm:
+        links = np.asarray(arm.links(posture))
+        for i, radius in enumerate(arm.link_radii):
+            parts.append(arm_clearance(links[..., i : i + 1, :, :], (radius,), rows, present))
+    part, obstacle = np.unravel_index(np.argmin(np.stack(parts)[:, 0]), (len(parts), rows.shape[1]))
+    return Touch(step, int(obstacle), int(part) - 1 if part else None)
