@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import itertools
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -10,14 +11,16 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Colour = tuple[float, float, float]
-Geom = mujoco.mjtGeom
+Geom = Any
+"""A shape in a scene."""
+Shape = mujoco.mjtGeom
 
 MATT, GLOWING = 0.0, 1.0
 """How much of its colour a thing shows without light: lines are ink, things are lit."""
 
 
 class Palette(NamedTuple):
-    """Colours of everything that is drawn, so that pictures, plots and films agree; red, green, blue in [0, 1]."""
+    """Colours of all that is drawn, so that pictures, plots and films agree; red, green, blue in [0, 1]."""
 
     plan: Colour = (0.36, 0.62, 0.90)
     executed: Colour = (0.07, 0.13, 0.27)
@@ -42,37 +45,28 @@ class Pencil:
 
     def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
         """A sphere at `centre` (3,) [m]."""
-        self._add(Geom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+        self._add(Shape.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
 
     def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
         """A flat cylinder that stands on `centre` (3,) [m]."""
-        self._add(
-            Geom.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), centre + (0, 0, height / 2.0), colour, glow
-        )
+        middle = np.array([*centre[:2], centre[2] + height / 2.0])
+        self._add(Shape.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
 
     def rod(
-        self,
-        first: Float,
-        second: Float,
-        radius: float,
-        colour: Colour,
-        glow: float = MATT,
-        *,
-        flat: bool = False,
-    ) -> None:
-        """A capsule, or a cylinder with `flat` ends, from `first` (3,) to `second` (3,) [m]."""
-        kind = Geom.mjGEOM_CYLINDER if flat else Geom.mjGEOM_CAPSULE
-        geom = self._add(kind, (radius,) * 3, first, colour, glow)
+        self, first: Float, second: Float, radius: float, colour: Colour, glow: float = MATT
+    ) -> Geom | None:
+        """A capsule from `first` (3,) to `second` (3,) [m]."""
+        geom = self._add(Shape.mjGEOM_CAPSULE, (radius,) * 3, first, colour, glow)
         if geom is not None:
-            mujoco.mjv_connector(geom, kind, radius, first, second)
+            mujoco.mjv_connector(geom, Shape.mjGEOM_CAPSULE, radius, first, second)
+        return geom
 
     def line(self, points: Float, radius: float, colour: Colour) -> None:
         """A tube through `points` (n, 3) [m] that throws no shadow."""
-        for first, second in zip(points[:-1], points[1:], strict=True):
-            geom = self._add(Geom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
+        for first, second in itertools.pairwise(points):
+            geom = self.rod(first, second, radius, colour, GLOWING)
             if geom is not None:
                 geom.castshadow = False
-                mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, radius, first, second)
 
     def ring(self, centre: Float, radius: float, thickness: float, colour: Colour) -> None:
         """A circle painted on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
@@ -89,22 +83,22 @@ class Pencil:
         ends = foot - half_axis, foot + half_axis
         for end in ends:
             self.post(end, top, radius, colour)
-        self.rod(*(np.array([*end[:2], crest]) for end in ends), radius, colour)
+        self.rod(np.array([*ends[0][:2], crest]), np.array([*ends[1][:2], crest]), radius, colour)
         half = float(np.linalg.norm(half_axis))
         along = half_axis / half
         turn = np.stack((along, (-along[1], along[0], 0.0), (0.0, 0.0, 1.0)), axis=-1)
         middle = np.array([*foot[:2], (foot[2] + crest) / 2.0])
-        self._add(Geom.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
+        self._add(Shape.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
 
     def _add(
         self,
-        kind: Geom,
+        kind: int,
         size: tuple[float, ...],
         centre: Float,
         colour: Colour,
         glow: float,
         turn: Float | None = None,
-    ) -> mujoco.MjvGeom | None:
+    ) -> Geom | None:
         if self._scene.ngeom >= self._scene.maxgeom:
             return None
         geom = self._scene.geoms[self._scene.ngeom]

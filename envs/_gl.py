@@ -9,6 +9,8 @@ import contextlib
 import importlib
 import os
 import sys
+import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -30,23 +32,20 @@ class GLUnavailableError(gym.error.DependencyNotInstalled):
 class Canvas:
     """A picture in memory that a scene is rendered to.
 
-    Smooth edges and soft shadows come from the mean of several passes, each with the picture moved by a fraction of a
-    pixel and the lamps by a fraction of their size: graphics cards do the former alone, software does neither cheaply.
+    Smooth edges and soft shadows come from the mean of several passes, each with the picture moved by
+    a fraction of a pixel and the lamps by a fraction of their size.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Open a context; `model` must have an offscreen buffer of at least width x height pixels.
+        """Open a context for pictures of this size, whatever the model's own offscreen size is.
 
         Raises:
             GLUnavailableError: There is no OpenGL library, or it refuses.
         """
         self.width, self.height = width, height
         self._context: Any = None
-        self._mjr: Any = None
-        self._context = _open_context(width, height)
-        with self._context.as_current():
-            self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._context, self._mjr = _open(model)
 
     def draw(self, scene: mujoco.MjvScene, passes: int = 1, lamp_radius: float = 0.0) -> Frame:
         """The scene as a picture, shape (height, width, 3).
@@ -71,9 +70,8 @@ class Canvas:
         """Give the context back; a second call changes nothing."""
         context, self._context = self._context, None
         if context is not None:
-            if self._mjr is not None:
-                with context.as_current():
-                    self._mjr.free()
+            with context.as_current():
+                self._mjr.free()
             context.free()
 
     def __del__(self) -> None:
@@ -92,22 +90,24 @@ class Window:
         self._window: Any = None
         if not _has_display():
             raise GLUnavailableError(
-                "render_mode='human' opens a window, and there is no display (neither DISPLAY nor WAYLAND_DISPLAY is "
-                "set): use render_mode='rgb_array' or 'rgb_array_list', or run under a virtual display, "
-                "e.g. xvfb-run -a python ..."
+                "render_mode='human' opens a window, and there is no display (neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set): use render_mode='rgb_array' or 'rgb_array_list', or run under a "
+                "virtual display, e.g. xvfb-run -a python ..."
             )
         import glfw
 
         self._glfw = glfw
-        if not glfw.init():
-            raise GLUnavailableError("render_mode='human' cannot open a window: GLFW found no usable display")
-        glfw.window_hint(glfw.VISIBLE, 1)
-        glfw.window_hint(glfw.SAMPLES, 4)
-        self._window = glfw.create_window(width, height, title, None, None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if not glfw.init():
+                raise GLUnavailableError(
+                    "render_mode='human' cannot open a window: the display does not answer"
+                )
+            glfw.window_hint(glfw.VISIBLE, 1)
+            glfw.window_hint(glfw.SAMPLES, 4)
+            self._window = glfw.create_window(width, height, title, None, None)
         if not self._window:
-            raise GLUnavailableError(
-                f"render_mode='human' cannot open a window: no OpenGL on the display; {INSTALL}"
-            )
+            raise GLUnavailableError(f"render_mode='human' cannot open a window: no OpenGL there; {INSTALL}")
         glfw.make_context_current(self._window)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
 
@@ -135,7 +135,7 @@ class Window:
         self.close()
 
 
-def _open_context(width: int, height: int) -> Any:
+def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     """A context for pictures in memory: what MUJOCO_GL says, else the first that this machine has."""
     wish = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wish in OFF:
@@ -143,17 +143,28 @@ def _open_context(width: int, height: int) -> Any:
     reasons = []
     for platform in _platforms(wish):
         try:
-            context = importlib.import_module(f"mujoco.{platform}").GLContext(width, height)
-            with context.as_current():
-                return context
-        except (
-            Exception
-        ) as error:  # every platform has failures of its own, from missing files to refused contexts
+            return _open_on(platform, model)
+        except AttributeError:  # PyOpenGL's way to say that it found no library
+            reasons.append(f"{platform}: library not found")
+        except Exception as error:  # every platform has failures of its own, down to MuJoCo's FatalError
             reasons.append(f"{platform}: {error}")
     raise GLUnavailableError(
         f"no OpenGL library could be used to render ({'; '.join(reasons)}). Install one ({INSTALL}), "
-        "or set MUJOCO_GL to egl, osmesa or glfw to choose another"
+        "or choose another by setting MUJOCO_GL to egl, osmesa or glfw"
     )
+
+
+def _open_on(platform: str, model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # GLFW warns where the exception that follows says the same
+        size = model.vis.global_.offwidth, model.vis.global_.offheight
+        context = importlib.import_module(f"mujoco.{platform}").GLContext(*size)
+        with context.as_current():
+            if platform == "glfw" and not importlib.import_module("glfw").get_current_context():
+                raise OSError("no window could be opened")  # going on would end the process
+            mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, mjr)
+    return context, mjr
 
 
 def _platforms(wish: str) -> tuple[str, ...]:
@@ -174,7 +185,7 @@ def _has_display() -> bool:
 
 
 def _spread(passes: int) -> NDArray[np.float64]:
-    """Points spread evenly over the square [-1/2, 1/2]^2, shape (passes, 2): the R2 sequence of M. Roberts (2018)."""
+    """Points spread over the square [-1/2, 1/2]^2, shape (passes, 2): M. Roberts' R2 sequence (2018)."""
     if passes == 1:
         return np.zeros((1, 2))
     steps = np.arange(passes)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
@@ -182,20 +193,27 @@ def _spread(passes: int) -> NDArray[np.float64]:
 
 
 @contextlib.contextmanager
-def _moved(scene: mujoco.MjvScene, shift: NDArray[np.float64], height: int, lamp_radius: float) -> Any:
-    """The scene with its picture moved by `shift` pixels and its lamps by `shift` diameters, for a while."""
+def _moved(
+    scene: mujoco.MjvScene, shift: NDArray[np.float64], height: int, lamp_radius: float
+) -> Iterator[None]:
+    """For a while, the scene with its picture moved by `shift` pixels and its lamps by `shift` diameters."""
     pixel = (scene.camera[0].frustum_top - scene.camera[0].frustum_bottom) / height
-    frusta = [(eye, eye.frustum_center, eye.frustum_bottom, eye.frustum_top) for eye in scene.camera]
+    step = pixel * shift[1]
+    lamp_step = 2.0 * lamp_radius * np.array([*shift, 0.0])
+    eyes = [(eye, eye.frustum_center, eye.frustum_bottom, eye.frustum_top) for eye in scene.camera]
     lamps = [(lamp, lamp.pos.copy()) for lamp in scene.lights[: scene.nlight] if lamp.castshadow]
-    for eye, centre, bottom, top in frusta:
-        eye.frustum_center = centre + pixel * shift[0]
-        eye.frustum_bottom, eye.frustum_top = bottom + pixel * shift[1], top + pixel * shift[1]
+    for eye, centre, bottom, top in eyes:
+        _set_frustum(eye, centre + pixel * shift[0], bottom + step, top + step)
     for lamp, place in lamps:
-        lamp.pos = place + 2.0 * lamp_radius * np.array([*shift, 0.0])
+        lamp.pos = place + lamp_step
     try:
         yield
     finally:
-        for eye, eye.frustum_center, eye.frustum_bottom, eye.frustum_top in frusta:
-            pass
-        for lamp, lamp.pos in lamps:
-            pass
+        for eye, *frustum in eyes:
+            _set_frustum(eye, *frustum)
+        for lamp, place in lamps:
+            lamp.pos = place
+
+
+def _set_frustum(eye: Any, centre: float, bottom: float, top: float) -> None:
+    eye.frustum_center, eye.frustum_bottom, eye.frustum_top = centre, bottom, top

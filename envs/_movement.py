@@ -58,7 +58,7 @@ class Movement(NamedTuple):
 def first_touch(
     arm: Arm, scene: Scenes, joints: Float, contact: NDArray[np.bool_], *, whole_arm: bool
 ) -> Touch | None:
-    """What the arm touched first: the nearest pair of part and obstacle where the physics first reports contact."""
+    """What the arm touched first: the nearest part and obstacle where the physics first reports contact."""
     if not contact.any():
         return None
     step = int(contact.argmax())

@@ -21,7 +21,7 @@ HIDDEN = 5
 OVERHEAD = 0.5
 """How opaque links are that pass above everything else."""
 LOW, TALL = 0.030, 0.060
-"""Height of the obstacles over the hand: below the links that pass above them, or in the way of the links, [m]."""
+"""Height of the obstacles over the hand: below the links that pass above, or in the way of the links, [m]."""
 PLAN, DONE = 0.0065, 0.0030
 """Radius of a planned and of an executed path, [m]: the one shows as a rim of the other."""
 SPACING = 0.008
@@ -33,7 +33,7 @@ ROOM = 2000
 class Stage:
     """Puts the arm and everything around it into a MuJoCo scene."""
 
-    def __init__(self, simulator: Simulator, width: int, height: int, oversize: int = 1) -> None:
+    def __init__(self, simulator: Simulator, width: int, height: int) -> None:
         """Copy the model, so that looks can be set without a trace in the simulation."""
         self.arm = simulator.arm
         self.model = copy.copy(simulator.model)
@@ -48,6 +48,7 @@ class Stage:
         if not self.whole_arm:
             self.model.geom_rgba[self._links, 3] = OVERHEAD
         self.scene = mujoco.MjvScene(self.model, ROOM)
+        """What is to be seen, once it is set."""
 
     def set(
         self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0
@@ -60,33 +61,31 @@ class Stage:
             movement: What to draw of a movement: its whole plan, and what was done of it up to `step`.
             step: Index into the movement's states.
         """
+        touch = None
+        if movement is not None and movement.touch is not None and step >= movement.touch.step:
+            touch = movement.touch
+        self._pose(joints)
+        if touch is not None:
+            self._paint(self._hand if touch.link is None else self._links[touch.link], PALETTE.contact)
+        pencil = Pencil(self.scene)
+        self._draw_fittings(pencil)
+        self._draw_ends(pencil, scene)
+        self._draw_obstacles(pencil, scene, None if touch is None else touch.obstacle)
+        if movement is not None:
+            self._draw_movement(pencil, movement, step)
+
+    def _pose(self, joints: Float) -> None:
+        """Begin the scene anew with the arm in a posture."""
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
         self._data.qpos[: len(joints)] = joints
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
         mujoco.mjv_updateScene(
-            self.model,
-            self._data,
-            self._option,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self.scene,
-        )
-        touch = None if movement is None else movement.touch
-        touched = touch is not None and step >= touch.step
-        self._paint_arm(
-            self._links[touch.link] if touched and touch.link is not None else self._hand, touched
-        )
-        pencil = Pencil(self.scene)
-        self._draw_fittings(pencil)
-        self._draw_ends(pencil, scene)
-        self._draw_obstacles(pencil, scene, touch.obstacle if touched else None)
-        if movement is not None:
-            self._draw_movement(pencil, movement, step)
-        return self.scene
+            self.model, self._data, self._option, None, self._camera, everything, self.scene
+        )  # fmt: skip
 
     def _geoms_of_links(self) -> list[int]:
-        """The geoms of the moving bodies but the hand, in order; the obstacles' own geoms become invisible."""
+        """The geoms of the moving bodies but the hand, in order; hides the obstacles' own geoms."""
         links = []
         for geom in range(self.model.ngeom):
             body = self.model.geom_bodyid[geom]
@@ -112,11 +111,11 @@ class Stage:
             half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
             self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
 
-    def _paint_arm(self, part: int, touched: bool) -> None:
-        """Give the geom `part` the colour of contact where something was touched."""
+    def _paint(self, part: int, colour: Colour) -> None:
+        """Give one geom of the model a colour."""
         for geom in self.scene.geoms[: self.scene.ngeom]:
-            if touched and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid == part:
-                geom.rgba = np.array((*PALETTE.contact, 1.0), dtype=np.float32)
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid == part:
+                geom.rgba = np.array((*colour, 1.0), dtype=np.float32)
 
     def _draw_fittings(self, pencil: Pencil) -> None:
         """The base and the joints of a planar arm, and the handle where the hand is below the links."""

@@ -51,9 +51,10 @@ def frame_steps(time: NDArray[np.float64], fps: int) -> NDArray[np.int64]:
 class MovementRenderer:
     """Draws what happened in one simulation.
 
-    Nothing is opened before the first picture. `rgb_array` gives one picture of shape (height, width, 3): of a movement
-    its end, or the moment of first contact, after which there is nothing to learn from it. `rgb_array_list` gives
-    the film of the movement as a list of such pictures, `human` plays it in a window in real time.
+    Nothing is opened before the first picture. `rgb_array` gives one picture of shape (height, width, 3): the
+    end of a movement or, where the arm hit something, the moment of first contact, which tells more.
+    `rgb_array_list` gives the film of the movement as a list of such pictures, `human` plays it in a window in
+    real time.
     """
 
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
