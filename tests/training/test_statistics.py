@@ -1,0 +1,110 @@
+"""Closed forms and published values."""
+
+import math
+
+import numpy as np
+import pytest
+
+from viapoint.training import statistics
+
+
+def test_wilson_equals_published_values():
+    # Newcombe 1998, Stat. Med. 17, 857-872, table I, method 3
+    for successes, trials, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (1, 29, 0.0061, 0.1718)):
+        interval = statistics.wilson(successes, trials)
+        assert (round(interval.low, 4), round(interval.high, 4)) == (low, high)
+    assert statistics.wilson(0, 20).low == 0.0
+    assert round(statistics.wilson(0, 20).high, 4) == 0.1611
+
+
+@pytest.mark.parametrize("trials", [1, 7, 500])
+def test_wilson_solves_the_score_equation(trials):
+    z = 1.959963984540054
+    for successes in range(1, trials):
+        p, low, high = statistics.wilson(successes, trials)
+        for bound in (low, high):
+            assert abs(p - bound) == pytest.approx(z * math.sqrt(bound * (1 - bound) / trials), rel=1e-9)
+    assert statistics.wilson(trials, trials).high == 1.0
+
+
+def test_wilson_is_symmetric_and_narrows():
+    left, right = statistics.wilson(3, 40), statistics.wilson(37, 40)
+    assert left.low == pytest.approx(1 - right.high)
+    widths = [np.subtract(*statistics.wilson(n // 2, n)[:0:-1]) for n in (10, 100, 1000)]
+    assert widths[0] > widths[1] > widths[2] > 0
+    assert math.isnan(statistics.wilson(0, 0).estimate)
+
+
+@pytest.mark.parametrize(("successes", "trials", "confidence"), [(5, 4, 0.95), (-1, 4, 0.95), (1, 4, 1.0)])
+def test_wilson_refuses_what_cannot_be(successes, trials, confidence):
+    with pytest.raises(ValueError, match="must lie between"):
+        statistics.wilson(successes, trials, confidence)
+
+
+def test_mcnemar_is_the_exact_binomial_test():
+    from scipy.stats import binomtest
+
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        first, second = generator.random((2, 80)) < generator.random((2, 1))
+        result = statistics.mcnemar(first, second)
+        assert result.difference == pytest.approx(first.mean() - second.mean())
+        number = result.only_first + result.only_second
+        if number:
+            assert result.p_value == pytest.approx(binomtest(result.only_first, number).pvalue, rel=1e-9)
+    same = np.array([True, False, True])
+    assert statistics.mcnemar(same, same) == (0.0, 0, 0, 1.0)
+    five = statistics.mcnemar([True] * 5, [False] * 5)
+    assert five.p_value == pytest.approx(2 / 2**5)
+
+
+def test_paired_bootstrap_follows_the_normal_interval():
+    generator = np.random.default_rng(1)
+    first, second = generator.normal(0.3, 1.0, 400), np.zeros(400)
+    interval = statistics.paired_bootstrap(first, second, np.random.default_rng(2), samples=2000)
+    half = 1.96 * first.std() / 20
+    assert interval.estimate == pytest.approx(first.mean())
+    assert interval.low == pytest.approx(first.mean() - half, abs=0.2 * half)
+    assert interval.high == pytest.approx(first.mean() + half, abs=0.2 * half)
+    constant = statistics.paired_bootstrap(second + 1.0, second, np.random.default_rng(0), samples=10)
+    assert constant == (1.0, 1.0, 1.0)
+
+
+def test_interquartile_mean_is_the_trimmed_mean():
+    from scipy.stats import trim_mean
+
+    generator = np.random.default_rng(3)
+    for shape in ((5, 4), (7, 3), (1, 2)):
+        scores = generator.normal(size=shape)
+        assert statistics.interquartile_mean(scores) == pytest.approx(trim_mean(scores, 0.25, axis=None))
+    assert statistics.interquartile_mean([0, 1, 2, 1000]) == 1.5
+
+
+def test_stratified_bootstrap_keeps_tasks_apart():
+    constant_within_tasks = np.tile([0.0, 1.0, 2.0, 3.0], (5, 1))
+    interval = statistics.stratified_bootstrap(constant_within_tasks, np.random.default_rng(0), samples=50)
+    assert interval == (1.5, 1.5, 1.5)  # resampling across tasks would spread it
+    spread = np.random.default_rng(4).normal(size=(5, 4))
+    interval = statistics.stratified_bootstrap(spread, np.random.default_rng(0), samples=200)
+    assert interval.low < interval.estimate < interval.high
+
+
+def test_spl_by_its_formula():
+    assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(2.5 / 4)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: statistics.mcnemar([True], [True, False]),
+        lambda: statistics.mcnemar([], []),
+        lambda: statistics.paired_bootstrap([1.0], [1.0, 2.0], np.random.default_rng(0)),
+        lambda: statistics.interquartile_mean([]),
+        lambda: statistics.stratified_bootstrap([1.0], np.random.default_rng(0)),
+        lambda: statistics.success_weighted_path_length([1], [0.0], [1.0]),
+        lambda: statistics.success_weighted_path_length([1], [1.0, 2.0], [1.0]),
+    ],
+)
+def test_wrong_shapes_are_refused(call):
+    with pytest.raises(ValueError, match="must"):
+        call()

@@ -1,0 +1,237 @@
+"""Everything that training needs to go on as if it had never stopped.
+
+A checkpoint is taken between the collection of experience and the next, when SB3 holds nothing in local
+variables. It is a folder of `state.json` and `tensors.safetensors`, written whole or not at all, and like a
+model it holds no code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+
+from viapoint.training.files import (
+    BadFileError,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_folder,
+    write_json,
+)
+from viapoint.training.model_files import describe
+from viapoint.training.vec_env import ViaVecEnv
+
+FORMAT = 1
+COUNTERS = (
+    "seed",
+    "num_timesteps",
+    "_total_timesteps",
+    "_episode_num",
+    "_n_updates",
+    "_current_progress_remaining",
+)
+"""Numbers of SB3's algorithms that training continues from."""
+ARRAYS = ("_last_obs", "_last_episode_starts")
+DEQUES = ("ep_info_buffer", "ep_success_buffer")
+
+
+def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any]) -> None:
+    """Write the whole state of a training run; `extra` comes back from :func:`read_checkpoint`."""
+    tensors: dict[str, Any] = {}
+    state = {
+        "format": FORMAT,
+        "model": describe(model),
+        "counters": {name: getattr(model, name) for name in COUNTERS},
+        "recent": {name: list(getattr(model, name) or ()) for name in DEQUES},
+        "parameters": _take(model.get_parameters(), "parameters", tensors),
+        "variables": _take(_variables(model), "variables", tensors),
+        "arrays": _take({name: getattr(model, name) for name in ARRAYS}, "arrays", tensors),
+        "buffer": _take(_buffer_state(model), "buffer", tensors),
+        "random": _take(_random_state(model), "random", tensors),
+        "env": _take(_env(model).state(), "env", tensors),
+        "extra": dict(extra),
+    }
+
+    def fill(temporary: Path) -> None:
+        write_arrays(temporary / "tensors.safetensors", tensors)
+        state["sha256"] = hashlib.sha256((temporary / "tensors.safetensors").read_bytes()).hexdigest()
+        write_json(temporary / "state.json", state)
+
+    write_folder(folder, fill)
+
+
+def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
+    """Put a newly built model of the same kind and its environment into the state of a checkpoint.
+
+    Returns:
+        What `extra` was.
+
+    Raises:
+        BadFileError: The checkpoint is torn, foreign, or of another model.
+    """
+    path = folder / "tensors.safetensors"
+    state = read_json(folder / "state.json")
+    if state.get("format") != FORMAT:
+        raise BadFileError(folder / "state.json", f"must have format {FORMAT}, got {state.get('format')!r}")
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
+    if digest != state.get("sha256"):
+        raise BadFileError(path, "is torn: its hash is not the one that state.json states")
+    tensors = read_arrays(path)
+    if {**state["model"], "num_timesteps": 0} != {**describe(model), "num_timesteps": 0}:
+        raise BadFileError(
+            folder / "state.json", f"is of another model: {_difference(state['model'], describe(model))}"
+        )
+    try:
+        _restore(model, state, tensors)
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise BadFileError(folder, f"does not fit the model ({type(error).__name__}: {error})") from None
+    extra: dict[str, Any] = state["extra"]
+    return extra
+
+
+def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:
+    """Set what a checkpoint holds; which attributes these are is said here, never by the file."""
+    model.set_parameters(_torch(_put(state["parameters"], tensors)), exact_match=True)
+    variables, arrays = _put(state["variables"], tensors), _put(state["arrays"], tensors)
+    for name in _variables(model):
+        recursive_setattr(model, f"{name}.data", torch.from_numpy(variables[name]))
+    for name in COUNTERS:
+        setattr(model, name, state["counters"][name])
+    for name in ARRAYS:
+        setattr(model, name, arrays[name])
+    for name in DEQUES:
+        setattr(model, name, deque(state["recent"][name], maxlen=model._stats_window_size))
+    _restore_buffer(model, _put(state["buffer"], tensors))
+    _env(model).restore(_put(state["env"], tensors))
+    _restore_random(model, _put(state["random"], tensors))  # last: nothing may be drawn after it
+
+
+def _variables(model: BaseAlgorithm) -> dict[str, Any]:
+    """Tensors outside of modules and optimisers, such as SAC's entropy coefficient."""
+    return {name: recursive_getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
+
+
+def _buffer(model: BaseAlgorithm) -> BaseBuffer | None:
+    """The replay buffer; a rollout buffer is empty between two collections."""
+    return getattr(model, "replay_buffer", None)
+
+
+def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
+    """The filled part of the replay buffer's arrays."""
+    buffer = _buffer(model)
+    if buffer is None:
+        return {}
+    size = buffer.size()
+    arrays = {name: _cut(value, size) for name, value in vars(buffer).items() if _is_storage(value)}
+    return {"pos": buffer.pos, "full": buffer.full, "arrays": arrays}
+
+
+def _restore_buffer(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    buffer = _buffer(model)
+    if buffer is None:
+        return
+    for name, kept in vars(buffer).items():
+        if not _is_storage(kept):
+            continue
+        saved = state["arrays"][name]
+        pairs = [(kept[key], saved[key]) for key in kept] if isinstance(kept, dict) else [(kept, saved)]
+        for mine, theirs in pairs:
+            mine[: len(theirs)] = theirs
+    buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
+
+
+def _is_storage(value: Any) -> bool:
+    return isinstance(value, np.ndarray) or (
+        isinstance(value, dict) and bool(value) and all(isinstance(v, np.ndarray) for v in value.values())
+    )
+
+
+def _cut(value: Any, size: int) -> Any:
+    return {key: array[:size] for key, array in value.items()} if isinstance(value, dict) else value[:size]
+
+
+def _random_state(model: BaseAlgorithm) -> dict[str, Any]:
+    version, words, gauss = random.getstate()
+    return {
+        "python": [version, list(words), gauss],
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3 draws from it
+        "torch": torch.get_rng_state(),
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def _restore_random(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words), gauss))
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(torch.from_numpy(state["torch"]))
+    model.action_space.np_random.bit_generator.state = state["actions"]
+
+
+def _env(model: BaseAlgorithm) -> ViaVecEnv:
+    env = model.get_env()
+    assert isinstance(env, ViaVecEnv)
+    return env
+
+
+def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
+    """A copy of nested values whose arrays went into `tensors` and left {"tensor": name} behind."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        tensors[name] = value
+        return {"tensor": name}
+    if isinstance(value, Mapping):
+        whole = [str(key) for key in value if isinstance(key, int)]
+        entries = {str(key): _take(each, f"{name}/{key}", tensors) for key, each in value.items()}
+        return {"whole_numbers": entries} if whole else entries
+    if isinstance(value, list | tuple):
+        return [_take(each, f"{name}/{i}", tensors) for i, each in enumerate(value)]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _put(value: Any, tensors: Mapping[str, Any]) -> Any:
+    """The inverse of :func:`_take`, but for arrays in place of torch's tensors."""
+    if isinstance(value, list):
+        return [_put(each, tensors) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"tensor"}:
+        return tensors[value["tensor"]]
+    if set(value) == {"whole_numbers"}:
+        return {int(key): _put(each, tensors) for key, each in value["whole_numbers"].items()}
+    return {key: _put(each, tensors) for key, each in value.items()}
+
+
+def _torch(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _torch(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_torch(each) for each in value]
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+
+def _difference(saved: dict[str, Any], mine: dict[str, Any]) -> str:
+    for name in sorted(set(saved) | set(mine)):
+        if (
+            isinstance(saved.get(name), dict)
+            and isinstance(mine.get(name), dict)
+            and saved[name] != mine[name]
+        ):
+            return _difference(saved[name], mine[name])
+        if saved.get(name) != mine.get(name) and name != "num_timesteps":
+            return f"{name} was {saved.get(name)!r}, is {mine.get(name)!r}"
+    return "nothing differs"

@@ -1,0 +1,268 @@
+"""What the commands can be told: plain records, checked when made, that become the command line and JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args
+
+import gymnasium as gym
+import tyro
+
+import viapoint.envs
+from viapoint.training.presets import PRESETS, Algorithm
+
+C = TypeVar("C")
+
+DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
+
+
+def _from_words(words: list[str]) -> dict[str, Any]:
+    """NAME=VALUE ... as a dictionary; values are JSON where they can be, otherwise words."""
+    result: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise ValueError(f"must be NAME=VALUE, got {word!r}")
+        try:
+            result[name] = json.loads(value)
+        except ValueError:
+            result[name] = value
+    return result
+
+
+_NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=_from_words,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda value: [f"{name}={json.dumps(each)}" for name, each in value.items()],
+)
+NamedValues = Annotated[dict[str, Any], _NAMED_VALUES]
+"""On the command line: NAME=VALUE NAME=VALUE ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Train an agent.
+
+    Example: viapoint train --env viapoint/PlanarObstacles-v0 --algo viatd3 --seed 0 --out runs/first
+    """
+
+    env: str = DEFAULT_ENV
+    """Id of the environment."""
+    algo: Algorithm = "viatd3"
+    """Learning algorithm; presets.py holds the settings of each."""
+    seed: int = 0
+    """Of everything that is random: equal seeds give equal agents on one machine."""
+    n_timesteps: int | None = None
+    """Decisions in all; as the preset says if not given."""
+    n_envs: int | None = None
+    """Environments stepped together; as the preset says if not given."""
+    out: Path | None = None
+    """Run folder; runs/<environment>-<algorithm>-<seed> if not given."""
+    resume: bool = False
+    """Go on with the run in the folder from its last checkpoint."""
+    eval_every: int = 2_000
+    """Decisions between two evaluations on the validation scenes; 0 for none."""
+    eval_scenes: int = 500
+    """Validation scenes used by each, at most."""
+    checkpoint_every: int = 5_000
+    """Decisions between two checkpoints."""
+    env_kwargs: NamedValues = field(default_factory=dict)
+    """Of the environment, for example n_via=2 timing=learned."""
+    hyperparameters: NamedValues = field(default_factory=dict)
+    """Of the algorithm, instead of its preset's, for example batch_size=256."""
+    progress: bool = True
+    """Whether to show a progress bar."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        _check_env(self.env)
+        if self.algo not in get_args(Algorithm):
+            raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
+        for name, least in (("seed", 0), ("eval_every", 0), ("eval_scenes", 1), ("checkpoint_every", 1)):
+            _check_whole(name, getattr(self, name), least)
+        for name in ("n_timesteps", "n_envs"):
+            if getattr(self, name) is not None:
+                _check_whole(name, getattr(self, name), 1)
+
+    @property
+    def total_timesteps(self) -> int:
+        """Decisions in all."""
+        return self.n_timesteps or PRESETS[self.algo].n_timesteps
+
+    @property
+    def copies(self) -> int:
+        """Environments stepped together."""
+        return self.n_envs or PRESETS[self.algo].n_envs
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.out or Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """Measure agents and baselines on the same frozen scenes.
+
+    Example: viapoint evaluate runs/first --methods agent straight planner --scenes test
+    """
+
+    run: tyro.conf.Positional[Path | None] = None
+    """Run folder, or folder of a model."""
+    pretrained: str | None = None
+    """Id of an environment whose shipped agent is taken instead."""
+    methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
+    """agent, straight, constant, random, random16, random80, planner."""
+    candidates: int = 0
+    """Actions that the agent's critic ranks at each decision; 0 is the policy alone."""
+    scenes: str = "test"
+    """validation, test, hard, or a file of scenes."""
+    n_scenes: int | None = None
+    """Only the first so many."""
+    json: Path | None = None
+    """File for all results, scene by scene."""
+    env: str | None = None
+    """Id of the environment where no agent says it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        if self.env is not None:
+            _check_env(self.env)
+        _check_one_source(self.run, self.pretrained, needed="agent" in self.methods)
+        if not self.methods:
+            raise ValueError("methods must name at least one method")
+        _check_whole("candidates", self.candidates, 0)
+        if self.n_scenes is not None:
+            _check_whole("n_scenes", self.n_scenes, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayConfig:
+    """Film an agent's movements.
+
+    Example: viapoint play runs/first --video movements.mp4 --scenes hard
+    """
+
+    run: tyro.conf.Positional[Path | None] = None
+    """Run folder, or folder of a model."""
+    pretrained: str | None = None
+    """Id of an environment whose shipped agent is taken instead."""
+    video: Path = Path("movements.mp4")
+    """File to write."""
+    scenes: str = "test"
+    """validation, test, hard, or a file of scenes."""
+    n_scenes: int = 8
+    """How many of them, evenly spread over the set."""
+    candidates: int = 0
+    """Actions that the agent's critic ranks at each decision; 0 is the policy alone."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        _check_one_source(self.run, self.pretrained, needed=True)
+        _check_whole("n_scenes", self.n_scenes, 1)
+        _check_whole("candidates", self.candidates, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """Measure throughput as ratios to what the engine alone and a plain copy would take.
+
+    Example: viapoint bench --json bench.json
+    """
+
+    env: str = DEFAULT_ENV
+    """Id of the environment."""
+    num_envs: int = 512
+    """Environments in the batch."""
+    repeats: int = 9
+    """Measurements of each side, of which the fastest counts; they alternate."""
+    json: Path | None = None
+    """File for the figures."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        _check_env(self.env)
+        _check_whole("num_envs", self.num_envs, 1)
+        _check_whole("repeats", self.repeats, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoConfig:
+    """Train, evaluate, draw and film an agent: everything in one folder.
+
+    Example: viapoint demo --out runs/demo
+    """
+
+    out: Path = Path("runs/demo")
+    """Folder for everything; what is there already is kept."""
+    env: str = DEFAULT_ENV
+    """Id of the environment."""
+    seed: int = 0
+    """Of the training."""
+    n_timesteps: int | None = None
+    """Decisions to train for; as the preset says if not given."""
+    n_scenes: int | None = None
+    """Test scenes to evaluate on; all if not given."""
+    candidates: int = 80
+    """Actions that the agent's critic ranks in its second row of the table."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        _check_env(self.env)
+        _check_whole("seed", self.seed, 0)
+        _check_whole("candidates", self.candidates, 1)
+        for name in ("n_timesteps", "n_scenes"):
+            if getattr(self, name) is not None:
+                _check_whole(name, getattr(self, name), 1)
+
+
+def as_json(config: Any) -> dict[str, Any]:
+    """A configuration as plain values; :func:`from_json` is the inverse."""
+    return {each.name: _plain(getattr(config, each.name)) for each in dataclasses.fields(config)}
+
+
+def from_json(kind: type[C], record: Mapping[str, Any]) -> C:
+    """A configuration from plain values.
+
+    Raises:
+        ValueError: A name is unknown or a value is not allowed.
+    """
+    fields = {each.name: str(each.type) for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(record) - set(fields))
+    if unknown:
+        raise ValueError(f"{kind.__name__} knows {', '.join(fields)}, not {unknown[0]!r}")
+    values = {}
+    for name, value in record.items():
+        if "Path" in fields[name] and isinstance(value, str):
+            value = Path(value)
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return kind(**values)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _check_env(env: str) -> None:
+    if env not in gym.registry:
+        raise ValueError(f"env must be one of {', '.join(viapoint.envs.TASKS)}, got {env!r}")
+
+
+def _check_whole(name: str, value: Any, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+
+
+def _check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) -> None:
+    if run is not None and pretrained is not None:
+        raise ValueError("give a run folder or --pretrained, not both")
+    if needed and run is None and pretrained is None:
+        raise ValueError("name a run folder, or an environment with --pretrained")

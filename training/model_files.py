@@ -1,0 +1,244 @@
+"""A model as two files: words and numbers in `model.json`, tensors in `weights.safetensors`.
+
+Reading them runs no code of theirs: no pickle is opened, no module is imported by name, classes come from the
+tables here, and the weights must have the names, shapes and types of the model that the JSON describes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from sb3_contrib import TQC
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from viapoint.training.files import BadFileError, read_arrays, read_json, write_arrays, write_json
+from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.via_td3 import ViaTD3
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "viatd3": ViaTD3,
+    "sac": SAC,
+    "td3": TD3,
+    "ppo": PPO,
+    "tqc": TQC,
+}
+"""The learning algorithms by the name the command line knows them by."""
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+}
+FORMAT = 1
+"""Version of the two files."""
+NOT_STORED = frozenset(
+    {
+        "self",
+        "policy",
+        "env",
+        "seed",
+        "device",
+        "verbose",
+        "tensorboard_log",
+        "_init_setup_model",
+        "stats_window_size",
+    }
+    | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
+)
+"""Arguments of an algorithm that belong to one process, or that are not used here."""
+
+
+def save_model(model: BaseAlgorithm, folder: Path) -> None:
+    """Write what is needed to decide with a model and to train it on from its weights.
+
+    Raises:
+        ValueError: It is of a class that is not in ALGORITHMS, or was not trained on a :class:`ViaVecEnv`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "model.json", describe(model))
+    write_arrays(folder / "weights.safetensors", weights(model))
+
+
+def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
+    """Read a model.
+
+    Args:
+        folder: That :func:`save_model` wrote.
+        env: To train it on; without one it gets a single environment of its own kind, and is fit for
+            decisions.
+
+    Raises:
+        BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
+    """
+    path = folder / "model.json"
+    record = read_json(path)
+    if record.get("format") != FORMAT:
+        raise BadFileError(path, f"must have format {FORMAT}, got {record.get('format')!r}")
+    try:
+        env = env or _own_environment(record["env"])
+        hyperparameters = dict(record["hyperparameters"])
+        if env.num_envs == 1:
+            hyperparameters.update({"buffer_size": 1} if "buffer_size" in hyperparameters else {})
+        model = build(record["algorithm"], record["policy"], env, hyperparameters)
+        model.num_timesteps = int(record["num_timesteps"])
+    except BadFileError:
+        raise
+    except Exception as error:
+        raise BadFileError(path, f"does not describe a model ({type(error).__name__}: {error})") from None
+    put_weights(model, read_arrays(folder / "weights.safetensors"), folder / "weights.safetensors")
+    return model
+
+
+def build(
+    algorithm: str,
+    policy: str,
+    env: ViaVecEnv,
+    hyperparameters: Mapping[str, Any],
+    *,
+    seed: int | None = None,
+) -> BaseAlgorithm:
+    """A new model from plain values.
+
+    Args:
+        algorithm: One of ALGORITHMS.
+        policy: One of the algorithm's policies.
+        env: To learn on.
+        hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
+            writes them.
+        seed: Of the algorithm.
+
+    Raises:
+        ValueError: There is no such algorithm or policy.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
+    kind = ALGORITHMS[algorithm]
+    if policy not in kind.policy_aliases:
+        raise ValueError(
+            f"policy of {algorithm} must be one of {', '.join(kind.policy_aliases)}, got {policy!r}"
+        )
+    allowed = _argument_names(kind)
+    unknown = sorted(set(hyperparameters) - allowed)
+    if unknown:
+        raise ValueError(
+            f"{algorithm} has no hyperparameter {unknown[0]!r}; it has {', '.join(sorted(allowed))}"
+        )
+    size = int(np.prod(env.action_space.shape or ()))
+    arguments = {name: _decode(value, size) for name, value in hyperparameters.items()}
+    return kind(policy, env, seed=seed, device="cpu", **arguments)
+
+
+def describe(model: BaseAlgorithm) -> dict[str, Any]:
+    """Everything but the weights, as JSON can hold it."""
+    names = {kind: name for name, kind in ALGORITHMS.items()}
+    env = model.get_env()
+    if type(model) not in names or not isinstance(env, ViaVecEnv):
+        raise ValueError(
+            f"only {', '.join(kind.__name__ for kind in names)} on a ViaVecEnv can be saved, "
+            f"not {type(model).__name__} on {type(env).__name__}"
+        )
+    policies = {kind: name for name, kind in type(model).policy_aliases.items()}
+    stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
+    return {
+        "format": FORMAT,
+        "algorithm": names[type(model)],
+        "policy": policies[model.policy_class],
+        "env": {"id": env.env_id, "kwargs": _encode(env.env_kwargs)},
+        "num_timesteps": model.num_timesteps,
+        "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
+    }
+
+
+def weights(model: BaseAlgorithm) -> dict[str, Any]:
+    """The policy's tensors by name, targets and critics included."""
+    return {name: tensor.detach().cpu().numpy() for name, tensor in model.policy.state_dict().items()}
+
+
+def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
+    """Set the policy's tensors after checking every one of them.
+
+    Raises:
+        BadFileError: Names, shapes or types differ, or a value is not finite.
+    """
+    wanted = model.policy.state_dict()
+    if set(arrays) != set(wanted):
+        name = sorted(set(arrays) ^ set(wanted))[0]
+        raise BadFileError(
+            path, f"tensor {name!r} is {'missing' if name in wanted else 'unknown to the model'}"
+        )
+    for name, array in arrays.items():
+        expected = wanted[name].cpu().numpy()
+        if array.shape != expected.shape or array.dtype != expected.dtype:
+            got, must = (f"{a.dtype} {a.shape}" for a in (array, expected))
+            raise BadFileError(path, f"tensor {name!r} must be {must}, is {got}")
+        if not np.isfinite(array).all():
+            raise BadFileError(path, f"tensor {name!r} holds values that are not finite")
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
+    if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
+        raise ValueError(f"environment {record['id']!r} is not known")
+    return ViaVecEnv(record["id"], 1, **record["kwargs"])
+
+
+def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
+    """Arguments of an algorithm, through its bases as far as `**kwargs` hands them on."""
+    names: set[str] = set()
+    for each in kind.__mro__:
+        parameters = inspect.signature(vars(each).get("__init__", object.__init__)).parameters.values()
+        names |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    return names - NOT_STORED
+
+
+def _encode(value: Any) -> Any:
+    """A value as JSON can hold it; what is not a plain value is written as {"kind": ..., ...}."""
+    if isinstance(value, FloatSchedule):
+        return _encode(value.value_schedule)
+    if isinstance(value, ConstantSchedule):
+        return value.val
+    if isinstance(value, LinearSchedule):
+        return {"kind": "linear", "start": value.start, "end": value.end, "end_fraction": value.end_fraction}
+    if isinstance(value, VectorizedActionNoise):
+        return _encode(value.base_noise)
+    if isinstance(value, NormalActionNoise):
+        return {"kind": "normal", "sigma": float(np.max(value._sigma))}
+    if isinstance(value, type) and value in ACTIVATIONS.values():
+        return {"kind": "activation", "name": value.__name__}
+    if isinstance(value, Mapping):
+        return {str(name): _encode(each) for name, each in value.items()}
+    if hasattr(value, "frequency"):  # SB3's TrainFreq
+        return [value.frequency, value.unit.value]
+    if isinstance(value, list | tuple):
+        return [_encode(each) for each in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ValueError(f"a {type(value).__name__} cannot be written as JSON: {value!r}")
+
+
+def _decode(value: Any, size: int) -> Any:
+    """The inverse of :func:`_encode`; `size` is that of an action."""
+    if isinstance(value, Mapping):
+        kind = value.get("kind")
+        if kind == "linear":
+            return LinearSchedule(float(value["start"]), float(value["end"]), float(value["end_fraction"]))
+        if kind == "normal":
+            return NormalActionNoise(np.zeros(size), np.full(size, float(value["sigma"])))
+        if kind == "activation":
+            return ACTIVATIONS[value["name"]]
+        if kind is not None:
+            raise ValueError(f"kind must be linear, normal or activation, got {kind!r}")
+        return {name: _decode(each, size) for name, each in value.items()}
+    if isinstance(value, list) and len(value) == 2 and isinstance(value[1], str):
+        return tuple(value)
+    return [_decode(each, size) for each in value] if isinstance(value, list) else value

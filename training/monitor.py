@@ -1,0 +1,229 @@
+"""What happens besides learning: watching, validating, keeping."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+import time
+from types import FrameType, TracebackType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from tqdm import tqdm
+
+from viapoint.training.baselines import AgentMethod
+from viapoint.training.evaluate import MethodResult, evaluate
+from viapoint.training.frozen_scenes import FrozenScenes, load, shipped_path
+from viapoint.training.runs import Run
+from viapoint.training.trial import Trial
+from viapoint.training.vec_env import ViaVecEnv
+
+LOG_EVERY = 1_000
+"""Decisions between two entries of the log."""
+RECENT = 20
+"""Steps of all environments over which outcomes are averaged for log and progress bar."""
+DRAWN_SEED = 1_000_003
+"""Of validation scenes that are drawn where none are shipped; far from the seeds people train with."""
+LOGGED = ("collision", "min_clearance", "jerk_ratio", "duration", "reachable")
+
+
+class TrainingStoppedError(Exception):
+    """Training was stopped by Ctrl-C after its state was saved."""
+
+
+class Monitor(BaseCallback):
+    """Validates, keeps the best model, writes checkpoints, logs, and shows progress.
+
+    All of it happens between two collections of experience, when the state of a run is whole. None of it
+    draws from the learner's random generators, so a run is the same with it and without. It is entered as a
+    context around `learn`: inside, the first Ctrl-C saves and leaves, the second leaves at once.
+    """
+
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self.run, self.config = run, run.config
+        self.curve: list[dict[str, Any]] = []
+        """One record for each evaluation so far."""
+        self._best = (-1.0, -math.inf)
+        self._seconds_before, self._began = 0.0, time.monotonic()
+        self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_every, "evaluation": 0}
+        self._every = {
+            "log": LOG_EVERY,
+            "checkpoint": self.config.checkpoint_every,
+            "evaluation": self.config.eval_every,
+        }
+        self._validation = validation_scenes(run) if self.config.eval_every else None
+        self._recent: list[dict[str, float]] = []
+        self._stop = False
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`restore` needs, as plain values."""
+        return {
+            "curve": self.curve,
+            "best": list(self._best),
+            "seconds": self.seconds,
+            "next": dict(self._next),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state` was taken."""
+        self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
+        self._best = (float(state["best"][0]), float(state["best"][1]))
+        self._next = {name: int(state["next"][name]) for name in self._next}
+
+    @property
+    def seconds(self) -> float:
+        """Trained so far, earlier parts of the run included, validation excluded, [s]."""
+        return self._seconds_before + time.monotonic() - self._began
+
+    def __enter__(self) -> Monitor:
+        self._bar = tqdm(
+            total=self.config.total_timesteps,
+            unit=" decisions",
+            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
+            disable=not self.config.progress,
+            file=sys.stderr,
+            dynamic_ncols=True,
+        )
+        self._listens = threading.current_thread() is threading.main_thread()
+        if self._listens:
+            self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._listens:
+            signal.signal(signal.SIGINT, self._handler)
+        self._bar.close()
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._stop = True
+        self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
+
+    def _on_training_start(self) -> None:
+        self._began = time.monotonic()
+        self._show_progress()
+
+    def _on_step(self) -> bool:
+        env = self.training_env
+        if isinstance(env, ViaVecEnv) and env.last_outcome:
+            self._recent.append({name: float(np.mean(env.last_outcome[name])) for name in env.last_outcome})
+            del self._recent[:-RECENT]
+        self._show_progress()
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self._between(final=False)
+        if self._stop:
+            self._keep()
+            self.run.save("final", self.model)
+            raise TrainingStoppedError(
+                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, "
+                "and the same command with --resume goes on"
+            )
+
+    def _on_training_end(self) -> None:
+        self._between(final=True)
+
+    def _between(self, *, final: bool) -> None:
+        if self._validation is not None and (self._due("evaluation") or final):
+            self._validate(self._validation)
+        if self._due("log") or final:
+            self._log()
+        if self._due("checkpoint") or final:
+            self._keep()
+
+    def _due(self, what: str) -> bool:
+        """Whether it is time; if so, when the next time comes."""
+        if self.num_timesteps < self._next[what]:
+            return False
+        self._next[what] = (self.num_timesteps // self._every[what] + 1) * self._every[what]
+        return True
+
+    def _keep(self) -> None:
+        self.run.checkpoint(self.model, self.state())
+
+    def _validate(self, frozen: FrozenScenes) -> None:
+        """Measure the policy alone, add to the learning curve, keep the model if it is the best so far."""
+        if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
+            return
+        seconds, began = self.seconds, time.monotonic()
+        result = evaluate(
+            [AgentMethod("agent", self.model)],
+            frozen,
+            self.config.env,
+            env_kwargs=self.config.env_kwargs,
+            time_decisions=False,
+        ).results[0]
+        if result.partial:
+            return
+        self.curve.append(self._record(result, seconds))
+        self.run.write_curve(self.curve)
+        summary = result.summary()
+        ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or math.inf))
+        if ranking > self._best:
+            self._best = ranking
+            self.run.save("best", self.model)
+        self._began += time.monotonic() - began
+
+    def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
+        env, summary = self.training_env, result.summary()
+        names = (
+            "success",
+            "success_by_band",
+            "collision",
+            "min_clearance",
+            "goal_error",
+            "jerk_ratio",
+            "duration",
+        )
+        for name in ("success", "collision"):
+            self.logger.record(f"validation/{name}", summary[name]["rate"])
+        for band, rate in summary["success_by_band"].items():
+            self.logger.record(f"validation/success, share {band}", rate["rate"])
+        return {
+            "decisions": self.num_timesteps,
+            "physics_steps": env.physics_steps if isinstance(env, ViaVecEnv) else 0,
+            "seconds": round(seconds, 3),
+            **{name: summary[name] for name in names},
+        }
+
+    def _log(self) -> None:
+        if self._recent:
+            self.logger.record("rollout/success", self._average("is_success"))
+            for name in LOGGED:
+                self.logger.record(f"rollout/{name}", self._average(name))
+        self.model.dump_logs()
+
+    def _average(self, name: str) -> float:
+        return float(np.mean([each[name] for each in self._recent if name in each]))
+
+    def _show_progress(self) -> None:
+        self._bar.update(min(self.num_timesteps, self.config.total_timesteps) - self._bar.n)
+        if self._recent:
+            shown = {"success": f"{100.0 * self._average('is_success'):.0f} %"}
+            if self.curve:
+                shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
+            self._bar.set_postfix(shown, refresh=False)
+
+
+def validation_scenes(run: Run) -> FrozenScenes:
+    """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
+    config = run.config
+    if shipped_path("validation", config.env).is_file() and not config.env_kwargs:
+        return load("validation", config.env).take(slice(0, config.eval_scenes))
+    trial = Trial(config.env, 1, **config.env_kwargs)
+    scenes = trial.task.sampler()([np.random.default_rng(DRAWN_SEED)] * config.eval_scenes)
+    trial.close()
+    return FrozenScenes(
+        name="drawn",
+        env_id=config.env,
+        scenes=scenes,
+        share=np.full(config.eval_scenes, np.nan),
+        solution=np.zeros((config.eval_scenes, trial.task.action.size)),
+    )

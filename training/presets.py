@@ -1,0 +1,67 @@
+"""Tuned settings of the learning algorithms, in one table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Algorithm = Literal["viatd3", "sac", "td3", "ppo", "tqc"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """How an algorithm is run unless one says otherwise."""
+
+    policy: str
+    """One of the algorithm's policies."""
+    n_envs: int
+    """Environments that are stepped together."""
+    n_timesteps: int
+    """Decisions in all."""
+    hyperparameters: tuple[tuple[str, Any], ...]
+    """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.model_files` writes them."""
+
+    def arguments(self) -> dict[str, Any]:
+        """The hyperparameters as a fresh dictionary."""
+        return {
+            name: dict(value) if isinstance(value, dict) else value for name, value in self.hyperparameters
+        }
+
+
+def _preset(
+    n_envs: int, n_timesteps: int, policy: str = "MultiInputPolicy", **hyperparameters: Any
+) -> Preset:
+    return Preset(
+        policy=policy, n_envs=n_envs, n_timesteps=n_timesteps, hyperparameters=tuple(hyperparameters.items())
+    )
+
+
+_NETWORK: dict[str, Any] = {"net_arch": [256, 256]}
+_OFF_POLICY: dict[str, Any] = {
+    "learning_rate": 1e-3,
+    "buffer_size": 200_000,
+    "learning_starts": 1024,
+    "batch_size": 256,
+    "gamma": 0.99,  # of no account where an episode is one decision
+    "train_freq": 1,
+    "gradient_steps": 16,
+    "policy_kwargs": _NETWORK,
+}
+
+PRESETS: dict[str, Preset] = {
+    "viatd3": _preset(64, 12_032, "ViaPolicy"),  # its defaults are its settings
+    "sac": _preset(64, 40_000, **_OFF_POLICY),
+    "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(64, 40_000, **_OFF_POLICY),
+    "ppo": _preset(
+        64,
+        400_000,
+        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
+        n_steps=16,
+        batch_size=256,
+        n_epochs=10,
+        ent_coef=0.001,
+        policy_kwargs=_NETWORK,
+    ),
+}
+"""By the name the command line knows them by; the comments and units are those of Stable-Baselines3."""

@@ -1,0 +1,121 @@
+"""An evaluation as a table: for the terminal, for a document, for a program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from viapoint.training.evaluate import Evaluation, MethodResult
+from viapoint.training.files import write_bytes, write_json
+from viapoint.training.frozen_scenes import BANDS
+
+Summary = dict[str, Any]
+
+
+class Column(NamedTuple):
+    """One column of the table."""
+
+    heading: str
+    cell: Callable[[Summary], str]
+
+
+def _percent(rate: Summary | None) -> str:
+    return "-" if rate is None or rate["rate"] is None else f"{100.0 * rate['rate']:.1f} %"
+
+
+def _with_interval(rate: Summary) -> str:
+    if rate["rate"] is None:
+        return "-"
+    return f"{_percent(rate)} [{100.0 * rate['low']:.1f}, {100.0 * rate['high']:.1f}]"
+
+
+def _number(name: str, scale: float, digits: int) -> Callable[[Summary], str]:
+    def cell(summary: Summary) -> str:
+        value = summary[name]
+        return "-" if value is None else f"{scale * value:.{digits}f}"
+
+    return cell
+
+
+def _decision(summary: Summary) -> str:
+    median, high = summary["decision_time"], summary["decision_time_98"]
+    if median is None:
+        return "-"
+    return f"{1e3 * median:.2f} / {1e3 * high:.2f}" if high is not None else f"{1e3 * median:.1f} in a batch"
+
+
+def _in_band(name: str) -> Callable[[Summary], str]:
+    return lambda summary: _percent(summary["success_by_band"].get(name))
+
+
+COLUMNS = (
+    Column("success [95 %]", lambda summary: _with_interval(summary["success"])),
+    *(Column(f"share {band}", _in_band(band)) for band in BANDS),
+    Column("collision", lambda summary: _percent(summary["collision"])),
+    Column("clearance [mm]", _number("min_clearance", 1e3, 1)),
+    Column("goal error [mm]", _number("goal_error", 1e3, 2)),
+    Column("jerk ratio", _number("jerk_ratio", 1.0, 2)),
+    Column("SPL", _number("spl", 1.0, 3)),
+    Column("duration [s]", _number("duration", 1.0, 2)),
+    Column("decision [ms], median / 98 %", _decision),
+)
+
+NOTES = (
+    "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
+    "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions that "
+    "solve a scene. Clearance and goal error are medians of all scenes, jerk ratio (to the straight "
+    "movement) and duration of the successes. SPL: success weighted by straight distance over path length."
+)
+
+
+def rows(evaluation: Evaluation) -> list[list[str]]:
+    """Heading and cells, method by method."""
+    table = [["method", *(column.heading for column in COLUMNS)]]
+    for result in evaluation.results:
+        summary = result.summary()
+        table.append([_name(result), *(column.cell(summary) for column in COLUMNS)])
+    return table
+
+
+def title(evaluation: Evaluation) -> str:
+    """What was measured on what."""
+    number = max(len(result.success) for result in evaluation.results)
+    return f"{evaluation.env_id}, scenes {evaluation.scenes} ({number}, sha256 {evaluation.sha256[:12]})"
+
+
+def markdown(evaluation: Evaluation) -> str:
+    """The table as a document."""
+    head, *body = rows(evaluation)
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"# {title(evaluation)}\n\n{table}\n\n{NOTES}\n"
+
+
+def show(evaluation: Evaluation, console: Console | None = None) -> None:
+    """Print the table."""
+    console = console or Console()
+    head, *body = rows(evaluation)
+    shown = [i for i in range(len(head)) if i == 0 or any(line[i] != "-" for line in body)]
+    table = Table(title=title(evaluation), title_justify="left")
+    for i in shown:
+        table.add_column(head[i], justify="left" if i == 0 else "right")
+    for line in body:
+        table.add_row(*(line[i] for i in shown))
+    console.print(table)
+
+
+def write(evaluation: Evaluation, folder: Path, stem: str = "table") -> tuple[Path, Path]:
+    """Write the table as Markdown and as JSON; the JSON holds every outcome of every scene, too."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document, data = folder / f"{stem}.md", folder / f"{stem}.json"
+    write_bytes(document, markdown(evaluation).encode())
+    write_json(data, evaluation.as_json())
+    return document, data
+
+
+def _name(result: MethodResult) -> str:
+    return f"{result.name} (partial: {len(result.success)} scenes)" if result.partial else result.name

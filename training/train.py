@@ -1,0 +1,95 @@
+"""Training an agent, from a configuration to a run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+
+from viapoint.training.config import TrainConfig
+from viapoint.training.model_files import build
+from viapoint.training.monitor import Monitor, TrainingStoppedError
+from viapoint.training.presets import PRESETS
+from viapoint.training.runs import Run
+from viapoint.training.vec_env import ViaVecEnv
+
+__all__ = ["TrainingStoppedError", "new_model", "one_thread", "train"]
+
+
+def train(config: TrainConfig) -> Run:
+    """Train an agent and leave everything in a run folder.
+
+    With `config.resume` the run in the folder goes on with its own configuration, from its last checkpoint,
+    to the same result as if it had never stopped; `n_timesteps` may extend it.
+
+    Raises:
+        BadFileError: The folder cannot take the run, or does not hold the one to resume.
+        TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
+    """
+    run = _resumed(config) if config.resume else Run.create(config)
+    with run.locked(), one_thread():
+        env = ViaVecEnv(run.config.env, run.config.copies, **run.config.env_kwargs)
+        try:
+            model = new_model(run.config, env)
+            with _logging(model, run), Monitor(run) as monitor:
+                _learn(model, run, monitor)
+        finally:
+            env.close()
+    return run
+
+
+def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
+    """The untrained model that a configuration asks for."""
+    preset = PRESETS[config.algo]
+    hyperparameters = {**preset.arguments(), **config.hyperparameters}
+    return build(config.algo, preset.policy, env, hyperparameters, seed=config.seed)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: fastest for small networks, and the same numbers on any number of cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _resumed(config: TrainConfig) -> Run:
+    """The run in the folder, with its own configuration but for what this call may change."""
+    run = Run(config.folder)
+    if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
+        run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
+        run.write_config()
+    run.config = dataclasses.replace(run.config, progress=config.progress)
+    return run
+
+
+def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:
+    restored, passed_over = run.restore(model)
+    for reason in passed_over:
+        print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
+    if restored is not None:
+        monitor.restore(restored)
+    run.write_curve(monitor.curve)
+    remaining = run.config.total_timesteps - model.num_timesteps
+    if remaining > 0:
+        model.learn(remaining, monitor, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
+    run.save("final", model)
+
+
+@contextmanager
+def _logging(model: BaseAlgorithm, run: Run) -> Iterator[None]:
+    folder = str(run.folder / "tensorboard")
+    logger = Logger(folder, [TensorBoardOutputFormat(folder)])
+    model.set_logger(logger)
+    try:
+        yield
+    finally:
+        logger.close()
