@@ -1,7 +1,7 @@
 """The border of the package: any array library in, one clear error for bad numbers.
 
-The formulas of this package use operators and Array API names only, so one source serves NumPy and torch. torch is
-imported by array-api-compat, and only when the caller hands in tensors.
+The formulas of this package use operators and Array API names only, so one source serves NumPy and torch.
+torch is imported by array-api-compat, and only when the caller hands in tensors.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def as_floats(**named: Any) -> tuple[Namespace, list[Any]]:
         **named: arrays, numbers or nested lists by argument name.
 
     Returns:
-        The namespace and the arrays in the order given. The dtype is the widest floating dtype among the arrays
-        (numbers, lists and integer arrays do not count, and are float64 if nothing else is there).
+        The namespace and the arrays in the order given. The dtype is the widest floating dtype among the
+        arrays (numbers, lists and integer arrays do not count, and are float64 if nothing else is there).
 
     Raises:
         ValueError: an argument is not numeric, or not finite.
@@ -115,7 +115,7 @@ def _foreign_floats(named: dict[str, Any], values: list[Any]) -> tuple[Namespace
 
 
 def require(xp: Namespace, holds: Array, name: str, array: Array, what: str) -> None:
-    """Raise ValueError with name, shape, index and value of the first entry of `array` for which `holds` is False."""
+    """Raise ValueError naming the first entry of `array` for which `holds` is False."""
     if holds.all():
         return
     index = tuple(int(i) for i in np.argwhere(~to_numpy(holds))[0])
@@ -133,7 +133,7 @@ def require_vectors(name: str, array: Array, dimension: int | None = None) -> No
 
 
 def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """The common leading shape, or ValueError naming the arguments that do not go together."""
+    """Return the common leading shape; ValueError names arguments that do not go together."""
     first, *rest = shapes.values()
     if all(shape == first for shape in rest):
         return first
@@ -150,7 +150,7 @@ def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
 
 
 def to_numpy(array: Array) -> np.ndarray[Any, Any]:
-    """A NumPy view or copy of `array`, outside of any gradient."""
+    """Return a NumPy view or copy of `array`, outside of any gradient."""
     if isinstance(array, np.ndarray):
         return array
     if hasattr(array, "detach"):
@@ -159,7 +159,7 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
 
 
 def detach(array: Array) -> Array:
-    """The same numbers, outside of any gradient."""
+    """Return the same numbers, outside of any gradient."""
     return array.detach() if hasattr(array, "detach") else array
 
 
@@ -176,10 +176,10 @@ def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
 
 
 def constant(table: tuple[tuple[float, ...], ...], other: Array) -> Array:
-    """A constant matrix in the library, dtype and device of `other`, made once."""
+    """Return a constant matrix in the library, dtype and device of `other`, made once."""
     if isinstance(other, np.ndarray):
         return _numpy_constant(table, other.dtype)
-    return _foreign_constant(table, type(other), other.dtype, other.device)
+    return _tensor_constant(table, other.dtype, other.device)
 
 
 @lru_cache(maxsize=256)
@@ -188,11 +188,12 @@ def _numpy_constant(table: tuple[tuple[float, ...], ...], dtype: Any) -> Array:
 
 
 @lru_cache(maxsize=256)
-def _foreign_constant(table: tuple[tuple[float, ...], ...], kind: type, dtype: Any, device: Any) -> Array:
-    from array_api_compat import torch as xp
+def _tensor_constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: Any) -> Array:
+    import array_api_compat.torch
 
-    with xp.inference_mode(False) if hasattr(xp, "inference_mode") else nullcontext():
-        return xp.asarray(table, dtype=dtype, device=device)
+    torch: Any = array_api_compat.torch
+    with torch.inference_mode(False):  # a constant made in inference mode could not serve a gradient later
+        return torch.tensor(table, dtype=dtype, device=device)
 
 
 def error_state(xp: Namespace) -> AbstractContextManager[Any]:

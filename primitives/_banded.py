@@ -1,11 +1,12 @@
 """The states at the knots that make a movement through given points least costly.
 
-With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments, a zero gradient with respect to the unknown derivatives at
-the knots is a symmetric positive definite system with a narrow band. The equations say that the higher derivatives
-(snap and jerk for m = 3) are continuous there; the lower ones are by construction.
+With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments, a zero gradient with respect to the unknown
+derivatives at the knots is a symmetric positive definite system with a narrow band. The equations say that
+the higher derivatives (snap and jerk for m = 3) are continuous there; the lower ones are by construction.
 
-Nothing here knows how a batch lies in memory: the entries are arrays, or Python floats where all movements share their
-durations, and every operation works element by element. So a batch gives bit for bit what each item gives alone.
+Nothing here knows how a batch lies in memory: the entries are arrays, or Python floats where all movements
+share their durations, and every operation works element by element. So a batch gives bit for bit what each
+item gives alone.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class BandedFactor:
 
 
 def factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
-    """Eliminate without pivoting (the matrix is positive definite); upper[p][q] = entry (p, q), q >= p; consumed."""
+    """Eliminate without pivoting; upper[p][q] is entry (p, q), q >= p, and is consumed."""
     multipliers: list[dict[int, Entry]] = []
     pivots: list[Entry] = []
     for p, row in enumerate(upper):
@@ -72,7 +73,7 @@ def solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array],
     Returns:
         The same with every FREE replaced.
     """
-    nodes = {}
+    nodes: dict[tuple[int, int], int] = {}
     for k, state in enumerate(states):
         for i, value in enumerate(state):
             if value is FREE:
@@ -94,7 +95,7 @@ def assemble(
     states: States,
     nodes: dict[tuple[int, int], int],
 ) -> tuple[list[dict[int, Entry]], list[Array]]:
-    """Matrix (rows of its upper half) and right side of the zero-gradient equations of the unknown `nodes`."""
+    """Return the upper half of the matrix and the right side of the zero-gradient equations of `nodes`."""
     table = stiffness_table(order)
     upper: list[dict[int, Entry]] = [{} for _ in nodes]
     right: list[Any] = [None] * len(nodes)

@@ -1,4 +1,4 @@
-"""From points, durations and boundary values to a trajectory: what point_to_point and through have in common."""
+"""From points, durations and boundary values to a trajectory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def boundary_values(
     goal_velocity: Boundary,
     goal_acceleration: Boundary,
 ) -> dict[str, Boundary]:
-    """The boundary arguments by name, with the sentinel refused where a movement cannot leave it open."""
+    """Return the boundary arguments by name; FREE is refused where a movement cannot leave it open."""
     for name, value in (("start_velocity", start_velocity), ("start_acceleration", start_acceleration)):
         if value is FREE:
             raise ValueError(
@@ -47,7 +47,7 @@ def check_order(order: int, start_acceleration: Boundary = None, goal_accelerati
 
 
 def check_boundary_shapes(boundary: dict[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
-    """Leading shapes of the given boundary arrays; ValueError where the last axis is not the dimension of space."""
+    """Return the leading shapes of the given boundary values; ValueError where the last axis is not D."""
     shapes = {}
     for name, value in boundary.items():
         if value is None or value is FREE:
@@ -59,12 +59,12 @@ def check_boundary_shapes(boundary: dict[str, Boundary], dimension: int) -> dict
 
 
 def end_states(order: int, velocity: Boundary, acceleration: Boundary) -> list[Any]:
-    """The m - 1 derivatives at one end; jerk (order 4) is zero there."""
+    """Return the m - 1 derivatives at one end; jerk (order 4) is zero there."""
     return [velocity, acceleration, None][: order - 1]
 
 
 def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
-    """The least-cost trajectory through all waypoints at fixed times.
+    """Return the least-cost trajectory through all waypoints at fixed times.
 
     Args:
         xp: namespace.
@@ -115,7 +115,7 @@ def _scaled_states(states: States, lengths: Sequence[Any], rest: Array, order: i
 def _connect_without_empty(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Trajectory:
-    """The same where some durations are 0: those via-points are dropped, item by item."""
+    """Do the same where some durations are 0: those via-points are dropped, item by item."""
     *batch, knots, dimension = waypoints.shape
     count = int(np.prod(batch, dtype=int))
     durations = broadcast_to(xp, durations, (*batch, knots - 1))

@@ -10,7 +10,7 @@ with the step D instead of x1, so that a far origin costs no accuracy.
 from __future__ import annotations
 
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache
 from math import factorial, perm, sqrt
 from typing import TypeAlias
 
@@ -20,18 +20,18 @@ Exact: TypeAlias = list[list[Fraction]]
 ORDERS = (2, 3, 4)
 
 
-@lru_cache(maxsize=None)
+@cache
 def coefficient_table(order: int) -> Table:
-    """The matrix that maps s to the coefficients of 1, u, ..., u^(2m-1); for m = 3 its lower half is the primer's
-    10 D - 6 V0 - 4 V1 - 1.5 A0 + .5 A1 and so on."""
+    """Return the matrix that maps s to the coefficients of 1, u, ..., u^(2m-1)."""
     return _floats(_coefficients(order))
 
 
-@lru_cache(maxsize=None)
+@cache
 def stiffness_table(order: int) -> Table:
-    """The matrix W of the cost 1/2 s^T W s / h^(2m-1) of a segment, without the row and column of x0.
+    """Return the matrix W of the cost 1/2 s^T W s / h^(2m-1) of a segment, without row and column of x0.
 
-    Rows and columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). For m = 3 it holds 720, 360, 192, 168, 60, ...
+    Rows and columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). For m = 3 it holds 720, 360, 192, 168, 60,
+        ...
     """
     places = [order, *range(1, order), *range(order + 1, 2 * order)]
     upper = [[row[place] for place in places] for row in _coefficients(order)[order:]]
@@ -51,12 +51,12 @@ def stiffness_table(order: int) -> Table:
     )
 
 
-@lru_cache(maxsize=None)
+@cache
 def energy_table(order: int, nu: int) -> Table:
-    """Matrix L with |L c|^2 = integral over [0, 1] of (nu-th derivative)^2; c = coefficients of u^nu ... u^(2m-1).
+    """Return L with |L c|^2 = integral over [0, 1] of the squared nu-th derivative.
 
-    It is the transposed Cholesky factor of the Gram matrix (scaled shifted Legendre polynomials), so a cost is a sum
-    of squares and loses nothing by cancellation.
+    It is the transposed Cholesky factor of the Gram matrix (scaled shifted Legendre polynomials), so a cost
+    is a sum of squares and loses nothing by cancellation.
     """
     gram = _gram(order, nu)
     size = len(gram)
@@ -70,9 +70,9 @@ def energy_table(order: int, nu: int) -> Table:
     return tuple(tuple(sqrt(pivots[j]) * float(lower[i][j]) for i in range(size)) for j in range(size))
 
 
-@lru_cache(maxsize=None)
+@cache
 def derivative_factors(order: int, nu: int) -> Table:
-    """Column (2m - nu, 1) of the factors k! / (k - nu)! that the nu-th derivative puts on u^k, k = nu ... 2m-1."""
+    """Return the column of factors k! / (k - nu)! that the nu-th derivative puts on u^k, k = nu ... 2m-1."""
     return tuple((float(perm(k, nu)),) for k in range(nu, 2 * order))
 
 

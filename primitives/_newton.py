@@ -1,7 +1,7 @@
 """Many small minimisations side by side: damped Newton steps, every problem at its own pace.
 
-The problems are the last axis of all arrays, and every operation works element by element, so the result of one does not
-depend on which others share the batch.
+The problems are the last axis of all arrays, and every operation works element by element, so the result of
+one does not depend on which others share the batch.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Minima:
 def minimise(evaluate: Evaluate, z: Floats) -> Minima:
     """Local minima from the given starts.
 
-    A step of the Newton iteration whose length is below 1e-8 is taken and is the last one: its successor would be of the
-    order of its square.
+    A step of the Newton iteration whose length is below 1e-8 is taken and is the last one: its successor
+    would be of the order of its square.
     """
     z = z.copy()
     active = np.arange(z.shape[1])
@@ -86,7 +86,8 @@ def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
     """-H^-1 g with the pivots of L D L^T made positive, and no component longer than 1.5."""
     step = -solve_positive(hessian, gradient)
     longest = np.abs(step).max(axis=0)
-    return step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
+    shortened: Floats = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
+    return shortened
 
 
 def solve_positive(matrix: Floats, right: Floats) -> Floats:
@@ -111,7 +112,7 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
 
 def _sum(array: Floats) -> Floats:
     """Sum over the first axis in its order, whatever the memory layout."""
-    total = array[0].copy()
+    total: Floats = array[0].copy()
     for row in array[1:]:
         total += row
     return total

@@ -1,8 +1,9 @@
 """The jerk cost of the best movement through given points, as a function of the segment durations alone.
 
-With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s). Its gradient is that of phi at fixed states
-(envelope theorem), its Hessian the Schur complement phi_hh - phi_hy phi_yy^-1 phi_yh, where phi_yy is the banded matrix of
-the linear problem. phi_s = 1/2 h^-5 |q0|^2 with the three Legendre modes of the jerk q0 = P s of the segment's data s.
+With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s). Its gradient is that of phi
+at fixed states (envelope theorem), its Hessian the Schur complement phi_hh - phi_hy phi_yy^-1 phi_yh, where
+phi_yy is the banded matrix of the linear problem. phi_s = 1/2 h^-5 |q0|^2 with the three Legendre modes of
+the jerk q0 = P s of the segment's data s.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ class PassageCost:
     goal: list[Any]
 
     def chosen(self, items: Any) -> PassageCost:
-        """The movements `items`, in that order."""
+        """Return the movements `items`, in that order."""
         ends = [
             [v[:, items] if isinstance(v, np.ndarray) else v for v in end] for end in (self.start, self.goal)
         ]
         return PassageCost(self.steps[:, :, items], *ends)
 
     def scale(self) -> Floats:
-        """(N,) a cost that is small beside any movement of this extent, so that its logarithm may be taken."""
+        """Return (N,) the squared extent of each movement, 1 where it is zero."""
         total = _total(self.steps * self.steps)
         for value in (*self.start, *self.goal):
             if isinstance(value, np.ndarray):
@@ -61,7 +62,7 @@ class PassageCost:
         """J (N,), dJ/dh (S, N), d2J/dh2 (S, S, N) at durations h (S, N)."""
         segments = len(h)
         states: States = [self.start, *([FREE, FREE] for _ in range(segments - 1)), self.goal]
-        nodes = {}
+        nodes: dict[tuple[int, int], int] = {}
         for k, state in enumerate(states):
             for i, value in enumerate(state):
                 if value is FREE:
@@ -88,7 +89,7 @@ class PassageCost:
         return j, first, hessian
 
     def _data(self, h: Floats, states: States) -> list[Floats]:
-        """s = (D, V0, A0, V1, A1), each (S, D, N)."""
+        """S = (D, V0, A0, V1, A1), each (S, D, N)."""
         nothing = np.zeros(self.steps.shape[1:])
         velocity, acceleration = (
             np.stack([nothing if state[i] is None else state[i] for state in states]) for i in range(2)
@@ -117,14 +118,14 @@ def _apply(data: list[Floats], power: int) -> list[Floats]:
     """P E^power s, with E the degrees: what the modes become when h d/dh acts on s."""
     modes = []
     for row in _MODES:
-        total = None
+        total: Any = None
         for place, weight in row.items():
             if power and not _DEGREES[place]:
                 continue
             term = (weight * _DEGREES[place] ** power) * data[place]
             total = term if total is None else total + term
         modes.append(total)
-    return modes  # type: ignore[return-value]
+    return modes
 
 
 def _segment_derivatives(
@@ -145,13 +146,13 @@ def _segment_derivatives(
 
 
 def _mixed_rows(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floats]:
-    """d2 phi_s / dy dh_s for the four states of a segment: h^(i-6) (P^T q1 + (i - 5) P^T q0), each (S, D, N)."""
+    """Return J (N,) and the first two derivatives (S, N) of phi_s by h_s at fixed states."""
     inverse = (1.0 / h)[:, None]
     fourth = inverse * inverse * inverse * inverse
     rows = {}
     for place in (1, 2, 3, 4):
         degree = _DEGREES[place]
-        total = None
+        total: Any = None
         for row, zero, one in zip(_MODES, q0, q1, strict=True):
             if place in row:
                 term = row[place] * (one + (degree - 5.0) * zero)
@@ -170,7 +171,7 @@ def _product(p: list[Floats], q: list[Floats]) -> Floats:
 
 def _sum_dimensions(array: Floats) -> Floats:
     """Sum over the axis before the last, in its order."""
-    total = array[..., 0, :]
+    total: Floats = array[..., 0, :]
     for d in range(1, array.shape[-2]):
         total = total + array[..., d, :]
     return total
@@ -179,7 +180,7 @@ def _sum_dimensions(array: Floats) -> Floats:
 def _total(array: Floats) -> Floats:
     """Sum over everything but the last axis, in its order."""
     rows = _sum_dimensions(array)
-    total = rows[0]
+    total: Floats = rows[0]
     for row in rows[1:]:
         total = total + row
     return total

@@ -1,8 +1,8 @@
 """Gradients of the free passage times by the implicit function theorem: one Newton step that changes nothing.
 
-At the optimum the gradient of the reduced cost with respect to the durations vanishes. One more Newton step, with the inverse
-Hessian as a constant and the gradient as a function of waypoints and boundary values, has the value of the optimum and its
-derivative; no iteration is unrolled.
+At the optimum the gradient of the reduced cost with respect to the durations vanishes. One more Newton step,
+with the inverse Hessian as a constant and the gradient as a function of waypoints and boundary values, has
+the value of the optimum and its derivative; no iteration is unrolled.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import numpy as np
 
 from ._arrays import FREE, Array, Boundary, Namespace, detach, like, to_numpy
 from ._connecting import connect
-from ._cost_gradient import duration_gradient
 from ._newton import solve_positive
 from ._passage_cost import PassageCost
 from ._passage_newton import log_cost
 from ._passage_rest import attach_gradient
+from .gradients import duration_gradient
 
 _LARGEST = 1e3
-"""Bound on the entries of the inverse Hessian of the log-cost, so that nearly merging knots keep a finite gradient."""
+"""Bound on the entries of the inverse Hessian of the log-cost, so that nearly merging knots keep a finite
+gradient."""
 
 
 def attach(
     fractions: Array, waypoints: Array, duration: Array, boundary: dict[str, Boundary], xp: Namespace
 ) -> Array:
-    """The same fractions (..., S), differentiable with respect to the other arguments.
+    """Return the same fractions (..., S), differentiable with respect to the other arguments.
 
     Movements with a dropped via-point get the gradient zero.
     """
@@ -38,7 +39,7 @@ def attach(
     whole = xp.all(fractions > 0, axis=-1)[..., None]
     safe = xp.where(whole, fractions, xp.ones_like(fractions) / fractions.shape[-1])
     ends = _unit_time(boundary, duration)
-    states = [ends[:2], *([FREE, FREE] for _ in range(fractions.shape[-1] - 1)), ends[2:]]
+    states: list[list[Any]] = [ends[:2], *([FREE, FREE] for _ in range(fractions.shape[-1] - 1)), ends[2:]]
     movement = connect(xp, 3, waypoints, safe, states)
     first = safe * duration_gradient(movement.coefficients, movement.rates)
     gradient = first - safe * first.sum(-1)[..., None]
@@ -50,7 +51,7 @@ def attach(
 
 
 def _unit_time(boundary: dict[str, Boundary], duration: Array) -> list[Boundary]:
-    """start and goal velocity and acceleration in unit time: V = v T, A = a T^2."""
+    """Start and goal velocity and acceleration in unit time: V = v T, A = a T^2."""
     time = duration[..., None]
     scaled: list[Any] = []
     for name, value in boundary.items():

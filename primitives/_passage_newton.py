@@ -1,8 +1,8 @@
 """Free passage times of any number of via-points: damped Newton on the logarithm of the reduced jerk cost.
 
-The durations are h_i = exp(z_i) / sum_j exp(z_j) in unit total time, positive by construction; the logarithm of the cost spans
-few units where the cost spans decades. Rest to rest only one minimum has ever been seen; with moving ends there can be
-several, so that case starts from several points and compares.
+The durations are h_i = exp(z_i) / sum_j exp(z_j) in unit total time, positive by construction; the logarithm
+of the cost spans few units where the cost spans decades. Rest to rest only one minimum has ever been seen;
+with moving ends there can be several, so that case starts from several points and compares.
 """
 
 from __future__ import annotations
@@ -15,29 +15,21 @@ from ._newton import Floats, Minima, minimise
 from ._passage_cost import PassageCost
 
 _STARTS = 10
-"""Starts with moving ends: even, by chord, and eight drawn from the flat Dirichlet distribution with a fixed seed."""
+"""Starts with moving ends: even, by chord, and eight drawn from the flat Dirichlet distribution with a fixed
+seed."""
 
 
 def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
     """Fractions of the duration per segment, (N, S), and whether the iteration converged, (N,)."""
-    starts = _starts(cost.steps, several)
-    best, fractions = None, None
-    for start in starts:
-        minima = _from_start(cost, start)
-        found = _softmax(minima.z)
-        if best is None:
-            best, fractions = minima, found
-        else:
-            # A later start must be better by more than rounding, else ties would be decided by noise.
-            better = (minima.value < best.value - 1e-9) & (minima.converged | ~best.converged)
-            fractions = np.where(better, found, fractions)
-            best = Minima(
-                np.where(better, minima.z, best.z),
-                np.where(better, minima.value, best.value),
-                np.where(better, minima.converged, best.converged),
-            )
-    assert best is not None and fractions is not None
-    return np.ascontiguousarray(fractions.T), best.converged
+    first, *others = _starts(cost.steps, several)
+    best = _from_start(cost, first)
+    for start in others:
+        found = _from_start(cost, start)
+        # A later start must be better by more than rounding, else ties would be decided by noise.
+        better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
+        pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
+        best = Minima(*(np.where(better, new, old) for new, old in pairs))
+    return np.ascontiguousarray(_softmax(best.z).T), best.converged
 
 
 def _from_start(cost: PassageCost, start: Floats) -> Minima:
@@ -50,7 +42,7 @@ def _from_start(cost: PassageCost, start: Floats) -> Minima:
 
 
 def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
-    """log(J + reference) with gradient and Hessian with respect to z; the Hessian's null direction (1, ..., 1) is filled."""
+    """Return log(J + reference), gradient and Hessian with respect to z."""
     h = _softmax(z)
     j, first, second = cost.derivatives(h)
     scale = 1.0 / (j + reference)
@@ -81,10 +73,11 @@ def _outer(p: Floats, q: Floats) -> Floats:
 def _softmax(z: Floats) -> Floats:
     largest = z.max(axis=0)
     h = np.exp(z - largest)
-    total = h[0]
+    total: Floats = h[0]
     for row in h[1:]:
         total = total + row
-    return h / total
+    shares: Floats = h / total
+    return shares
 
 
 def _starts(steps: Floats, several: bool) -> list[Floats]:

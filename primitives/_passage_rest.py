@@ -1,11 +1,13 @@
 """The free passage time of one via-point, rest to rest: the root of a polynomial that has exactly one.
 
-Substituting the movement into Flash & Hogan's Eq. C16, pi . v(t1) = 0, gives with E = x1 - x0, D = xf - x0 and
+Substituting the movement into Flash & Hogan's Eq. C16, pi . v(t1) = 0, gives with E = x1 - x0, D = xf - x0
+and
 
     a = E.D,   b = D.D,   c = E.E,   q = 10 t^3 - 15 t^4 + 6 t^5,   w = t^3 (2 - t)
 
-the equation F(t) = (E - D q).(E (1 - 2t) + D w) = c (1 - 2t) + a w - q (a (1 - 2t) + b w) = 0, of degree 9. It has one root
-in (0, 1), simple, the global minimum of the jerk cost; it lies below 1/2 exactly if x1 is nearer to x0 than to xf.
+the equation F(t) = (E - D q).(E (1 - 2t) + D w) = c (1 - 2t) + a w - q (a (1 - 2t) + b w) = 0, of degree 9.
+It has one root in (0, 1), simple, the global minimum of the jerk cost; it lies below 1/2 exactly if x1 is
+nearer to x0 than to xf.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ Number: TypeAlias = Any
 """A float, or an array with one entry per movement: the same operations, the same bits."""
 
 _STEPS = 5
-"""Newton steps: the start is within 34 % everywhere, after five the error is 2e-16 (measured over all cases)."""
+"""Newton steps: the start is within 34 % everywhere, after five the error is 2e-16 (measured over all
+cases)."""
 
 _FLOOR = 1e-5
-"""Distance of the via-point from an end point, relative to the movement's extent, below which the gradient is clipped."""
+"""Distance of the via-point from an end point, relative to the movement's extent, below which the gradient is
+clipped."""
 
 
 class _Functions(NamedTuple):
@@ -51,14 +55,15 @@ def fractions_at_rest(points: Any) -> Any:
         points: (N, 3, D) NumPy float64: start, via-point, goal [m].
 
     Returns:
-        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start or goal has
-        fraction 0 there.
+        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start
+        or goal has fraction 0 there.
     """
     if len(points) == 1:  # Python floats spare a batch of one the overhead of 200 array operations
         rows, math_functions = points[0].tolist(), _FLOATS
     else:
         rows, math_functions = np.ascontiguousarray(points.transpose(1, 2, 0)), _ARRAYS
-    a, b, c, is_late = _invariants(*rows, math_functions)
+    start, via, goal = rows
+    a, b, c, is_late = _invariants(start, via, goal, math_functions)
     smaller = _root(a, b, c, math_functions)
     larger = 1.0 - smaller
     before = math_functions.where(is_late, larger, smaller)
@@ -69,7 +74,7 @@ def fractions_at_rest(points: Any) -> Any:
 def _invariants(
     start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: _Functions
 ) -> tuple[Number, ...]:
-    """a, b, c as seen from the nearer end point, and whether that is the goal."""
+    """Return a, b, c as seen from the nearer end point, and whether that is the goal."""
     first = [x1 - x0 for x0, x1 in zip(start, via, strict=True)]
     second = [x1 - x0 for x0, x1 in zip(via, goal, strict=True)]
     whole = [x1 - x0 for x0, x1 in zip(start, goal, strict=True)]
@@ -88,7 +93,7 @@ def dot(x: Sequence[Number], y: Sequence[Number]) -> Number:
 
 
 def _root(a: Number, b: Number, c: Number, f: _Functions) -> Number:
-    """The root of F in (0, 1/2]."""
+    """Return the root of F in (0, 1/2]."""
     # For small t, c = 4 a z + 10 b z^2 + ... with z = t^3; t = 1/2 for far via-points.
     root = f.sqrt(4.0 * a * a + 5.0 * b * c)
     top = f.where(a >= 0, c, root - 2.0 * a)
@@ -117,8 +122,8 @@ def residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number
 def attach_gradient(fractions: Array, waypoints: Array) -> Array:
     """Make the fractions differentiable by the implicit function theorem, dt/dp = -(dF/dp) / (dF/dt).
 
-    The gradient grows without bound, like |E|^(-2/3), as the via-point meets an end point; it is clipped there, and stays
-    finite when all points coincide.
+    The gradient grows without bound, like |E|^(-2/3), as the via-point meets an end point; it is clipped
+    there, and stays finite when all points coincide.
     """
     first = waypoints[..., 1, :] - waypoints[..., 0, :]
     second = waypoints[..., 2, :] - waypoints[..., 1, :]

@@ -1,8 +1,8 @@
 """Values of many piecewise polynomials at many times: the part that limits the speed.
 
-All segments go into one small matrix product per trajectory: column (k, s) of the basis is u_s^k where segment s is
-the current one and zero elsewhere. NumPy's stacked product treats every trajectory by itself with the same inner sizes,
-so a batch gives bit for bit what each item gives alone.
+All segments go into one small matrix product per trajectory: column (k, s) of the basis is u_s^k where
+segment s is the current one and zero elsewhere. NumPy's stacked product treats every trajectory by itself
+with the same inner sizes, so a batch gives bit for bit what each item gives alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from ._arrays import Array, Namespace, blocks, constant
 from ._hermite import derivative_factors
 
 _BLOCK_BYTES = 400_000
-"""Size of the basis of one block of trajectories: it stays in a core's second-level cache while it is used."""
+"""Size of the basis of one block of trajectories: it stays in a core's second-level cache while it is
+used."""
 
 
 def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:
@@ -45,8 +46,7 @@ def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Names
     for _ in range(degree - 1):
         power = power * local
         rows.append(power)
-    stacked = xp.concat(rows[: degree + 1], axis=-2)
-    return stacked
+    return xp.concat(rows[: degree + 1], axis=-2)
 
 
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
@@ -60,7 +60,7 @@ def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
 
 
 def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array:
-    """Coefficients (..., 2m - nu, S, D) of the nu-th derivative with respect to time in seconds, in unit time."""
+    """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time."""
     if nu == 0:
         return coefficients
     order = coefficients.shape[-3] // 2
@@ -80,11 +80,12 @@ def evaluate(
     out: Sequence[Array] | None,
     xp: Namespace,
 ) -> list[Array]:
-    """Derivatives `orders` at `time`, each (..., T, D), into `out` where it is given.
+    """Return derivatives `orders` at `time`, each (..., T, D), in `out` where it is given.
 
     Args:
         coefficients: (..., 2m, S, D).
-        starts, rates: (..., S), batch shape that broadcasts against the coefficients'.
+        starts: (..., S) with a batch shape that broadcasts against the coefficients' [s].
+        rates: (..., S), likewise [1/s].
         time: (..., T), likewise.
         orders: derivative orders, each below 2m.
         out: buffers, one per order, of the full result shape.

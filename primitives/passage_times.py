@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from . import _passage_gradient, _passage_rest
+from . import _passage_gradient
 from ._arrays import FREE, Array, Boundary, as_floats, broadcast_to, follows_gradient, like, require, to_numpy
 from ._connecting import boundary_values
 from ._passage_cost import PassageCost
+from ._passage_moving import fractions_moving
 from ._passage_newton import fractions_by_newton
+from ._passage_rest import fractions_at_rest
 from .via_points import check_waypoints
 
 
@@ -26,26 +28,28 @@ def passage_durations(
 ) -> Array:
     """Segment durations with the least jerk: Flash & Hogan's free passage times, pi . v(t_k) = 0 (Eq. C16).
 
-    One via-point, rest to rest: the only root of a polynomial (see _passage_rest). Several: damped Newton on the jerk cost.
-    The numbers are found in NumPy and double precision whatever the input; torch gradients follow from the implicit
-    function theorem and are clipped where a via-point meets its neighbour.
+    One via-point, rest to rest: the only root of a polynomial (see _passage_rest). Several: damped Newton on
+    the jerk cost. The numbers are found in NumPy and double precision whatever the input; torch gradients
+    follow from the implicit function theorem and are clipped where a via-point meets its neighbour.
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].
         duration: (...,) total [s].
-        start_velocity, start_acceleration: (..., D) [m/s], [m/s^2]; None = zero.
-        goal_velocity, goal_acceleration: likewise, or FREE.
+        start_velocity: (..., D) [m/s]; None = zero.
+        start_acceleration: (..., D) [m/s^2]; None = zero.
+        goal_velocity: (..., D) [m/s]; None = zero, FREE = as the least cost decides (natural boundary).
+        goal_acceleration: (..., D) [m/s^2]; likewise.
 
     Returns:
-        (..., K + 1) [s], adding up to `duration`. A via-point that equals its neighbour gets duration 0; `through` then
-        drops it.
+        (..., K + 1) [s], adding up to `duration`. A via-point that equals its neighbour gets duration 0;
+        `through` then drops it.
 
     Raises:
         ValueError: an argument is not finite or has a wrong shape, or duration <= 0.
 
     Warns:
-        RuntimeWarning: the iteration did not converge for some movements (K >= 2, knots about to merge); their durations
-            are the best found.
+        RuntimeWarning: the iteration did not converge for some movements (K >= 2, knots about to merge);
+            their durations are the best found.
     """
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
     xp, arrays = as_floats(waypoints=waypoints, duration=duration, **named)
@@ -70,7 +74,7 @@ def _flat(array: Array, batch: tuple[int, ...], own: int) -> Any:
 
 
 def _unit_time_ends(boundary: dict[str, Boundary], duration: Array, batch: tuple[int, ...]) -> list[Any]:
-    """The four boundary values in unit time (V = v T, A = a T^2): (N, D), None or FREE."""
+    """Return the four boundary values in unit time (V = v T, A = a T^2): (N, D), None or FREE."""
     if all(value is None for value in boundary.values()):
         return [None] * 4
     time = _flat(duration, batch, 0)[:, None]
@@ -113,8 +117,8 @@ def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     """(N, S) fractions where neighbouring waypoints differ."""
     if points.shape[1] == 2:
         return np.ones((len(points), 1))
-    if points.shape[1] == 3 and not moving:
-        return _passage_rest.fractions_at_rest(points)
+    if points.shape[1] == 3:
+        return fractions_moving(points, ends) if moving else fractions_at_rest(points)
     rows = [
         np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v
         for v in (ends if moving else [None] * 4)

@@ -18,19 +18,21 @@ def point_to_point(
     goal_acceleration: Boundary = None,
     order: int = 3,
 ) -> Trajectory:
-    """The movement from start to goal with the least integral of |x^(order)|^2.
+    """Return the movement from start to goal with the least integral of |x^(order)|^2.
 
     At rest on both ends and with order 3 it is Flash & Hogan's Eq. 2,
     x(t) = x0 + (xf - x0)(10 tau^3 - 15 tau^4 + 6 tau^5), tau = t / duration.
 
     Args:
-        start, goal: (..., D) [m].
+        start: (..., D) [m].
+        goal: (..., D) [m].
         duration: (...,) [s].
-        start_velocity, start_acceleration: (..., D) [m/s], [m/s^2]; None = zero.
-        goal_velocity, goal_acceleration: likewise, or FREE: then the least cost decides (natural boundary), as in a
-            hitting or a repetitive movement.
-        order: 2, 3 or 4: least acceleration, jerk or snap. Order 2 leaves accelerations open; with order 4 the jerk is
-            zero at both ends.
+        start_velocity: (..., D) [m/s]; None = zero.
+        start_acceleration: (..., D) [m/s^2]; None = zero.
+        goal_velocity: (..., D) [m/s]; None = zero, FREE = as the least cost decides (natural boundary).
+        goal_acceleration: (..., D) [m/s^2]; likewise.
+        order: 2, 3 or 4: least acceleration, jerk or snap. Order 2 leaves accelerations open; with order 4
+            the jerk is zero at both ends.
 
     Returns:
         A trajectory of one segment with the broadcast leading shape.
@@ -64,7 +66,7 @@ def point_to_point(
 def minimum_jerk_coefficients(
     x0: Array, dx0: Array, ddx0: Array, xT: Array, dxT: Array, ddxT: Array, T: Array
 ) -> Array:
-    """The primer's function: a_0 ... a_5 of x(t) = sum_k a_k t^k (its Eqs. 15 to 23), without its pseudo-inverse.
+    """Return the primer's a_0 ... a_5 of x(t) = sum_k a_k t^k, without its pseudo-inverse.
 
     With V = T dx, A = T^2 ddx and D = xT - x0 the solution is, exactly and for any T > 0,
 
@@ -73,8 +75,12 @@ def minimum_jerk_coefficients(
         a_5 T^5 =   6 D - 3 V0 - 3 VT - 1/2 A0 + 1/2 AT
 
     Args:
-        x0, dx0, ddx0: (...,) location, velocity and acceleration at the start [m], [m/s], [m/s^2].
-        xT, dxT, ddxT: (...,) the same at the target.
+        x0: (...,) location at the start [m].
+        dx0: (...,) velocity at the start [m/s].
+        ddx0: (...,) acceleration at the start [m/s^2].
+        xT: (...,) location at the target [m].
+        dxT: (...,) velocity at the target [m/s].
+        ddxT: (...,) acceleration at the target [m/s^2].
         T: (...,) time from start to target [s].
 
     Returns:

@@ -18,20 +18,22 @@ from ._arrays import (
     require,
     require_vectors,
 )
+from ._extremes import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
 from ._hermite import energy_table
 from ._sampling import evaluate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
-    """Movements x(t), 0 <= t <= duration, each a chain of S polynomials; made by point_to_point, through, retarget.
+    """Movements x(t), 0 <= t <= duration, each a chain of S polynomials.
 
-    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in its own unit time u = (t - t_s) / h_s, so that no
-    duration, short or long, over- or underflows.
+    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in its own unit time u = (t - t_s) / h_s, so
+    that no duration, short or long, over- or underflows.
 
     Attributes:
         coefficients: (..., 2 order, S, D), c_k of segment s [m].
-        durations: (..., S) the segments' durations h [s]; its leading shape may be shorter than the coefficients' (shared).
+        durations: (..., S) the segments' durations h [s]; its leading shape may be shorter than the
+            coefficients' (shared).
         order: order of the derivative whose square is least: 2 acceleration, 3 jerk, 4 snap.
         starts: (..., S) first instant of each segment [s].
         rates: (..., S) 1 / h [1/s].
@@ -89,15 +91,15 @@ class Trajectory:
         return broadcast_to(xp, knots, (*self.batch_shape, knots.shape[-1]))
 
     def __repr__(self) -> str:
-        segments = self.durations.shape[-1]
-        return f"Trajectory(batch {self.batch_shape}, {segments} segments, dimension {self.dimension}, order {self.order})"
+        shape = f"batch {self.batch_shape}, {self.durations.shape[-1]} segments, dimension {self.dimension}"
+        return f"Trajectory({shape}, order {self.order})"
 
     def __call__(self, time: Array, nu: int = 0) -> Array:
-        """The nu-th time derivative.
+        """Return the nu-th time derivative.
 
         Args:
-            time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0 and after the
-                duration the end point is held at rest.
+            time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0
+                and after the duration the end point is held at rest.
             nu: order of the derivative, at least 0 (from 2 order on it is zero).
 
         Returns:
@@ -116,12 +118,12 @@ class Trajectory:
         """Several derivatives at once, optionally into the caller's buffers.
 
         Args:
-            time: as in a call; or a whole number of at least 2: so many evenly spaced times from 0 to the duration of each
-                trajectory, both included.
+            time: as in a call; or a whole number of at least 2: so many evenly spaced times from 0 to the
+                duration of each trajectory, both included.
             nu: the orders of derivative; one number counts as a sequence of one.
-            out: one array per order, each (..., T, D) with the full batch shape, for example the planes of one array
-                (len(nu), ..., T, D). Written without intermediate copies where they are NumPy arrays of the trajectory's
-                dtype and the batch has one dimension.
+            out: one array per order, each (..., T, D) with the full batch shape, for example the planes of
+                one array (len(nu), ..., T, D). Written without intermediate copies where they are NumPy
+                arrays of the trajectory's dtype and the batch has one dimension.
 
         Returns:
             One array (..., T, D) per order [m/s^nu], the given buffers if there are any.
@@ -144,7 +146,7 @@ class Trajectory:
         )
 
     def _times(self, time: Array | int) -> tuple[Array, Array | None]:
-        """Times (..., T) within the movement, and where the given ones were inside (None: everywhere)."""
+        """Return times (..., T) clipped to the movement, and where they were inside (None: everywhere)."""
         xp = self.namespace
         end = self.end
         if isinstance(time, int | np.integer):
@@ -175,11 +177,11 @@ class Trajectory:
         return value * factor
 
     def cost(self) -> Array:
-        """(...,) 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], exact (Flash & Hogan's Eq. 1 for order 3)."""
+        """Return (...,) 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], exact."""
         return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
-        """(...,) integral of |x^(nu)|^2 over the movement [m^2 / s^(2 nu - 1)], exact, as a sum of squares."""
+        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], exact, as a sum of squares."""
         xp = self.namespace
         if not 0 <= nu < 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
@@ -191,8 +193,23 @@ class Trajectory:
             scale = scale * self.rates
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
+    def extrema(self, nu: int = 0) -> Extrema:
+        """Return the least and greatest nu-th derivative per axis, with their times.
+
+        Where the derivative jumps at a knot both sides count.
+        """
+        return axis_extrema(self._pieces(nu))
+
+    def peak(self, nu: int = 0) -> Array:
+        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]."""
+        return largest_norm(self._pieces(nu))
+
+    def _pieces(self, nu: int) -> Pieces:
+        (nu,) = _whole_orders(nu)
+        return pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, self.namespace)
+
     def stretched(self, duration: Array) -> Trajectory:
-        """The same path at another pace: all times scaled to a new total duration (...,) [s].
+        """Return the same path at another pace, scaled to a new total duration (...,) [s].
 
         Raises:
             ValueError: duration is not finite, not positive, or does not broadcast.
@@ -213,7 +230,7 @@ class Trajectory:
     def transformed(
         self, rotation: Array | None = None, translation: Array | None = None, scale: Array | None = None
     ) -> Trajectory:
-        """scale * rotation @ x(t) + translation: the movement elsewhere, turned and resized.
+        """Scale * rotation @ x(t) + translation: the movement elsewhere, turned and resized.
 
         Args:
             rotation: (..., D', D) matrix (any linear map), default the identity.

@@ -19,17 +19,20 @@ def through(
     via_velocities: Array | None = None,
     order: int = 3,
 ) -> Trajectory:
-    """The movement through all waypoints with the least integral of |x^(order)|^2, segment durations given.
+    """Return the movement through all waypoints with the least integral of |x^(order)|^2.
 
-    Velocity and acceleration at the via-points are those of least cost: a symmetric block tridiagonal system, solved in
-    a time proportional to their number K. The result is continuous up to x^(2 order - 2) (Flash & Hogan, Appendix C).
+    Velocity and acceleration at the via-points are those of least cost: a symmetric block tridiagonal system,
+    solved in a time proportional to their number K. The result is continuous up to x^(2 order - 2) (Flash &
+    Hogan, Appendix C).
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].
-        durations: (..., K + 1) [s]; 0 is allowed between equal waypoints, the via-point is then dropped. Durations
-            (K + 1,) for a batch of waypoints are shared, which is faster.
-        start_velocity, start_acceleration: (..., D) [m/s], [m/s^2]; None = zero.
-        goal_velocity, goal_acceleration: likewise, or FREE (natural boundary).
+        durations: (..., K + 1) [s]; 0 is allowed between equal waypoints, the via-point is then dropped.
+            Durations (K + 1,) for a batch of waypoints are shared, which is faster.
+        start_velocity: (..., D) [m/s]; None = zero.
+        start_acceleration: (..., D) [m/s^2]; None = zero.
+        goal_velocity: (..., D) [m/s]; None = zero, FREE = as the least cost decides (natural boundary).
+        goal_acceleration: (..., D) [m/s^2]; likewise.
         via_velocities: (..., K, D) velocities to have at the via-points [m/s]; None = those of least cost.
         order: 2, 3 or 4: least acceleration, jerk or snap.
 
@@ -37,8 +40,8 @@ def through(
         A trajectory of K + 1 segments with the broadcast leading shape.
 
     Raises:
-        ValueError: an argument is not finite or has a wrong shape; a duration is negative, or 0 between different
-            waypoints, or they are all 0.
+        ValueError: an argument is not finite or has a wrong shape; a duration is negative, or 0 between
+            different waypoints, or they are all 0.
     """
     check_order(order, start_acceleration, goal_acceleration)
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
@@ -65,7 +68,7 @@ def check_waypoints(
     durations: Array | None = None,
     duration: Array | None = None,
 ) -> tuple[int, ...]:
-    """The common leading shape of waypoints, durations and boundary values, or ValueError naming what is wrong."""
+    """Return the common leading shape, or raise ValueError naming what is wrong."""
     if waypoints.ndim < 2 or waypoints.shape[-2] < 2 or waypoints.shape[-1] < 1:
         raise ValueError(
             f"waypoints must have shape (..., K + 2, D), K >= 0, got shape {tuple(waypoints.shape)}"
@@ -91,9 +94,8 @@ def _check_via_velocities(
         return batch
     expected = (waypoints.shape[-2] - 2, waypoints.shape[-1])
     if velocities.ndim < 2 or tuple(velocities.shape[-2:]) != expected:
-        raise ValueError(
-            f"via_velocities must have shape (..., {expected[0]}, {expected[1]}), got {tuple(velocities.shape)}"
-        )
+        wanted = f"(..., {expected[0]}, {expected[1]})"
+        raise ValueError(f"via_velocities must have shape {wanted}, got shape {tuple(velocities.shape)}")
     return broadcast_batch(waypoints=batch, via_velocities=tuple(velocities.shape[:-2]))
 
 

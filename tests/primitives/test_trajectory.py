@@ -1,5 +1,7 @@
 """Laws of a trajectory: what it passes, how smooth it is, that nothing near it costs less."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -83,14 +85,14 @@ def test_no_admissible_perturbation_lowers_the_cost(order):
     trajectory = through(waypoints, durations, order=order, **ends)
     end = float(trajectory.duration)
     time, weight = np.polynomial.legendre.leggauss(60)
-    # A bump that keeps every point and boundary value: product of the knots' factors, flat enough at the ends.
+    # A bump that keeps points and boundary values: product of the knots' factors, flat at the ends.
     t = np.polynomial.Polynomial([0, 1])
     bump = (t * (end - t)) ** order
     for knot in trajectory.knots[1:-1]:
         bump = bump * (t - knot)
     for shape in (bump, bump * t, bump * (1 - t * t)):
         cross, own = 0.0, 0.0
-        for left, right in zip(trajectory.knots[:-1], trajectory.knots[1:], strict=True):
+        for left, right in pairwise(trajectory.knots):
             at = (left + right) / 2 + (right - left) / 2 * time
             w = weight * (right - left) / 2
             change = shape.deriv(order)(at)
@@ -108,7 +110,7 @@ def test_cost_is_the_integral(order):
     knots = trajectory.knots
     total = sum(
         quad(lambda t: 0.5 * np.sum(trajectory(t, order) ** 2), a, b, epsabs=0, epsrel=1e-12)[0]
-        for a, b in zip(knots[:-1], knots[1:], strict=True)
+        for a, b in pairwise(knots)
     )
     np.testing.assert_allclose(trajectory.cost(), total, rtol=1e-12)
 

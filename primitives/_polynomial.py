@@ -1,0 +1,90 @@
+"""Polynomials in unit time, many at once: products, derivatives, values, and every root that lies in [0, 1].
+
+Coefficients are the last axis, lowest power first, always NumPy float64. Each polynomial is treated by
+itself.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from math import comb
+from typing import Any, TypeAlias
+
+import numpy as np
+
+Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
+
+_SHIFT = 0.6180339887498949
+_POLISHING_STEPS = 3
+
+
+def evaluate(coefficients: Floats, u: Floats) -> Floats:
+    """Evaluate polynomials (..., n + 1) at points (...) of the same leading shape, by Horner's rule."""
+    value = np.zeros_like(u) + coefficients[..., -1]
+    for k in reversed(range(coefficients.shape[-1] - 1)):
+        value = value * u + coefficients[..., k]
+    return value
+
+
+def differentiate(coefficients: Floats) -> Floats:
+    """Return the coefficients (..., n) of the derivative, at least one."""
+    if coefficients.shape[-1] == 1:
+        return np.zeros_like(coefficients)
+    return coefficients[..., 1:] * np.arange(1.0, coefficients.shape[-1])
+
+
+def multiply(p: Floats, q: Floats) -> Floats:
+    """Return the coefficients of the product."""
+    product: Floats = np.zeros(
+        (*np.broadcast_shapes(p.shape[:-1], q.shape[:-1]), p.shape[-1] + q.shape[-1] - 1)
+    )
+    for k in range(p.shape[-1]):
+        product[..., k : k + q.shape[-1]] += p[..., k : k + 1] * q
+    return product
+
+
+def root_candidates(coefficients: Floats) -> Floats:
+    """Return points of [0, 1] among which are all real roots there, (..., n) ascending.
+
+    The others are real parts of complex roots or nearest ends: a caller that compares a function at all of
+        them loses
+    nothing by their company. They are the eigenvalues w of a companion matrix in w = 1 / (u + s): so roots at
+    infinity, where the degree is lower than it looks, become w = 0 and do no harm.
+    """
+    degree = coefficients.shape[-1] - 1
+    if degree < 1:
+        return np.zeros((*coefficients.shape[:-1], 0))
+    size = np.abs(coefficients).max(axis=-1, keepdims=True)
+    scaled = coefficients / np.where(size > 0, size, 1.0)
+    # p(v - s) = sum_j shifted_j v^j; with v = 1/w the leading coefficient in w is shifted_0 = p(-s).
+    shifted = np.matmul(scaled[..., None, :], _shift_matrix(degree))[..., 0, :]
+    leading = shifted[..., :1]
+    leading = np.where(np.abs(leading) < 1e-15, 1e-15, leading)
+    companion = np.zeros((*shifted.shape[:-1], degree, degree))
+    companion[..., np.arange(1, degree), np.arange(degree - 1)] = 1.0
+    companion[..., 0, :] = -shifted[..., 1:] / leading
+    w = np.linalg.eigvals(companion)
+    square = w.real * w.real + w.imag * w.imag
+    u = w.real / np.where(square > 0, square, 1.0) - _SHIFT  # the real part of 1/w - s
+    return np.sort(_polish(scaled, np.clip(u, 0.0, 1.0)), axis=-1)
+
+
+def _polish(coefficients: Floats, u: Floats) -> Floats:
+    """Newton steps within [0, 1]."""
+    polynomial = coefficients[..., None, :]
+    slope = differentiate(polynomial)
+    for _ in range(_POLISHING_STEPS):
+        rate = evaluate(slope, u)
+        step = evaluate(polynomial, u) / np.where(rate == 0, 1.0, rate)
+        u = np.where(np.abs(step) < 1e-2, np.clip(u - step, 0.0, 1.0), u)
+    return u
+
+
+@cache
+def _shift_matrix(degree: int) -> Floats:
+    """Matrix that turns coefficients of u = v - s into those of v."""
+    rows = [
+        [comb(k, j) * (-_SHIFT) ** (k - j) if j <= k else 0.0 for j in range(degree + 1)]
+        for k in range(degree + 1)
+    ]
+    return np.array(rows)

@@ -1,0 +1,177 @@
+"""How smooth a movement is, from its polynomials: nothing here depends on a sampling step.
+
+Closed forms for the straight minimum-jerk reach of amplitude A and duration T, which the tests check:
+integral of squared jerk 720 A^2 / T^5, peak speed 1.875 A / T, dimensionless jerk 204.8, its negative
+logarithm -5.3220, spectral arc length -1.4024. Where nothing moves the ratios are not defined and come out as
+NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ._arrays import Array, error_state, like, to_numpy
+from ._polynomial import differentiate, multiply, root_candidates
+from .trajectory import Trajectory
+
+_SPECTRUM_SAMPLES = 1000
+"""Instants at which the spectral arc length takes the speed, whatever the duration: far beyond a movement's
+bandwidth."""
+
+
+@dataclass(frozen=True)
+class SpeedEvents:
+    """Local extremes of the speed, padded with NaN where a movement has fewer than the others of its batch.
+
+    Attributes:
+        time: (..., M) ascending [s].
+        speed: (..., M) [m/s].
+    """
+
+    time: Array
+    speed: Array
+
+
+def speed(trajectory: Trajectory, time: Array) -> Array:
+    """Return the tangential velocity |v| at `time` (T,) or (..., T): (..., T) [m/s]."""
+    return trajectory.namespace.linalg.vector_norm(trajectory(time, 1), axis=-1)
+
+
+def curvature(trajectory: Trajectory, time: Array) -> Array:
+    """Return the curvature of the path at `time`.
+
+    In the plane it is signed, (x' y'' - y' x'') / |v|^3, positive to the left (Flash & Hogan, footnote 4); in
+    space it is |v x a| / |v|^3. A movement that passes a via-point from rest to rest has no bounded curvature
+    at its ends; at rest itself the curvature is not defined and comes out as NaN.
+
+    Args:
+        trajectory: movements in two or three dimensions.
+        time: (T,) or (..., T) [s].
+
+    Returns:
+        (..., T) [1/m].
+
+    Raises:
+        ValueError: the dimension is neither 2 nor 3; time is bad.
+    """
+    if trajectory.dimension not in (2, 3):
+        raise ValueError(f"trajectory must have dimension 2 or 3 for a curvature, got {trajectory.dimension}")
+    xp = trajectory.namespace
+    velocity, acceleration = trajectory.sample(time, (1, 2))
+    if trajectory.dimension == 2:
+        turn = velocity[..., 0] * acceleration[..., 1] - velocity[..., 1] * acceleration[..., 0]
+    else:
+        turn = xp.linalg.vector_norm(xp.linalg.cross(velocity, acceleration, axis=-1), axis=-1)
+    length = xp.linalg.vector_norm(velocity, axis=-1)
+    with error_state(xp):
+        return turn / (length * length * length)
+
+
+def dimensionless_jerk(trajectory: Trajectory) -> Array:
+    """Return (...,) integral |jerk|^2 dt * duration^3 / peak speed^2; 204.8 for a straight reach."""
+    xp = trajectory.namespace
+    duration, peak = trajectory.duration, trajectory.peak(1)
+    with error_state(xp):
+        return trajectory.energy(3) * duration * duration * duration / (peak * peak)
+
+
+def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
+    """Return (...,) minus the natural logarithm of the dimensionless jerk: greater is smoother."""
+    return -trajectory.namespace.log(dimensionless_jerk(trajectory))
+
+
+def spectral_arc_length(
+    trajectory: Trajectory, *, cutoff: float = 10.0, threshold: float = 0.05, padding: int = 4
+) -> Array:
+    """Return (...,) minus the arc length of the normalised speed spectrum: greater is smoother.
+
+    The spectrum of the speed at 1000 instants is padded to 2^padding times the next power of two, scaled to 1
+    at frequency 0, and followed up to the last frequency below `cutoff` where it reaches `threshold`
+    (Balasubramanian et al. 2015).
+
+    Args:
+        trajectory: the movements.
+        cutoff: highest frequency [Hz]; the measure is 0 for movements so brief that the first frequency
+            exceeds it.
+        threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
+        padding: powers of two of zero padding.
+
+    Raises:
+        ValueError: cutoff or threshold is out of range, or padding is negative.
+    """
+    if not cutoff > 0 or not 0 <= threshold < 1 or padding < 0:
+        raise ValueError(
+            f"need cutoff > 0, 0 <= threshold < 1, padding >= 0, got {cutoff!r}, {threshold!r}, {padding!r}"
+        )
+    xp = trajectory.namespace
+    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + padding)
+    velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
+    spectrum = xp.abs(xp.fft.rfft(xp.linalg.vector_norm(velocity, axis=-1), n=length, axis=-1))
+    with error_state(xp):
+        spectrum = spectrum / spectrum[..., :1]
+    numbers = to_numpy(spectrum)
+    index = np.arange(numbers.shape[-1])
+    step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
+    last = np.max(
+        np.where((numbers >= threshold) & (index * step <= cutoff), index, 0), axis=-1, keepdims=True
+    )
+    used = like(xp, (index[:-1] < last).astype(float), spectrum)
+    width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
+    rise = spectrum[..., 1:] - spectrum[..., :-1]
+    return -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
+
+
+def speed_valleys(trajectory: Trajectory) -> SpeedEvents:
+    """Return the local minima of the speed strictly inside the movement, exact from the roots of v . a."""
+    return _speed_events(trajectory, rising_after=True)
+
+
+def speed_peaks(trajectory: Trajectory) -> SpeedEvents:
+    """Return the local maxima of the speed strictly inside the movement, exact from the roots of v . a."""
+    return _speed_events(trajectory, rising_after=False)
+
+
+def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
+    xp = trajectory.namespace
+    times = _turning_times(trajectory)
+    before, after = _speed_trend(trajectory, times)
+    found = (before < 0) & (after > 0) if rising_after else (before > 0) & (after < 0)
+    count = int(found.sum(axis=-1).max(initial=0))
+    order = np.argsort(~found, axis=-1, kind="stable")[..., :count]
+    place, exists = np.take_along_axis(times, order, axis=-1), np.take_along_axis(found, order, axis=-1)
+    time = like(xp, np.where(exists, place, 0.0), trajectory.coefficients)
+    missing = like(xp, np.where(exists, 0.0, np.nan), trajectory.coefficients)
+    value = speed(trajectory, time) if count else time
+    return SpeedEvents(time + missing, value + missing)
+
+
+def _turning_times(trajectory: Trajectory) -> Any:
+    """All times (..., Q), ascending, at which the speed may have an extreme: roots of v . a, and knots."""
+    coefficients = np.moveaxis(to_numpy(trajectory.coefficients).astype(float), -3, -1)  # (..., S, D, 2m)
+    velocity = differentiate(coefficients)
+    power = multiply(velocity, differentiate(velocity)).sum(axis=-2)
+    u = root_candidates(power)
+    knots = to_numpy(trajectory.knots)
+    times = knots[..., :-1, None] + u * np.diff(knots, axis=-1)[..., None]
+    times = np.concatenate([times.reshape(*times.shape[:-2], -1), knots], axis=-1)
+    return np.sort(times, axis=-1)
+
+
+def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
+    """Whether the speed falls (-1) or rises (1) before and after each of `times`; 0 outside the movement."""
+    middle = (times[..., 1:] + times[..., :-1]) / 2
+    sampled = trajectory.sample(like(trajectory.namespace, middle, trajectory.coefficients), (1, 2))
+    velocity, acceleration = (to_numpy(value) for value in sampled)
+    rate = (velocity * acceleration).sum(axis=-1)
+    size = np.abs(velocity).max(axis=(-2, -1)) * np.abs(acceleration).max(axis=(-2, -1))
+    wide = (
+        np.diff(times, axis=-1) > 1e-9 * times[..., -1:]
+    )  # between two copies of one root there is only noise
+    trend = np.where(wide & (np.abs(rate) > 1e-12 * size[..., None]), np.sign(rate), 0.0)
+    for i in range(1, trend.shape[-1]):
+        trend[..., i] = np.where(trend[..., i] == 0, trend[..., i - 1], trend[..., i])
+    edge = np.zeros((*trend.shape[:-1], 1))
+    return np.concatenate([edge, trend], axis=-1), np.concatenate([trend, edge], axis=-1)
