@@ -1,40 +1,23 @@
-"""A palette, and shapes added to a MuJoCo scene for the eye alone."""
+"""Shapes added to a MuJoCo scene for the eye alone."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.palette import PALETTE, Colour
+
 Float = NDArray[np.float64]
-Colour = tuple[float, float, float]
 Geom = Any
 """A shape in a scene."""
 Shape = mujoco.mjtGeom
 
 MATT, GLOWING = 0.0, 1.0
 """How much of its colour a thing shows without light: lines are ink, things are lit."""
-
-
-class Palette(NamedTuple):
-    """Colours of all that is drawn, so that pictures, plots and films agree; red, green, blue in [0, 1]."""
-
-    plan: Colour = (0.36, 0.62, 0.90)
-    executed: Colour = (0.07, 0.13, 0.27)
-    via: Colour = (0.96, 0.56, 0.08)
-    goal: Colour = (0.15, 0.64, 0.38)
-    start: Colour = (0.42, 0.45, 0.50)
-    obstacle: Colour = (0.80, 0.53, 0.41)
-    contact: Colour = (0.86, 0.10, 0.14)
-    arm: Colour = (0.63, 0.69, 0.77)
-    joint: Colour = (0.30, 0.35, 0.44)
-    table: Colour = (0.965, 0.96, 0.945)
-
-
-PALETTE = Palette()
 
 
 class Pencil:

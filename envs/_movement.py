@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.clearance import arm_clearance, hand_clearance
+from viapoint.envs.clearance import arm_clearance, hand_clearance, point_distance_squared
 from viapoint.envs.execution import Rollout
 from viapoint.envs.scenes import Scenes
 
@@ -25,6 +25,8 @@ class Touch(NamedTuple):
     """Row of the obstacle."""
     link: int | None
     """Index of the link; None is the hand."""
+    place: Float
+    """Where on the hand or on the link's axis, shape (D,), [m]."""
 
 
 class Movement(NamedTuple):
@@ -70,4 +72,8 @@ def first_touch(
         for i, radius in enumerate(arm.link_radii):
             parts.append(arm_clearance(links[..., i : i + 1, :, :], (radius,), rows, present))
     part, obstacle = np.unravel_index(np.argmin(np.stack(parts)[:, 0]), (len(parts), rows.shape[1]))
-    return Touch(step, int(obstacle), int(part) - 1 if part else None)
+    link = int(part) - 1 if part else None
+    ends = np.asarray(arm.hand(posture))[0] if link is None else np.asarray(arm.links(posture))[0, 0, link]
+    places = ends[0] + np.linspace(0.0, 1.0, 200)[:, None] * (ends[-1] - ends[0])
+    nearest = point_distance_squared(places, rows[0, obstacle : obstacle + 1]).argmin()
+    return Touch(step, int(obstacle), link, places[nearest])

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs._drawing import GLOWING, PALETTE, Colour, Pencil, in_space, resampled
+from viapoint.envs._drawing import GLOWING, Pencil, in_space, resampled
 from viapoint.envs._movement import Movement
+from viapoint.envs.palette import PALETTE, Colour
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Simulator
 

@@ -21,7 +21,7 @@ __all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame
 
 Frame = NDArray[np.uint8]
 
-STILL_PASSES, FILM_PASSES = 16, 2
+STILL_PASSES, FILM_PASSES = 16, 3
 """How many pictures one picture is the mean of: many for one that is looked at, few for one of a film."""
 LAMP_RADIUS = 0.30
 """[m]"""
@@ -52,9 +52,8 @@ class MovementRenderer:
     """Draws what happened in one simulation.
 
     Nothing is opened before the first picture. `rgb_array` gives one picture of shape (height, width, 3): the
-    end of a movement or, where the arm hit something, the moment of first contact, which tells more.
-    `rgb_array_list` gives the film of the movement as a list of such pictures, `human` plays it in a window in
-    real time.
+    end of a movement or, where the arm hit something, the moment of first contact, which tells more. From
+    `rgb_array_list` comes the film of the movement as a list of such pictures, `human` plays it in a window.
     """
 
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
