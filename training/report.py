@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
-from viapoint.training.evaluate import Evaluation, MethodResult
 from viapoint.training.files import write_bytes, write_json
 from viapoint.training.frozen_scenes import BANDS
 
-Summary = dict[str, Any]
+Summary = Mapping[str, Any]
+Record = Mapping[str, Any]
+"""What :meth:`viapoint.training.evaluate.Evaluation.as_json` returns, or a file that holds it."""
 
 
 class Column(NamedTuple):
@@ -66,56 +67,56 @@ COLUMNS = (
 
 NOTES = (
     "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
-    "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions that "
-    "solve a scene. Clearance and goal error are medians of all scenes, jerk ratio (to the straight "
+    "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
+    "that solve a scene. Clearance and goal error are medians of all scenes, jerk ratio (to the straight "
     "movement) and duration of the successes. SPL: success weighted by straight distance over path length."
 )
 
 
-def rows(evaluation: Evaluation) -> list[list[str]]:
-    """Heading and cells, method by method."""
-    table = [["method", *(column.heading for column in COLUMNS)]]
-    for result in evaluation.results:
-        summary = result.summary()
-        table.append([_name(result), *(column.cell(summary) for column in COLUMNS)])
-    return table
+def rows(record: Record) -> list[list[str]]:
+    """Headings, then the cells of each method; columns in which no method has a value are left out."""
+    heads = ["method", *(column.heading for column in COLUMNS)]
+    table = [
+        [_name(name, summary), *(column.cell(summary) for column in COLUMNS)]
+        for name, summary in record["methods"].items()
+    ]
+    shown = [i for i in range(len(heads)) if any(line[i] != "-" for line in table)]
+    return [[line[i] for i in shown] for line in (heads, *table)]
 
 
-def title(evaluation: Evaluation) -> str:
+def title(record: Record) -> str:
     """What was measured on what."""
-    number = max(len(result.success) for result in evaluation.results)
-    return f"{evaluation.env_id}, scenes {evaluation.scenes} ({number}, sha256 {evaluation.sha256[:12]})"
+    number = max(summary["scenes"] for summary in record["methods"].values())
+    return f"{record['env']}, scenes {record['scenes']} ({number}, sha256 {record['sha256'][:12]})"
 
 
-def markdown(evaluation: Evaluation) -> str:
+def markdown(record: Record) -> str:
     """The table as a document."""
-    head, *body = rows(evaluation)
+    head, *body = rows(record)
     lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"# {title(evaluation)}\n\n{table}\n\n{NOTES}\n"
+    return f"# {title(record)}\n\n{table}\n\n{NOTES}\n"
 
 
-def show(evaluation: Evaluation, console: Console | None = None) -> None:
-    """Print the table."""
-    console = console or Console()
-    head, *body = rows(evaluation)
-    shown = [i for i in range(len(head)) if i == 0 or any(line[i] != "-" for line in body)]
-    table = Table(title=title(evaluation), title_justify="left")
-    for i in shown:
-        table.add_column(head[i], justify="left" if i == 0 else "right")
-    for line in body:
-        table.add_row(*(line[i] for i in shown))
-    console.print(table)
+def show(record: Record, console: Console | None = None) -> None:
+    """Print the table, turned on its side: one column for each method."""
+    lines = rows(record)
+    table = Table(title=title(record), title_justify="left")
+    for i, line in enumerate(lines):
+        table.add_column(line[0] if i else "", justify="right" if i else "left")
+    for i in range(1, len(lines[0])):
+        table.add_row(*(line[i] for line in lines))
+    (console or Console()).print(table)
 
 
-def write(evaluation: Evaluation, folder: Path, stem: str = "table") -> tuple[Path, Path]:
+def write(record: Record, folder: Path, stem: str = "table") -> tuple[Path, Path]:
     """Write the table as Markdown and as JSON; the JSON holds every outcome of every scene, too."""
     folder.mkdir(parents=True, exist_ok=True)
     document, data = folder / f"{stem}.md", folder / f"{stem}.json"
-    write_bytes(document, markdown(evaluation).encode())
-    write_json(data, evaluation.as_json())
+    write_bytes(document, markdown(record).encode())
+    write_json(data, dict(record))
     return document, data
 
 
-def _name(result: MethodResult) -> str:
-    return f"{result.name} (partial: {len(result.success)} scenes)" if result.partial else result.name
+def _name(name: str, summary: Summary) -> str:
+    return f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name

@@ -1,0 +1,106 @@
+"""The command `viapoint`."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import io
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple, Union
+
+import tyro
+
+from viapoint.training.config import BenchConfig, DemoConfig, EvaluateConfig, PlayConfig, TrainConfig
+
+
+class UsageError(ValueError):
+    """A command line that is not understood; the message is one line."""
+
+
+class Command(NamedTuple):
+    """One subcommand: what it can be told, and the function that does it, imported only when it is called."""
+
+    config: type[Any]
+    module: str
+    function: str
+
+    def __call__(self, config: Any) -> None:
+        """Do it."""
+        getattr(importlib.import_module(self.module), self.function)(config)
+
+
+COMMANDS: dict[str, Command] = {
+    "train": Command(TrainConfig, "viapoint.training.commands", "train"),
+    "evaluate": Command(EvaluateConfig, "viapoint.training.commands", "evaluate"),
+    "play": Command(PlayConfig, "viapoint.training.commands", "play"),
+    "bench": Command(BenchConfig, "viapoint.training.bench", "run"),
+    "demo": Command(DemoConfig, "viapoint.training.demo", "run"),
+}
+"""Every subcommand by its name; one line adds one."""
+
+DESCRIPTION = (
+    "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
+    "`viapoint COMMAND --help` shows a command's options; --debug shows where an error came from."
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a subcommand; an error is one line on the standard error output and exit code 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        config = parse(words)
+        next(command for command in COMMANDS.values() if type(config) is command.config)(config)
+    except KeyboardInterrupt:
+        _leave("stopped", 130)
+    except Exception as error:
+        if debug:
+            raise
+        _leave(_one_line(error), 2)
+
+
+def parse(words: Sequence[str]) -> Any:
+    """The configuration that a command line stands for.
+
+    Raises:
+        SystemExit: Help was asked for; code 0.
+        UsageError: A word is not understood or not allowed.
+    """
+    kinds = [Annotated[command.config, tyro.conf.subcommand(name=name)] for name, command in COMMANDS.items()]
+    union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                union,
+                prog="viapoint",
+                description=DESCRIPTION,
+                args=list(words),
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(_unboxed(complaint.getvalue())) from None
+
+
+def _unboxed(text: str) -> str:
+    """The words in tyro's boxes, without the frame and its title."""
+    lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
+    return " ".join(line for line in lines if line) or text
+
+
+def _one_line(error: Exception) -> str:
+    known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
+        ("viapoint", "gymnasium")
+    )
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if known else f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+def _leave(message: str, code: int) -> None:
+    print(f"viapoint: {message}", file=sys.stderr)
+    raise SystemExit(code)

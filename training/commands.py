@@ -1,0 +1,142 @@
+"""What `viapoint train`, `evaluate` and `play` do."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from viapoint.training import report
+from viapoint.training import train as training
+from viapoint.training.baselines import AgentMethod, Method, make_method
+from viapoint.training.config import EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.evaluate import evaluate as measure
+from viapoint.training.files import write_json
+from viapoint.training.frozen_scenes import load
+from viapoint.training.runs import find_model, load_model
+
+
+class Agent(NamedTuple):
+    """A trained agent and the environment that it was trained on."""
+
+    model: Any
+    env_id: str
+    env_kwargs: dict[str, Any]
+    folder: Path
+
+    def method(self, candidates: int = 0) -> AgentMethod:
+        """The agent as a method; with candidates, its critic ranks that many at each decision."""
+        if candidates and not hasattr(self.model.policy, "ranked"):
+            kind = type(self.model).__name__
+            raise ValueError(f"candidates are ranked by ViaTD3 only; this agent is a {kind}")
+        name = f"agent, {candidates} candidates" if candidates else "agent"
+        return AgentMethod(name, self.model, candidates)
+
+
+def find_agent(run: Path | None, pretrained: str | None) -> Agent:
+    """The agent of a run folder, or the one shipped for an environment.
+
+    Raises:
+        ValueError: There is none.
+    """
+    folder = find_model(run) if run is not None else pretrained_folder(pretrained or "")
+    model = load_model(folder)
+    env: Any = model.get_env()
+    return Agent(model, env.env_id, env.env_kwargs, folder)
+
+
+def pretrained_folder(env_id: str) -> Path:
+    """Where the agent shipped for an environment lies.
+
+    Raises:
+        ValueError: There is none.
+    """
+    shipped = Path(str(files("viapoint.training") / "pretrained"))
+    names = sorted(path.parent.name for path in shipped.glob("*/model.json"))
+    name = env_id.removeprefix("viapoint/")
+    if name not in names:
+        known = ", ".join(f"viapoint/{each}" for each in names) or "none yet"
+        raise ValueError(f"there is no pretrained agent for {env_id!r}; there are: {known}")
+    return shipped / name
+
+
+def train(config: TrainConfig) -> None:
+    """Train, and say where everything is."""
+    run = training.train(config)
+    last = run.curve[-1] if run.curve else None
+    reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
+    print(f"trained for {run.config.total_timesteps} decisions{reached}: {run.folder}")
+
+
+def evaluate(config: EvaluateConfig) -> None:
+    """Measure, print the table, and write the results."""
+    agent = find_agent(config.run, config.pretrained) if "agent" in config.methods else None
+    env_id = agent.env_id if agent else config.env
+    if env_id is None:
+        raise ValueError("without an agent, --env must say which environment is meant")
+    env_kwargs = agent.env_kwargs if agent else {}
+    frozen = load(config.scenes, env_id)
+    methods = [_method(name, agent, config.candidates, env_id, env_kwargs) for name in config.methods]
+    with (
+        progress_bar(methods, min(config.n_scenes or len(frozen.share), len(frozen.share))) as progress,
+        training.one_thread(),
+    ):
+        result = measure(
+            methods, frozen.take(slice(0, config.n_scenes)), env_id, env_kwargs=env_kwargs, progress=progress
+        )
+    record = result.as_json()
+    report.show(record)
+    if result.partial:
+        print("interrupted: the results are partial", file=sys.stderr)
+    if config.json is not None:
+        config.json.parent.mkdir(parents=True, exist_ok=True)
+        write_json(config.json, record)
+        print(f"results, scene by scene: {config.json}")
+
+
+def play(config: PlayConfig) -> None:
+    """Film an agent's movements."""
+    from viapoint.training.video import film
+
+    agent = find_agent(config.run, config.pretrained)
+    scenes = load(config.scenes, agent.env_id).scenes
+    rows = spread(len(scenes.start), config.n_scenes)
+    env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
+    method = agent.method(config.candidates)
+    config.video.parent.mkdir(parents=True, exist_ok=True)
+    note = film(config.video, env, scenes.take(rows), method.decide)
+    env.close()
+    print(f"{len(rows)} movements: {note or config.video}")
+
+
+def spread(number: int, count: int) -> Any:
+    """At most `count` indices, evenly spread over `number`."""
+    return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
+
+
+@contextmanager
+def progress_bar(methods: Sequence[Method], scenes: int) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar over methods and scenes."""
+    with tqdm(total=scenes * len(methods), unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
+
+        def progress(name: str, done: int, total: int) -> None:
+            bar.set_description(name)
+            bar.update(done - (bar.n % total))
+
+        yield progress
+
+
+def _method(
+    name: str, agent: Agent | None, candidates: int, env_id: str, env_kwargs: dict[str, Any]
+) -> Method:
+    if name == "agent":
+        assert agent is not None
+        return agent.method(candidates)
+    return make_method(name, env_id, **env_kwargs)
