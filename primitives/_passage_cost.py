@@ -2,8 +2,8 @@
 
 With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s). Its gradient is that of phi
 at fixed states (envelope theorem), its Hessian the Schur complement phi_hh - phi_hy phi_yy^-1 phi_yh, where
-phi_yy is the banded matrix of the linear problem. phi_s = 1/2 h^-5 |q0|^2 with the three Legendre modes of
-the jerk q0 = P s of the segment's data s.
+phi_yy is the banded matrix of the linear problem. phi_s = 1/2 h^-5 sum_i w_i |q_i|^2 with the three Legendre
+modes of the jerk q = P s of the segment's data s.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from ._banded import States, assemble, factorise
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 
-_SQRT3, _SQRT5 = 3.0**0.5, 5.0**0.5
 _MODES: tuple[dict[int, float], ...] = (
     {2: -1.0, 4: 1.0},
-    {1: 2.0 * _SQRT3, 2: _SQRT3, 3: -2.0 * _SQRT3, 4: _SQRT3},
-    {0: 12.0 * _SQRT5, 1: -6.0 * _SQRT5, 2: -_SQRT5, 3: -6.0 * _SQRT5, 4: _SQRT5},
+    {1: 2.0, 2: 1.0, 3: -2.0, 4: 1.0},
+    {0: 12.0, 1: -6.0, 2: -1.0, 3: -6.0, 4: 1.0},
 )
-"""P: the modes of the jerk in unit time, of the data s = (D, V0, A0, V1, A1)."""
+"""P: the Legendre modes of the jerk in unit time, of the data s = (D, V0, A0, V1, A1)."""
+
+_WEIGHTS = (1.0, 3.0, 5.0)
+"""Integral of squared jerk = sum of weight * mode^2; whole numbers, so that modes cancel as they should."""
 
 _DEGREES = (0, 1, 2, 1, 2)
 """The power of h by which each entry of s is scaled."""
@@ -49,6 +51,15 @@ class PassageCost:
             [v[:, items] if isinstance(v, np.ndarray) else v for v in end] for end in (self.start, self.goal)
         ]
         return PassageCost(self.steps[:, :, items], *ends)
+
+    def refined(self, items: Any) -> PassageCost:
+        """Return the movements `items` in extended precision, where the machine has one."""
+        part = self.chosen(items)
+        ends = [
+            [v.astype(np.longdouble) if isinstance(v, np.ndarray) else v for v in end]
+            for end in (part.start, part.goal)
+        ]
+        return PassageCost(part.steps.astype(np.longdouble), *ends)
 
     def scale(self) -> Floats:
         """Return (N,) the squared extent of each movement, 1 where it is zero."""
@@ -75,7 +86,7 @@ class PassageCost:
                 states[k] = [value, states[k][1]] if i == 0 else [states[k][0], value]
         modes = [_apply(self._data(h, states), power) for power in range(3)]
         j, first, second = _segment_derivatives(h, *modes)
-        hessian = np.zeros((segments, *h.shape))
+        hessian = np.zeros((segments, *h.shape), dtype=h.dtype)
         if factor is not None:
             rows = _mixed_rows(h, modes[0], modes[1])
             right = [self._mixed_column(rows, k, i) for k, i in nodes]
@@ -90,7 +101,7 @@ class PassageCost:
 
     def _data(self, h: Floats, states: States) -> list[Floats]:
         """S = (D, V0, A0, V1, A1), each (S, D, N)."""
-        nothing = np.zeros(self.steps.shape[1:])
+        nothing = np.zeros(self.steps.shape[1:], dtype=h.dtype)
         velocity, acceleration = (
             np.stack([nothing if state[i] is None else state[i] for state in states]) for i in range(2)
         )
@@ -106,7 +117,7 @@ class PassageCost:
 
     def _mixed_column(self, rows: dict[int, Floats], k: int, i: int) -> Floats:
         """d2 phi / dy dh_s for all s, (S, D, N): only the two segments at the knot count."""
-        column = np.zeros(self.steps.shape)
+        column = np.zeros_like(self.steps)
         if k > 0:
             column[k - 1] = rows[3 + i][k - 1]
         if k < len(column):
@@ -149,13 +160,13 @@ def _mixed_rows(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floa
     """Return J (N,) and the first two derivatives (S, N) of phi_s by h_s at fixed states."""
     inverse = (1.0 / h)[:, None]
     fourth = inverse * inverse * inverse * inverse
-    rows = {}
+    rows: dict[int, Floats] = {}
     for place in (1, 2, 3, 4):
         degree = _DEGREES[place]
         total: Any = None
-        for row, zero, one in zip(_MODES, q0, q1, strict=True):
+        for weight, row, zero, one in zip(_WEIGHTS, _MODES, q0, q1, strict=True):
             if place in row:
-                term = row[place] * (one + (degree - 5.0) * zero)
+                term = (weight * row[place]) * (one + (degree - 5.0) * zero)
                 total = term if total is None else total + term
         rows[place] = (fourth * inverse if degree == 1 else fourth) * total
     return rows
@@ -164,8 +175,8 @@ def _mixed_rows(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floa
 def _product(p: list[Floats], q: list[Floats]) -> Floats:
     """Sum over modes and dimensions, (S, N)."""
     total = _sum_dimensions(p[0] * q[0])
-    for x, y in zip(p[1:], q[1:], strict=True):
-        total = total + _sum_dimensions(x * y)
+    for weight, x, y in zip(_WEIGHTS[1:], p[1:], q[1:], strict=True):
+        total = total + weight * _sum_dimensions(x * y)
     return total
 
 

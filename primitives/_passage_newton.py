@@ -18,6 +18,10 @@ _STARTS = 10
 """Starts with moving ends: even, by chord, and eight drawn from the flat Dirichlet distribution with a fixed
 seed."""
 
+_SHORT = 0.03
+"""Fraction of the duration below which a segment's cost suffers from cancellation, like 1e-16 / h^2:
+movements with such a segment are finished in extended precision."""
+
 
 def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
     """Fractions of the duration per segment, (N, S), and whether the iteration converged, (N,)."""
@@ -29,7 +33,13 @@ def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, An
         better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
         pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
         best = Minima(*(np.where(better, new, old) for new, old in pairs))
-    return np.ascontiguousarray(_softmax(best.z).T), best.converged
+    h = _softmax(best.z)
+    hard = np.flatnonzero(~best.converged | (h.min(axis=0) < _SHORT))
+    if hard.size:
+        refined = _from_start(cost.refined(hard), h[:, hard].astype(np.longdouble))
+        h[:, hard] = _softmax(refined.z)
+        best.converged[hard] = refined.converged
+    return np.ascontiguousarray(h.T), best.converged
 
 
 def _from_start(cost: PassageCost, start: Floats) -> Minima:

@@ -7,7 +7,7 @@ with the same inner sizes, so a batch gives bit for bit what each item gives alo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,48 +15,63 @@ import numpy as np
 from ._arrays import Array, Namespace, blocks, constant
 from ._hermite import derivative_factors
 
-_BLOCK_BYTES = 400_000
+_BLOCK_BYTES = 600_000
 """Size of the basis of one block of trajectories: it stays in a core's second-level cache while it is
 used."""
 
 
 def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:
-    """Columns of the basis, transposed.
+    """Return the columns of the basis, transposed.
 
     Args:
         time: (..., T) [s], within the movement.
         starts: (..., S) start time of each segment [s].
         rates: (..., S) reciprocal durations [1/s].
-        degree: highest power.
+        degree: highest power, at least 1.
         xp: namespace.
 
     Returns:
         (..., (degree + 1) S, T); row k S + s is u_s^k where segment s is current, else 0.
     """
-    time = time[..., None, :]
-    segments = starts.shape[-1]
-    if segments == 1:
-        power = (time - starts[..., None]) * rates[..., None]
-        rows = [xp.ones_like(power), power]
-    else:
-        current = _current_segment(time, starts, xp)
-        power = (time - starts[..., None]) * rates[..., None] * current
-        rows = [current, power]
-    local = power
-    for _ in range(degree - 1):
+    if xp is np:
+        return _power_basis_in_place(time, starts, rates, degree)
+    power = (time[..., None, :] - starts[..., None]) * rates[..., None]
+    current = xp.ones_like(power)
+    if starts.shape[-1] > 1:
+        current = xp.astype(_current_segment(time, starts, xp), starts.dtype)
+        power = power * current
+    rows, local = [current, power], power
+    while len(rows) <= degree:
         power = power * local
         rows.append(power)
-    return xp.concat(rows[: degree + 1], axis=-2)
+    return xp.concat(rows, axis=-2)
+
+
+def _power_basis_in_place(time: Any, starts: Any, rates: Any, degree: int) -> Any:
+    """Do the same, to the bit, without temporary arrays: most of the time of sampling is spent here."""
+    segments, count = starts.shape[-1], time.shape[-1]
+    batch = np.broadcast_shapes(time.shape[:-1], starts.shape[:-1])
+    basis = np.empty((*batch, degree + 1, segments, count), dtype=starts.dtype)
+    current, local = basis[..., 0, :, :], basis[..., 1, :, :]
+    np.subtract(time[..., None, :], starts[..., None], out=local)
+    local *= rates[..., None]
+    if segments == 1:
+        current[...] = 1.0
+    else:
+        current[...] = _current_segment(time, starts, np)
+        local *= current
+    for k in range(2, degree + 1):
+        np.multiply(basis[..., k - 1, :, :], local, out=basis[..., k, :, :])
+    return basis.reshape(*batch, -1, count)
 
 
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
-    """(..., S, T): 1 where start_s <= time < start_(s+1), else 0; the last segment has no end."""
-    reached = xp.astype(time >= starts[..., 1:, None], starts.dtype)
-    if reached.shape[-2] == 1:
-        return xp.concat([1.0 - reached, reached], axis=-2)
-    return xp.concat(
-        [1.0 - reached[..., :1, :], reached[..., :-1, :] - reached[..., 1:, :], reached[..., -1:, :]], axis=-2
-    )
+    """(..., S, T): True where start_s <= time < start_(s+1), S >= 2; the last segment has no end."""
+    reached = time[..., None, :] >= starts[..., 1:, None]
+    parts = [~reached[..., :1, :], reached[..., -1:, :]]
+    if reached.shape[-2] > 1:
+        parts.insert(1, reached[..., :-1, :] & ~reached[..., 1:, :])
+    return xp.concat(parts, axis=-2)
 
 
 def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array:
@@ -91,52 +106,46 @@ def evaluate(
         out: buffers, one per order, of the full result shape.
         xp: namespace.
     """
-    plain = coefficients.ndim == 4 and time.ndim <= 2 and starts.ndim + time.ndim > 2
-    if xp is np and plain and all(len(a) in (1, len(coefficients)) for a in (starts, time) if a.ndim == 2):
-        return _evaluate_in_blocks(coefficients, starts, rates, time, orders, out)
-    return _evaluate(coefficients, starts, rates, time, orders, out, xp)
-
-
-def _evaluate_in_blocks(
-    coefficients: Any, starts: Any, rates: Any, time: Any, orders: Sequence[int], out: Sequence[Any] | None
-) -> list[Array]:
-    count = coefficients.shape[0]
-    size = max(1, _BLOCK_BYTES // (coefficients.itemsize * time.shape[-1] * coefficients[0, ..., 0].size))
+    powers, segments, dimension = coefficients.shape[-3:]
+    weights = []
+    for nu in orders:
+        weight = derivative_coefficients(coefficients, rates, nu)
+        weights.append(xp.reshape(weight, (*weight.shape[:-3], (powers - nu) * segments, dimension)))
+    degree = max(1, powers - 1 - min(orders))
+    if xp is not np:
+        return _products(power_basis(time, starts, rates, degree, xp), weights, out, xp)
     if out is None:
-        shape = (count, time.shape[-1], coefficients.shape[-1])
-        out = [np.empty(shape, coefficients.dtype) for _ in orders]
-
-    def part(array: Any, where: slice) -> Any:
-        return array[where] if array.ndim > 1 and array.shape[0] > 1 else array
-
-    for where in blocks(count, size):
-        piece = coefficients[where], part(starts, where), part(rates, where), part(time, where)
-        _evaluate(*piece, orders, [buffer[where] for buffer in out], np)
+        batch = np.broadcast_shapes(coefficients.shape[:-3], time.shape[:-1])
+        out = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
+    for where, shared in _blocks(coefficients, starts, time):
+        basis = power_basis(time[shared[0]], starts[shared[1]], rates[shared[1]], degree, np)
+        _products(basis, [weight[where] for weight in weights], [buffer[where] for buffer in out], np)
     return list(out)
 
 
-def _evaluate(
-    coefficients: Array,
-    starts: Array,
-    rates: Array,
-    time: Array,
-    orders: Sequence[int],
-    out: Sequence[Array] | None,
-    xp: Namespace,
-) -> list[Array]:
-    powers, segments, dimension = coefficients.shape[-3:]
-    basis = power_basis(time, starts, rates, powers - 1 - min(orders), xp)
+def _products(basis: Array, weights: list[Array], out: Sequence[Array] | None, xp: Namespace) -> list[Array]:
+    """Multiply the basis with the coefficients of each derivative; it uses the first rows of the basis."""
     results = []
-    for place, nu in enumerate(orders):
-        size = (powers - nu) * segments
-        weights = derivative_coefficients(coefficients, rates, nu)
-        weights = xp.reshape(weights, (*weights.shape[:-3], size, dimension))
-        columns = basis[..., :size, :].mT
+    for place, weight in enumerate(weights):
+        columns = basis[..., : weight.shape[-2], :].mT
         if out is None:
-            results.append(xp.matmul(columns, weights))
+            results.append(xp.matmul(columns, weight))
         elif xp is np:
-            results.append(np.matmul(columns, weights, out=out[place]))
+            results.append(np.matmul(columns, weight, out=out[place]))
         else:
-            out[place][...] = xp.matmul(columns, weights)
+            out[place][...] = xp.matmul(columns, weight)
             results.append(out[place])
     return results
+
+
+def _blocks(coefficients: Any, starts: Any, time: Any) -> Iterator[tuple[Any, tuple[Any, Any]]]:
+    """Index of each block of the batch, and of the same block in `time` and `starts` (or all, if shared)."""
+    count, own = len(coefficients), [array.ndim == 2 and len(array) > 1 for array in (time, starts)]
+    plain = coefficients.ndim == 4 and all(array.ndim <= 2 for array in (time, starts))
+    fitting = all(len(array) in (1, count) for array in (time, starts) if array.ndim == 2)
+    if not plain or not fitting or not any(own):
+        yield ..., (..., ...)
+        return
+    size = max(1, _BLOCK_BYTES // (coefficients[0, ..., 0].size * time.shape[-1] * coefficients.itemsize))
+    for where in blocks(count, size):
+        yield where, (where if own[0] else ..., where if own[1] else ...)

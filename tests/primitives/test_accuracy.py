@@ -1,0 +1,170 @@
+"""Errors against a reference in 40 digits: the promises of the package, for hard inputs as well."""
+
+import mpmath
+import numpy as np
+import pytest
+
+from viapoint.primitives import minimum_jerk_coefficients, passage_durations, point_to_point, through
+
+RNG = np.random.default_rng(50)
+mpmath.mp.dps = 40
+
+
+class Reference:
+    """The minimum-jerk movement of one axis, rest to rest, by dense elimination in 40 digits: states, then segments."""
+
+    def __init__(self, points, durations):
+        self.x = [mpmath.mpf(float(x)) for x in points]
+        self.h = [mpmath.mpf(float(h)) for h in durations]
+        inner = len(self.x) - 2
+        matrix, right = mpmath.zeros(2 * inner), mpmath.zeros(2 * inner, 1)
+        for k in range(inner):
+            # Continuity of snap and jerk at via-point k + 1, in terms of velocities and accelerations.
+            left, after = self.h[k], self.h[k + 1]
+            step, next_step = self.x[k + 1] - self.x[k], self.x[k + 2] - self.x[k + 1]
+            v, a = 2 * k, 2 * k + 1
+            matrix[v, v] = 192 * (left**-3 + after**-3)
+            matrix[v, a] = matrix[a, v] = 36 * (after**-2 - left**-2)
+            matrix[a, a] = 9 * (1 / left + 1 / after)
+            if k + 1 < inner:
+                matrix[v, v + 2] = matrix[v + 2, v] = 168 * after**-3
+                matrix[v, a + 2] = matrix[a + 2, v] = -24 * after**-2
+                matrix[a, v + 2] = matrix[v + 2, a] = 24 * after**-2
+                matrix[a, a + 2] = matrix[a + 2, a] = -3 / after
+            right[v] = 360 * (step / left**4 + next_step / after**4)
+            right[a] = 60 * (next_step / after**3 - step / left**3)
+        solution = mpmath.lu_solve(matrix, right) if inner else []
+        self.v = [mpmath.mpf(0), *(solution[2 * k] for k in range(inner)), mpmath.mpf(0)]
+        self.a = [mpmath.mpf(0), *(solution[2 * k + 1] for k in range(inner)), mpmath.mpf(0)]
+
+    def segment(self, s):
+        h, d = self.h[s], self.x[s + 1] - self.x[s]
+        v0, v1 = self.v[s] * h, self.v[s + 1] * h
+        a0, a1 = self.a[s] * h**2, self.a[s + 1] * h**2
+        return [
+            self.x[s],
+            v0,
+            a0 / 2,
+            10 * d - 6 * v0 - 4 * v1 - 3 * a0 / 2 + a1 / 2,
+            -15 * d + 8 * v0 + 7 * v1 + 3 * a0 / 2 - a1,
+            6 * d - 3 * v0 - 3 * v1 - a0 / 2 + a1 / 2,
+        ]
+
+    def __call__(self, time, nu):
+        time = mpmath.mpf(float(time))
+        start, s = mpmath.mpf(0), 0
+        while s + 1 < len(self.h) and time >= start + self.h[s]:
+            start, s = start + self.h[s], s + 1
+        u = (time - start) / self.h[s]
+        terms = [c * mpmath.ff(k, nu) * u ** (k - nu) for k, c in enumerate(self.segment(s)) if k >= nu]
+        return mpmath.fsum(terms) / self.h[s] ** nu
+
+    def cost(self):
+        total = mpmath.mpf(0)
+        for s, h in enumerate(self.h):
+            c3, c4, c5 = (6 * self.segment(s)[3], 24 * self.segment(s)[4], 60 * self.segment(s)[5])
+            square = c3**2 + c3 * c4 + c4**2 / 3 + 2 * c3 * c5 / 3 + c4 * c5 / 2 + c5**2 / 5
+            total += square / h**5 / 2
+        return total
+
+
+@pytest.mark.parametrize("duration", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(("vias", "ratio"), [(0, 1), (1, 100), (5, 10), (20, 1), (20, 100)])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_positions_velocities_and_accelerations_are_exact_to_rounding(vias, ratio, duration, offset):
+    points = offset + RNG.uniform(-1, 1, vias + 2)
+    durations = np.exp(RNG.uniform(0, np.log(ratio), vias + 1)) if ratio > 1 else np.ones(vias + 1)
+    durations *= duration / durations.sum()
+    trajectory = through(points[:, None], durations)
+    reference = Reference(points, durations)
+    time = RNG.uniform(0, duration, 40)
+    for nu in range(4):
+        expected = np.array([float(reference(t, nu)) for t in time])
+        error = np.abs(trajectory(time, nu)[:, 0] - expected).max() / np.abs(expected).max()
+        assert error < 1e-11, (nu, error)
+    np.testing.assert_allclose(float(trajectory.cost()), float(reference.cost()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("duration", [1e-3, 1e3])
+def test_single_precision_stays_within_1e_5(duration):
+    waypoints = RNG.uniform(-1, 1, (20, 5, 2)).astype(np.float32)
+    durations = (RNG.uniform(0.5, 1.0, (20, 4)) * duration).astype(np.float32)
+    single = through(waypoints, durations)
+    double = through(waypoints.astype(float), durations.astype(float))
+    assert single.coefficients.dtype == np.float32
+    for nu in range(3):
+        a, b = (trajectory.sample(100, nu)[0] for trajectory in (single, double))
+        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
+    np.testing.assert_allclose(single.cost(), double.cost(), rtol=1e-5)
+
+
+def test_passage_times_agree_with_40_digits():
+    vias = np.concatenate(
+        [
+            RNG.uniform(-2, 2, (15, 2)),
+            RNG.normal(size=(15, 2)) * 10.0 ** RNG.uniform(-9, 3, (15, 1)),
+            [[1e-12, 0], [0.5 - 1e-9, 0.3], [-0.2, 0.0], [1e-7, 1e-3]],
+        ]
+    )
+    waypoints = np.zeros((len(vias), 3, 2))
+    waypoints[:, 1], waypoints[:, 2, 0] = vias, 1.0
+    fractions = passage_durations(waypoints, 1.0)
+    for (x, y), found in zip(vias, fractions, strict=True):
+        x, y = mpmath.mpf(float(x)), mpmath.mpf(float(y))
+        a, b, c = x, mpmath.mpf(1), x * x + y * y
+        polynomial = [c, -2 * c, 0, -8 * a, 34 * a, -36 * a, 12 * a - 20 * b, 40 * b, -27 * b, 6 * b]
+        root = mpmath.findroot(lambda t, p=polynomial: mpmath.polyval(p[::-1], t), mpmath.mpf(float(found[0])))
+        smaller = min(root, 1 - root)
+        assert abs(found.min() - smaller) <= 1e-12 * smaller
+
+
+def test_the_primers_own_example():
+    """Its Matlab code, with T = 2: coefficients a such that x_t = sum_k a_k t^(k-1) meets all six conditions."""
+    state = {"x0": 0.3, "dx0": -1.0, "ddx0": 2.0, "xT": 1.5, "dxT": 0.5, "ddxT": -3.0}
+    duration = 2.0
+    a = minimum_jerk_coefficients(**state, T=duration)
+    movement = np.polynomial.Polynomial(a)
+    for nu, names in enumerate((("x0", "xT"), ("dx0", "dxT"), ("ddx0", "ddxT"))):
+        at = movement.deriv(nu)(np.array([0.0, duration])) if nu else movement(np.array([0.0, duration]))
+        np.testing.assert_allclose(at, [state[name] for name in names], atol=1e-12)
+    # The code's own linear system, solved instead of pseudo-inverted.
+    t = duration
+    b = np.array([[t**3, t**4, t**5], [3 * t**2, 4 * t**3, 5 * t**4], [6 * t, 12 * t**2, 20 * t**3]])
+    c = [1.5 - a[0] - a[1] * t - a[2] * t**2, 0.5 - a[1] - 2 * a[2] * t, -3.0 - 2 * a[2]]
+    np.testing.assert_allclose(np.linalg.solve(b, c), a[3:], rtol=1e-12)
+
+
+@pytest.mark.parametrize("duration", [1e-5, 1e-3, 1e3, 1e5])
+def test_the_primers_coefficients_hold_for_any_duration(duration):
+    x0, v0, a0, x1, v1, a1 = RNG.normal(size=(6, 50))
+    rate = 1 / duration
+    a = minimum_jerk_coefficients(x0, v0 * rate, a0 * rate**2, x1, v1 * rate, a1 * rate**2, duration)
+    unit = a * duration ** np.arange(6)
+    np.testing.assert_allclose(unit.sum(axis=-1), x1, atol=1e-12)
+    np.testing.assert_allclose(unit @ np.arange(6), v1, atol=1e-12)
+    np.testing.assert_allclose(unit @ (np.arange(6) * np.arange(-1, 5)), a1, atol=1e-11)
+
+
+def test_equations_2_4_and_5_of_the_paper():
+    """Flash & Hogan's closed forms, corrected where the print is wrong, are this package's movements."""
+    start, via, goal, end = 0.2, 0.9, 0.5, 1.7
+    tau = np.linspace(0, 1, 41)
+    straight = start + (start - goal) * (15 * tau**4 - 6 * tau**5 - 10 * tau**3)
+    np.testing.assert_allclose(point_to_point([start], [goal], end)(tau * end)[:, 0], straight, atol=1e-15)
+    t1 = 0.37
+    p = t1 * (1 - t1)
+    pi1 = ((goal - start) * (120 * t1**5 - 300 * t1**4 + 200 * t1**3) - 20 * (via - start)) / (end**5 * p**5)
+    c1 = (
+        (goal - start) * (300 * t1**5 - 1200 * t1**4 + 1600 * t1**3)
+        + t1**2 * (-720 * goal + 120 * via + 600 * start)
+        + (start - via) * (300 * t1 - 200)
+    ) / (end**5 * t1**2 * (1 - t1) ** 5)
+    before = (
+        pi1 * (t1**4 * (15 * tau**4 - 30 * tau**3) + t1**3 * (80 * tau**3 - 30 * tau**4))
+        + pi1 * (-60 * tau**3 * t1**2 + 30 * tau**4 * t1 - 6 * tau**5)
+        + c1 * (15 * tau**4 - 10 * tau**3 - 6 * tau**5)
+    ) * end**5 / 720 + start
+    after = before + pi1 * end**5 * (tau - t1) ** 5 / 120
+    expected = np.where(tau < t1, before, after)
+    movement = through(np.array([[start], [via], [goal]]), [t1 * end, (1 - t1) * end])
+    np.testing.assert_allclose(movement(tau * end)[:, 0], expected, atol=1e-13)
