@@ -18,6 +18,8 @@ Shape = mujoco.mjtGeom
 
 MATT, GLOWING = 0.0, 1.0
 """How much of its colour a thing shows without light: lines are ink, things are lit."""
+VAULT = 0.4
+"""Height of a post's head relative to its radius."""
 
 
 class Pencil:
@@ -57,15 +59,18 @@ class Pencil:
         self.disc(centre, radius - thickness, 0.002, PALETTE.table)
 
     def post(self, foot: Float, top: float, radius: float, colour: Colour) -> None:
-        """An upright rounded post from `foot` (3,) up to the height `top` [m]."""
-        self.rod(foot, np.array([*foot[:2], top - radius]), radius, colour)
+        """An upright post with a vaulted head, from `foot` (3,) up to the height `top` [m]."""
+        vault = VAULT * radius
+        self.disc(foot, radius, top - vault - foot[2], colour)
+        head = np.array([*foot[:2], top - vault])
+        self._add(Shape.mjGEOM_ELLIPSOID, (radius, radius, vault), head, colour, MATT)
 
     def wall(self, foot: Float, half_axis: Float, top: float, radius: float, colour: Colour) -> None:
         """A rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
         crest = top - radius
         ends = foot - half_axis, foot + half_axis
         for end in ends:
-            self.post(end, top, radius, colour)
+            self.rod(end, np.array([*end[:2], crest]), radius, colour)
         self.rod(np.array([*ends[0][:2], crest]), np.array([*ends[1][:2], crest]), radius, colour)
         half = float(np.linalg.norm(half_axis))
         along = half_axis / half

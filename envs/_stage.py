@@ -19,8 +19,8 @@ Float = NDArray[np.float64]
 CAMERA = "view"
 HIDDEN = 5
 """MuJoCo's group of geoms that nobody sees."""
-OVERHEAD = 0.5
-"""How opaque links are that pass above everything else."""
+OVERHEAD, AMONG = 0.5, 0.7
+"""How opaque links are that pass above the obstacles, or stand among them."""
 LOW, TALL = 0.030, 0.060
 """Height of the obstacles over the hand: below the links that pass above, or in the way of the links, [m]."""
 PLAN, DONE = 0.0065, 0.0030
@@ -46,8 +46,8 @@ class Stage:
         """Whether the links collide, too."""
         self._floor = self._level_table()
         self._aim(width, height)
-        if not self.whole_arm:
-            self.model.geom_rgba[self._links, 3] = OVERHEAD
+        if self.arm.dimension == 2:
+            self.model.geom_rgba[self._links, 3] = AMONG if self.whole_arm else OVERHEAD
         self.scene = mujoco.MjvScene(self.model, ROOM)
         """What is to be seen, once it is set."""
 

@@ -1,0 +1,130 @@
+"""The pictures of the documentation, rendered by the program: `python -m viapoint.training.pictures`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from viapoint.envs.scenes import Scenes
+from viapoint.training.flow_picture import draw_flow
+
+Float = NDArray[np.float64]
+
+SEEDS = {"PlanarReach": (4,), "PlanarObstacles": (15, 5, 12, 6), "PlanarWholeArm": (1,)}
+"""Scenes that show what a task is about; the first of each is its picture."""
+FILES = {
+    "PlanarReach": "planar_reach.png",
+    "PlanarObstacles": "planar_obstacles.png",
+    "PlanarWholeArm": "planar_whole_arm.png",
+}
+ATTEMPTS = 400
+"""Random movements in a scene."""
+SCENES = 10
+"""How many scenes are tried for one that can be shown."""
+SAFE = 0.012
+"""Least clearance of a movement that is shown, [m]."""
+SPEED = 0.5
+"""Of the animation, relative to real time."""
+PAUSE = 700
+"""After each movement of the animation, [ms]."""
+
+
+class Solved(NamedTuple):
+    """A movement that succeeds."""
+
+    scene: Scenes
+    """One row."""
+    action: Float
+    """Shape (m,)."""
+
+
+def solve(env: gym.Env[Any, Any], seed: int) -> Solved:
+    """The smoothest of the successful movements among random ones, in the scene of a seed.
+
+    Where none succeeds, the scenes of the next seeds are tried.
+
+    Raises:
+        RuntimeError: None succeeds in any of them.
+    """
+    task: Any = env.unwrapped.task  # type: ignore[attr-defined]
+    for scene_seed in range(seed, seed + SCENES):
+        scene = task.sampler()([np.random.default_rng(scene_seed)])
+        generator = np.random.default_rng(seed)
+        best, least = None, np.inf
+        for _ in range(ATTEMPTS):
+            action = generator.uniform(-1.0, 1.0, task.action.size).astype(np.float32)
+            env.reset(options=scene.as_options())
+            info = env.step(action)[-1]
+            good = info["is_success"] and info["min_clearance"] > SAFE
+            if good and info["jerk_ratio"] < least:
+                best, least = action, info["jerk_ratio"]
+        if best is not None:
+            return Solved(scene, np.asarray(best))
+    raise RuntimeError(
+        f"none of {ATTEMPTS} random movements succeeds in the scenes of seeds {seed} and after"
+    )
+
+
+def perform(env: gym.Env[Any, Any], solved: Solved) -> Any:
+    """Carry a movement out; what the environment renders of it."""
+    env.reset(options=solved.scene.as_options())
+    env.step(solved.action)
+    return env.render()
+
+
+def picture(task: str, path: Path) -> None:
+    """One movement of a task."""
+    env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array")
+    frame = perform(env, solve(env, SEEDS[task][0]))
+    env.close()
+    Image.fromarray(frame).save(path, optimize=True)
+
+
+def animation(task: str, path: Path, *, size: int = 400) -> None:
+    """A movement in each scene of a task, one after the other, for ever."""
+    env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array_list", width=size, height=size)
+    each = 1000.0 / (env.metadata["render_fps"] * SPEED)
+    images: list[Image.Image] = []
+    durations: list[int] = []
+    for seed in SEEDS[task]:
+        frames = perform(env, solve(env, seed))
+        images += [Image.fromarray(frame) for frame in frames]
+        durations += [round(each)] * (len(frames) - 1) + [PAUSE]
+    env.close()
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=durations, loop=0, quality=80, method=4
+    )
+
+
+def flow(path: Path) -> None:
+    """The flow from action to observation, in real numbers."""
+    env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0", render_mode="rgb_array")
+    solved = solve(env, SEEDS["PlanarObstacles"][0])
+    observation, _ = env.reset(options=solved.scene.as_options())
+    info = env.step(solved.action)[-1]
+    draw_flow(path, env, solved.scene, solved.action, observation, info)
+    env.close()
+
+
+def main() -> None:
+    """Make all pictures."""
+    parser = argparse.ArgumentParser(description="Render the pictures of the documentation.")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
+    out: Path = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    for task, name in FILES.items():
+        picture(task, out / name)
+    animation("PlanarObstacles", out / "reaching.webp")
+    flow(out / "flow.png")
+    for path in sorted(out.iterdir()):
+        print(f"{path}  {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
