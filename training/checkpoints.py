@@ -90,10 +90,9 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     if digest != state.get("sha256"):
         raise BadFileError(path, "is torn: its hash is not the one that state.json states")
     tensors = read_arrays(path)
-    if {**state["model"], "num_timesteps": 0} != {**describe(model), "num_timesteps": 0}:
-        raise BadFileError(
-            folder / "state.json", f"is of another model: {_difference(state['model'], describe(model))}"
-        )
+    difference = _difference(state.get("model"), describe(model))
+    if difference:
+        raise BadFileError(folder / "state.json", f"is of another model: {difference}")
     try:
         _restore(model, state, tensors)
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
@@ -224,14 +223,9 @@ def _torch(value: Any) -> Any:
     return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
 
 
-def _difference(saved: dict[str, Any], mine: dict[str, Any]) -> str:
-    for name in sorted(set(saved) | set(mine)):
-        if (
-            isinstance(saved.get(name), dict)
-            and isinstance(mine.get(name), dict)
-            and saved[name] != mine[name]
-        ):
-            return _difference(saved[name], mine[name])
-        if saved.get(name) != mine.get(name) and name != "num_timesteps":
-            return f"{name} was {saved.get(name)!r}, is {mine.get(name)!r}"
-    return "nothing differs"
+def _difference(saved: Any, mine: Any, name: str = "the model") -> str:
+    """The first thing that differs between two descriptions, in words; empty where nothing does."""
+    if isinstance(saved, dict) and isinstance(mine, dict):
+        names = [each for each in sorted({*saved, *mine}) if each not in ("num_timesteps", "viapoint")]
+        return next(filter(None, (_difference(saved.get(each), mine.get(each), each) for each in names)), "")
+    return "" if saved == mine else f"{name} was {saved!r}, is {mine!r}"

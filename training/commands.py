@@ -82,15 +82,10 @@ def evaluate(config: EvaluateConfig) -> None:
     if env_id is None:
         raise ValueError("without an agent, --env must say which environment is meant")
     env_kwargs = agent.env_kwargs if agent else {}
-    frozen = load(config.scenes, env_id)
+    frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))
     methods = [_method(name, agent, config.candidates, env_id, env_kwargs) for name in config.methods]
-    with (
-        progress_bar(methods, min(config.n_scenes or len(frozen.share), len(frozen.share))) as progress,
-        training.one_thread(),
-    ):
-        result = measure(
-            methods, frozen.take(slice(0, config.n_scenes)), env_id, env_kwargs=env_kwargs, progress=progress
-        )
+    with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
+        result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()
     report.show(record)
     if result.partial:

@@ -6,6 +6,7 @@ tables here, and the weights must have the names, shapes and types of the model 
 
 from __future__ import annotations
 
+import importlib.metadata
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -90,7 +91,8 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
     except BadFileError:
         raise
     except Exception as error:
-        raise BadFileError(path, f"does not describe a model ({type(error).__name__}: {error})") from None
+        reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
+        raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
     put_weights(model, read_arrays(folder / "weights.safetensors"), folder / "weights.safetensors")
     return model
 
@@ -147,6 +149,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
     stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
     return {
         "format": FORMAT,
+        "viapoint": importlib.metadata.version("viapoint"),
         "algorithm": names[type(model)],
         "policy": policies[model.policy_class],
         "env": {"id": env.env_id, "kwargs": _encode(env.env_kwargs)},

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from viapoint.training.evaluate import Evaluation
 from viapoint.training.frozen_scenes import BANDS
 
 BLUE = "#1f5fa8"
@@ -62,9 +61,14 @@ def learning_curve(
     return _save(figure, path)
 
 
-def success_by_band(path: Path, evaluation: Evaluation) -> Path:
-    """Draw each method's success by the difficulty of the scenes, with Wilson intervals."""
-    summaries = {result.name: result.summary() for result in evaluation.results}
+def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
+    """Draw each method's success by the difficulty of the scenes, with Wilson intervals.
+
+    Args:
+        path: Of the picture, PNG.
+        record: Of an evaluation, see :meth:`viapoint.training.evaluate.Evaluation.as_json`.
+    """
+    summaries = record["methods"]
     figure = Figure(figsize=(8.0, 3.8), layout="constrained")
     ax = figure.subplots()
     width = 0.8 / len(summaries)

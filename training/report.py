@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from viapoint.training.files import write_bytes, write_json
@@ -103,9 +104,9 @@ def show(record: Record, console: Console | None = None) -> None:
     lines = rows(record)
     table = Table(title=title(record), title_justify="left")
     for i, line in enumerate(lines):
-        table.add_column(line[0] if i else "", justify="right" if i else "left")
+        table.add_column(escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i)
     for i in range(1, len(lines[0])):
-        table.add_row(*(line[i] for line in lines))
+        table.add_row(*(escape(line[i]) for line in lines))
     (console or Console()).print(table)
 
 

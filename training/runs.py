@@ -101,6 +101,12 @@ class Run:
         write_bytes(self.folder / "learning_curve.jsonl", content.encode())
 
     @property
+    def decisions(self) -> int:
+        """Decisions that the newest checkpoint was trained for; 0 without one."""
+        checkpoints = self.checkpoints()
+        return int(checkpoints[-1].name) if checkpoints else 0
+
+    @property
     def model_folder(self) -> Path:
         """The best model where there is one, otherwise the last.
 
