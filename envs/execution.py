@@ -21,6 +21,8 @@ R = TypeVar("R")
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
+LOOK_EVERY = 4
+"""The clearance of the plan is taken at every fourth physics step: it shapes the reward, contact decides."""
 GROUP = 64
 """Movements carried out together: few enough for the cache, many enough for the threads."""
 
@@ -57,6 +59,8 @@ class References(NamedTuple):
     """Shape (n,)."""
     jerk_cost: Float
     """Shape (n,), [m^2/s^5]."""
+    clearance: Float
+    """Of the plan, shape (n,), [m]."""
 
 
 class Executor:
@@ -77,7 +81,7 @@ class Executor:
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         order = np.argsort(steps, kind="stable")
         groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
-        self._groups = self._map(lambda sims: self._refer(sims, steps[sims], plan), groups)
+        self._groups = self._map(lambda sims: self._refer(steps, plan, scenes, sims), groups)
         self._records = [self._simulate(group) for group in self._groups]
         outcomes = self._map(lambda i: self._measure(i, scenes), list(range(len(groups))))
         together = blank(len(duration))
@@ -128,14 +132,22 @@ class Executor:
             self._pool = ThreadPoolExecutor(self._threads or None, thread_name_prefix="viapoint")
         return list(self._pool.map(function, items))
 
-    def _refer(self, sims: NDArray[np.int64], steps: NDArray[np.int64], plan: Plan) -> References:
-        """References at the physics rate, and the controls that follow them."""
+    def _refer(self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]) -> References:
+        """References at the physics rate, and the controls that follow them, for one group."""
         trajectory = plan.take(sims).trajectory()
-        time = self.simulator.timestep * np.arange(steps.max() + 1)
+        time = self.simulator.timestep * np.arange(steps[sims].max() + 1)
         position, velocity, acceleration = (trajectory(time, nu) for nu in (0, 1, 2))
-        reachable = (self.arm.reach_margin(position) >= 0.0).all(axis=-1)
-        controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])
-        return References(sims, steps, position[:, 1:], controls, reachable, np.asarray(trajectory.cost()))
+        looked_at = position[:, ::LOOK_EVERY]
+        joints = self.arm.posture(looked_at)
+        return References(
+            sims=sims,
+            steps=steps[sims],
+            planned=position[:, 1:],
+            controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
+            reachable=(self.arm.reach_margin(position) >= 0.0).all(axis=-1),
+            jerk_cost=np.asarray(trajectory.cost()),
+            clearance=least_clearance(self.arm, joints, looked_at, scenes.take(sims), whole_arm=self.whole_arm),
+        )
 
     def _simulate(self, group: References) -> Record | None:
         run = group.reachable
@@ -158,4 +170,4 @@ class Executor:
             )
             for mine, theirs in zip(outcome, done, strict=True):
                 mine[run] = theirs
-        return outcome._replace(jerk_cost=group.jerk_cost)
+        return outcome._replace(jerk_cost=group.jerk_cost, planned_clearance=group.clearance)

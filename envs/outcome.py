@@ -34,6 +34,8 @@ class Outcome(NamedTuple):
     """[s]; -1 without contact."""
     min_clearance: Float
     """[m], exact, over all physics steps; at most 1."""
+    planned_clearance: Float
+    """[m], of the plan: how deep it would cut into an obstacle that gave way; at most 1."""
     goal_error: Float
     """[m], after the settling time."""
     duration: Float

@@ -17,13 +17,13 @@ from viapoint.envs.action import ActionLayout, Plan, Timing
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.execution import Executor, Rollout
-from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
 from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
-from viapoint.envs.scene_sampling import SceneDistribution, SceneSampler
+from viapoint.envs.scene_sampling import SceneDistribution
 from viapoint.envs.scenes import Scenes, check_scenes, given_scenes
 from viapoint.envs.simulator import Simulator
+from viapoint.envs.task import Task
 
 Float = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -93,24 +93,30 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         )  # fmt: skip
         self.num_envs = _whole_number("num_envs", num_envs, 1)
         threads = _whole_number("threads", threads, 0)
-        self.arm = arm
-        self.whole_arm = bool(whole_arm)
-        self.weights = RewardWeights.of(reward_weights)
-        self.action_layout = ActionLayout(
-            dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=tuple(duration_range)
+        self.task = Task(
+            arm=arm,
+            whole_arm=bool(whole_arm),
+            action=ActionLayout(
+                dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=tuple(duration_range)
+            ),
+            weights=RewardWeights.of(reward_weights),
+            scenes=SceneDistribution(n_obstacles=_fewest_and_most(n_obstacles)),
         )
-        self.distribution = SceneDistribution(n_obstacles=_fewest_and_most(n_obstacles))
-        n_rows = self.distribution.n_obstacles[1]
-        self.observation_layout = ObservationLayout.of(arm, n_rows)
+        """What an agent may compute with before it has moved."""
+        self.arm, self.action_layout, self.observation_layout = arm, self.task.action, self.task.observation
         self.single_action_space = spaces.Box(-1.0, 1.0, (self.action_layout.size,), np.float32)
         self.single_observation_space = self.observation_layout.space()
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._sampler = SceneSampler(arm, self.distribution, whole_arm=self.whole_arm)
+        self._sampler = self.task.sampler()
         self._simulator = Simulator(
-            arm, n_obstacles=n_rows, whole_arm=self.whole_arm, num_envs=self.num_envs, threads=threads
+            arm,
+            n_obstacles=self.observation_layout.n_rows,
+            whole_arm=self.task.whole_arm,
+            num_envs=self.num_envs,
+            threads=threads,
         )
-        self._executor = Executor(self._simulator, whole_arm=self.whole_arm, threads=threads)
+        self._executor = Executor(self._simulator, whole_arm=self.task.whole_arm, threads=threads)
         self._generators: list[np.random.Generator] = []
         self.scenes: Scenes | None = None
         """The scenes of the running episodes; None before the first reset."""
@@ -198,7 +204,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         actions = self._checked(actions)
         plan = self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
         outcome = self._executor(plan, self.scenes)
-        terms = reward_terms(outcome, self.action_layout.centre_duration, self.weights)
+        terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
         joints = self._executor.final_joints(self.scenes)
         observation = self.observation_layout.observe(joints, np.asarray(self.arm.hand(joints)), self.scenes)
         self._last, self.scenes = (self.scenes, plan, outcome), None
@@ -251,12 +257,12 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         if not {"start", "goal", "obstacles"} <= set(options):
             sampled = self._sampler(generators, (given.start, given.goal))
             given = given_scenes(options, sampled, self.arm)
-        check_scenes(given, self.arm, whole_arm=self.whole_arm)
+        check_scenes(given, self.arm, whole_arm=self.task.whole_arm)
         return given
 
     def _scene_shapes(self) -> tuple[tuple[int, ...], ...]:
         d = self.arm.dimension
-        return (d,), (d,), (self.distribution.n_obstacles[1], 2 * d + 1)
+        return (d,), (d,), (self.observation_layout.n_rows, 2 * d + 1)
 
     def _start(self, rows: NDArray[np.int64], scenes: Scenes) -> None:
         """Begin episodes: the arms at rest at the start, the obstacles in place."""
@@ -298,6 +304,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
         self.render_mode = self.batch.render_mode
+        self.task = self.batch.task
         self.action_layout = self.batch.action_layout
         self.observation_layout = self.batch.observation_layout
 

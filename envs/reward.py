@@ -31,7 +31,7 @@ class RewardWeights:
     collision: float = 0.5
     """- 1[contact at any physics step]."""
     clearance: float = 0.5
-    """+ clip(min_clearance, -0.05 m, 0.01 m) / 0.05 m."""
+    """+ clip(planned_clearance, -0.05 m, 0.01 m) / 0.05 m; the plan's, as a crash ends at the surface."""
     goal_error: float = 0.5
     """- min(goal_error / 0.1 m, 1)."""
     smoothness: float = 0.05
@@ -95,7 +95,7 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
     return RewardTerms(
         success=weights.success * outcome.is_success,
         collision=-weights.collision * outcome.collision,
-        clearance=weights.clearance * np.clip(outcome.min_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
+        clearance=weights.clearance * np.clip(outcome.planned_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
         goal_error=-weights.goal_error * np.minimum(outcome.goal_error / GOAL_ERROR_UNIT, 1.0),
         smoothness=-weights.smoothness * log_jerk,
         duration=-weights.duration * (relative - 1.0),

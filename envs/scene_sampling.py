@@ -21,8 +21,9 @@ from viapoint.envs.scenes import Scenes
 
 Float = NDArray[np.float64]
 
-ENDS, WITNESSES, CANDIDATES, PHASES = 16, 6, 24, 40
-"""How many pairs of ends, witnesses and obstacles are drawn at once, and at how many times a movement is looked at."""
+ENDS, WITNESSES, CANDIDATES, PHASES, WAYS = 16, 6, 32, 40, 25
+"""How many pairs of ends, witnesses and obstacles are drawn at once, at how many times a movement is looked at,
+and how many ways round are told apart."""
 ATTEMPTS = 200
 
 
@@ -34,17 +35,19 @@ class SceneDistribution:
     """Fewest and most obstacles."""
     distance: tuple[float, float] = (0.25, 0.45)
     """From start to goal, [m]."""
-    post_radius: tuple[float, float] = (0.010, 0.035)
+    post_radius: tuple[float, float] = (0.012, 0.045)
     """[m]."""
     bar_radius: tuple[float, float] = (0.006, 0.010)
     """[m]."""
-    bar_half_length: tuple[float, float] = (0.03, 0.125)
+    bar_half_length: tuple[float, float] = (0.05, 0.125)
     """[m]; the rows of lights of Flash & Hogan 1985 were up to 0.25 m long."""
     bar_tilt: float = 0.6
     """Greatest angle between a bar and the perpendicular of the straight line, [rad]."""
-    spread: float = 0.16
+    spread: float = 0.26
     """Greatest distance of an obstacle's centre from the straight line, [m]."""
-    witness_margin: float = 0.012
+    ease: float = 0.3
+    """Hardness is a uniform number to this power: less is harder."""
+    witness_margin: float = 0.006
     """Least clearance of the witness, [m]: what sampling times and tracking may cost, and to spare."""
     end_margin: float = 0.025
     """Least clearance of the arm at start and goal, [m]."""
@@ -71,6 +74,7 @@ class SceneSampler:
         self.whole_arm = whole_arm
         self._layout = ActionLayout(dimension=arm.dimension)
         self._rows = distribution.n_obstacles[1]
+        self._ways = _ways_round(self._layout, float(np.mean(distribution.distance)))
 
     def __call__(
         self, generators: Sequence[np.random.Generator], ends: tuple[Float, Float] | None = None
@@ -113,11 +117,12 @@ class SceneSampler:
         """Scenes, and which of them are good."""
         start, goal, good = self._ends(u, ends)
         path, reached = self._witness(u, start, goal)
-        rows = self._candidates(u, start, goal)
+        hardness = u.take(1) ** self.distribution.ease
+        rows = self._candidates(u, start, goal, path, hardness)
         clearance = self._least_clearance(path, rows)
         resting = np.minimum(self._least_clearance(start[:, None], rows), self._least_clearance(goal[:, None], rows))
         free = (clearance > self.distribution.witness_margin) & (resting > self.distribution.end_margin)
-        obstacles, enough = self._choose(u, start, goal, rows, clearance, free)
+        obstacles, enough = self._choose(u, (start, goal), rows, free, hardness)
         return good & reached & enough, Scenes(start, goal, obstacles)
 
     def _ends(self, u: _Uniforms, ends: tuple[Float, Float] | None) -> tuple[Float, Float, NDArray[np.bool_]]:
@@ -156,21 +161,29 @@ class SceneSampler:
         first = good.argmax(axis=-1)
         return paths[np.arange(len(first)), first], good.any(axis=-1)
 
-    def _candidates(self, u: _Uniforms, start: Float, goal: Float) -> Float:
-        """Posts and bars about the straight line, shape (N, CANDIDATES, 5)."""
+    def _candidates(self, u: _Uniforms, start: Float, goal: Float, path: Float, hardness: Float) -> Float:
+        """Posts and bars, shape (N, CANDIDATES, 5): a half about the straight line, a half beside the witness."""
         d = self.distribution
-        line = (goal - start)[:, None]
-        along = line / np.sqrt((line * line).sum(axis=-1, keepdims=True))
-        across = np.stack((-along[..., 1], along[..., 0]), axis=-1)
-        fraction, offset = u.take(CANDIDATES), d.spread * (2.0 * u.take(CANDIDATES) - 1.0)
-        centre = start[:, None] + line * fraction[..., None] + across * offset[..., None]
-        bar = (u.take(CANDIDATES) < 0.5)[..., None]
+        along = (goal - start)[:, None] / np.sqrt(((goal - start) ** 2).sum(axis=-1))[:, None, None]
+        fraction, offset = u.take(CANDIDATES), 2.0 * u.take(CANDIDATES) - 1.0
+        bar = u.take(CANDIDATES) < 0.5
         tilt = d.bar_tilt * (2.0 * u.take(CANDIDATES) - 1.0)
-        half = _between(d.bar_half_length, u.take(CANDIDATES))
-        axis = across * (half * np.cos(tilt))[..., None] + along * (half * np.sin(tilt))[..., None]
-        size = u.take(CANDIDATES)[..., None]
+        half = np.where(bar, _between(d.bar_half_length, u.take(CANDIDATES)), 0.0)
+        size = u.take(CANDIDATES)
         radius = np.where(bar, _between(d.bar_radius, size), _between(d.post_radius, size))
-        return np.concatenate((centre, np.where(bar, axis, 0.0), radius), axis=-1)
+        beside = np.arange(CANDIDATES) % 2 == 1
+        phase = (0.15 * PHASES + 0.7 * PHASES * fraction).astype(np.int64)
+        each = np.arange(len(path))[:, None]
+        tangent = _unit(path[each, phase + 1] - path[each, phase - 1])
+        direction = np.where(beside[:, None], tangent, along)
+        normal = np.stack((-direction[..., 1], direction[..., 0]), axis=-1)
+        axis = half[..., None] * (normal * np.cos(tilt)[..., None] + direction * np.sin(tilt)[..., None])
+        gap = d.witness_margin + 0.002 + 0.08 * np.abs(offset) * (1.0 - hardness)
+        away = np.copysign(half + radius + self.arm.hand_radius + gap, offset)
+        line = start[:, None] + (goal - start)[:, None] * fraction[..., None]
+        foot = np.where(beside[:, None], path[each, phase], line)
+        centre = foot + normal * np.where(beside, away, d.spread * offset)[..., None]
+        return np.concatenate((centre, axis, radius[..., None]), axis=-1)
 
     def _least_clearance(self, path: Float, rows: Float) -> Float:
         """Clearance of the arm from each candidate while its hand is on `path`, shape (N, CANDIDATES), [m]."""
@@ -182,27 +195,50 @@ class SceneSampler:
         return np.asarray(clearance)
 
     def _choose(
-        self, u: _Uniforms, start: Float, goal: Float, rows: Float, clearance: Float, free: NDArray[np.bool_]
+        self,
+        u: _Uniforms,
+        ends: tuple[Float, Float],
+        rows: Float,
+        free: NDArray[np.bool_],
+        hardness: Float,
     ) -> tuple[Float, NDArray[np.bool_]]:
         """Obstacles among the free candidates, in random rows, the first of them in the way of the straight movement.
 
-        A drawn tightness moves the choice from any candidate to those that stand closest to the witness.
+        One after the other is chosen; hardness moves the choice from any candidate to the one that closes most of the
+        ways round that are still open.
         """
         fewest, most = self.distribution.n_obstacles
         count = fewest + np.floor((most - fewest + 1) * u.take(1))
-        tightness = u.take(1)
-        distance = np.sqrt(segment_distance_squared(start[:, None], goal[:, None], rows)[..., 0])
-        in_the_way = free & (distance - rows[..., -1] - self.arm.hand_radius < -0.004)
-        key = (1.0 - tightness) * u.take(CANDIDATES) + tightness * clearance / 0.1
-        key = np.where(free, key, np.inf)
-        first = np.where(in_the_way, key, np.inf).argmin(axis=-1)
-        key[np.arange(len(first)), first] = -np.inf
-        order = key.argsort(axis=-1, kind="stable")[:, : self._rows]
-        chosen = np.take_along_axis(rows, order[..., None], axis=1)
-        chosen = np.where((np.arange(self._rows) < count)[..., None], chosen, 0.0)
+        chance = u.take(CANDIDATES)
         shuffled = u.take(self._rows).argsort(axis=-1, kind="stable")
+        distance = np.sqrt(segment_distance_squared(ends[0][:, None], ends[1][:, None], rows)[..., 0])
+        in_the_way = free & (distance - rows[..., -1] - self.arm.hand_radius < -0.004)
         enough = (free.sum(axis=-1) >= count[:, 0]) & (in_the_way.any(axis=-1) | (count[:, 0] == 0))
+        closed = self._ways_closed(ends, rows)
+        still_open = np.ones((len(rows), 1, closed.shape[-1]), dtype=bool)
+        eligible, each = in_the_way, np.arange(len(rows))
+        chosen = np.zeros((len(rows), self._rows, rows.shape[-1]))
+        for row in range(self._rows):
+            gain = (closed & still_open).sum(axis=-1) / np.maximum(still_open.sum(axis=-1), 1)
+            key = np.where(eligible, 2.0 * hardness * gain + (1.0 - hardness) * chance, -1.0)
+            best = key.argmax(axis=-1)
+            chosen[:, row] = np.where(row < count, rows[each, best], 0.0)
+            still_open &= ~closed[each, best][:, None]
+            free = free & (np.arange(CANDIDATES) != best[:, None])
+            eligible = free
         return np.take_along_axis(chosen, shuffled[..., None], axis=1), enough
+
+    def _ways_closed(self, ends: tuple[Float, Float], rows: Float) -> NDArray[np.bool_]:
+        """Which ways round each candidate closes, shape (N, CANDIDATES, ways): an estimate that steers difficulty."""
+        start, goal = (end[:, None] for end in ends)
+        along, length = _unit(goal - start), np.sqrt(((goal - start) ** 2).sum(axis=-1))
+        across = np.stack((-along[..., 1], along[..., 0]), axis=-1)
+        centre, axis, radius = rows[..., :2] - start, rows[..., 2:4], rows[..., 4]
+        fraction = np.clip((centre * along).sum(axis=-1) / length, 0.0, 1.0)
+        ways = self._ways[np.round(fraction * (len(self._ways) - 1)).astype(np.int64)]
+        lateral = (centre * across).sum(axis=-1)[..., None]
+        reach = np.abs((axis * across).sum(axis=-1)) + radius + self.arm.hand_radius
+        return np.asarray(np.abs(ways - lateral) < reach[..., None])
 
 
 class _Uniforms:
@@ -216,6 +252,24 @@ class _Uniforms:
         """The next `count` numbers of each row, shape (N, count)."""
         self._next += count
         return self._values[:, self._next - count : self._next]
+
+
+def _ways_round(layout: ActionLayout, distance: float) -> Float:
+    """Distance from the straight line of movements through one via-point, at 21 places along it, shape (21, ways), [m]."""
+    along, across = (g.ravel() for g in np.meshgrid((-0.7, 0.0, 0.7), np.linspace(-1.0, 1.0, WAYS)))
+    action = np.zeros((len(along), layout.size))
+    action[:, 0], action[:, 1] = along, across
+    start = np.zeros((len(along), layout.dimension))
+    goal = start.copy()
+    goal[:, 0] = distance
+    plan = layout.decode(action, start, goal)
+    path = plan.trajectory()(plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, 200))
+    places = np.linspace(0.0, distance, 21)
+    return np.stack([np.interp(places, way[:, 0], way[:, 1]) for way in path], axis=-1)
+
+
+def _unit(vectors: Float) -> Float:
+    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=-1, keepdims=True)), 1e-9))
 
 
 def _between(bounds: tuple[float, float], u: Any) -> Any:

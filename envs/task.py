@@ -1,0 +1,61 @@
+"""What a task is, apart from any episode of it: all that an agent may compute with before it has moved."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from viapoint.envs.action import ActionLayout
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.observation import ObservationLayout
+from viapoint.envs.reward import RewardWeights
+from viapoint.envs.scene_sampling import SceneDistribution, SceneSampler
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Arm, layouts, weights and scenes of an environment."""
+
+    arm: Arm
+    whole_arm: bool
+    action: ActionLayout
+    weights: RewardWeights
+    scenes: SceneDistribution
+
+    @property
+    def observation(self) -> ObservationLayout:
+        """The layout of the observation."""
+        return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
+
+    def sampler(self) -> SceneSampler:
+        """Draws scenes of the task."""
+        return SceneSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The task as plain values, fit for JSON."""
+        record = {name: dataclasses.asdict(getattr(self, name)) for name in ("action", "weights", "scenes")}
+        return {"arm": self.arm.name, "whole_arm": self.whole_arm, **record}
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any], arms: Mapping[str, Arm]) -> Task:
+        """The task that :meth:`as_dict` wrote down; its arm is one of `arms`.
+
+        Raises:
+            ValueError: The arm is not among them, or a value is not allowed.
+        """
+        if record["arm"] not in arms:
+            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}")
+        return cls(
+            arm=arms[record["arm"]],
+            whole_arm=bool(record["whole_arm"]),
+            action=ActionLayout(**_tuples(record["action"])),
+            weights=RewardWeights(**record["weights"]),
+            scenes=SceneDistribution(**_tuples(record["scenes"])),
+        )
+
+
+def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON knows lists only; the records hold tuples."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}

@@ -1,0 +1,132 @@
+"""What an agent is measured against, and the agent, all behind one method: observations and scenes in, actions out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.scenes import Scenes
+from viapoint.training.planner import Planner, PlannerBudget
+from viapoint.training.trial import Trial
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+
+class Method(Protocol):
+    """Decides on a movement in each of N scenes."""
+
+    @property
+    def name(self) -> str:
+        """As it stands in the table."""
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Actions, shape (N, m), from the first observations and, for those that may search, the scenes."""
+
+
+class Straight:
+    """The straight minimum-jerk movement: the zero action."""
+
+    name = "straight line"
+
+    def __init__(self, trial: Trial) -> None:
+        self._size = trial.task.action.size
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return np.zeros((len(scenes.start), self._size))
+
+
+class Constant:
+    """The one action that succeeds in most scenes of the training distribution."""
+
+    name = "best constant action"
+
+    def __init__(self, trial: Trial, *, seed: int = 0, candidates: int = 256, number: int = 256) -> None:
+        generator = np.random.default_rng(seed)
+        scenes = trial.task.sampler()([generator] * number)
+        actions = generator.uniform(-1.0, 1.0, (candidates, trial.task.action.size))
+        every = scenes.take(np.tile(np.arange(number), candidates))
+        success = trial(every, np.repeat(actions, number, axis=0)).success.reshape(candidates, number)
+        self._action = actions[success.mean(axis=-1).argmax()]
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return np.tile(self._action, (len(scenes.start), 1))
+
+
+class RandomVias:
+    """The best of some random actions, checked in simulation where there is more than one."""
+
+    def __init__(self, trial: Trial, count: int, *, seed: int = 0) -> None:
+        self._trial, self._count = trial, count
+        self._generator = np.random.default_rng(seed)
+        self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        number, size = len(scenes.start), self._trial.task.action.size
+        actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
+        if self._count == 1:
+            return actions[:, 0]
+        every = scenes.take(np.repeat(np.arange(number), self._count))
+        reward = self._trial(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
+        return actions[np.arange(number), reward.argmax(axis=-1)]
+
+
+class PlannerMethod:
+    """The planner, see :mod:`viapoint.training.planner`."""
+
+    name = "planner"
+
+    def __init__(self, trial: Trial, *, seed: int = 0, budget: PlannerBudget | None = None) -> None:
+        self._planner = Planner(trial, seed=seed, budget=budget)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return self._planner(scenes).action
+
+
+class AgentMethod:
+    """A trained agent; with candidates, its critic ranks that many neighbours of its proposals."""
+
+    def __init__(self, name: str, model: Any, candidates: int = 0) -> None:
+        self.name, self._model, self._candidates = name, model, candidates
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`; the scenes are not looked at."""
+        policy = self._model.policy
+        before = getattr(policy, "candidates", 0)
+        if self._candidates:
+            policy.candidates = self._candidates
+        try:
+            actions, _ = self._model.predict(observation, deterministic=True)
+        finally:
+            if self._candidates:
+                policy.candidates = before
+        return np.asarray(actions, dtype=np.float64)
+
+
+METHODS: dict[str, Callable[[Trial], Method]] = {
+    "straight": Straight,
+    "constant": Constant,
+    "random": lambda trial: RandomVias(trial, 1),
+    "random16": lambda trial: RandomVias(trial, 16),
+    "random80": lambda trial: RandomVias(trial, 80),
+    "planner": PlannerMethod,
+}
+"""The baselines by the name the command line knows them by."""
+
+
+def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
+    """A baseline for an environment made with `kwargs`.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    if name not in METHODS:
+        raise ValueError(f"method must be agent or one of {', '.join(METHODS)}, got {name!r}")
+    return METHODS[name](Trial(env_id, **kwargs))

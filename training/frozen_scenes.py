@@ -1,0 +1,109 @@
+"""Scenes that stay the same: files with a content hash, each scene with its difficulty and a solution."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.scenes import Scenes
+
+Float = NDArray[np.float64]
+
+SETS = ("validation", "test", "hard")
+"""Names of the sets; an environment need not have all."""
+BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
+"""Bands of the solution share, from easy to hard."""
+BAND_EDGES = (0.2, 0.05, 0.01)
+FIELDS = ("start", "goal", "obstacles", "share", "solution")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenScenes:
+    """A set of N scenes."""
+
+    name: str
+    """Of the set, or the path of its file."""
+    env_id: str
+    scenes: Scenes
+    share: Float
+    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,)."""
+    solution: Float
+    """An action that the planner found and the simulation confirmed, shape (N, m)."""
+
+    @property
+    def band(self) -> NDArray[np.int64]:
+        """Index into BANDS, shape (N,)."""
+        return np.searchsorted(-np.array(BAND_EDGES), -self.share, side="left").astype(np.int64)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the content, independent of how the file is packed."""
+        digest = hashlib.sha256(self.env_id.encode())
+        for name, array in self.arrays().items():
+            digest.update(f"{name}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
+
+    def arrays(self) -> dict[str, Float]:
+        """The content by name."""
+        values = (*self.scenes, self.share, self.solution)
+        return dict(zip(FIELDS, values, strict=True))
+
+    def save(self, path: Path) -> None:
+        """Write the set with its hash."""
+        np.savez_compressed(path, env_id=np.array(self.env_id), sha256=np.array(self.sha256), **self.arrays())  # type: ignore[arg-type]
+
+    def take(self, rows: Any) -> FrozenScenes:
+        """The scenes at `rows`, an index array, slice or mask."""
+        return FrozenScenes(
+            name=self.name,
+            env_id=self.env_id,
+            scenes=self.scenes.take(rows),
+            share=self.share[rows],
+            solution=self.solution[rows],
+        )
+
+
+def shipped_path(name: str, env_id: str) -> Path:
+    """Where a set of an environment lies in the package."""
+    task = env_id.removeprefix("viapoint/").partition("-")[0]
+    stem = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+    return Path(str(files("viapoint.training") / "scenes" / f"{stem}_{name}.npz"))
+
+
+def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
+    """Read a set of scenes and check that it is whole.
+
+    Args:
+        name_or_path: One of SETS, or the path of a file.
+        env_id: The environment that the scenes must be for.
+
+    Raises:
+        ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
+    """
+    path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
+    if not path.is_file():
+        raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s} ({path} is none)")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256")}
+    except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
+        raise ValueError(f"{path} is not a file of scenes: {error}") from None
+    frozen = FrozenScenes(
+        name=str(name_or_path),
+        env_id=str(content["env_id"]),
+        scenes=Scenes(content["start"], content["goal"], content["obstacles"]),
+        share=content["share"],
+        solution=content["solution"],
+    )
+    if frozen.sha256 != str(content["sha256"]):
+        raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
+    if frozen.env_id != env_id:
+        raise ValueError(f"{path} holds scenes for {frozen.env_id}, not for {env_id}")
+    return frozen

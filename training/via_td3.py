@@ -1,0 +1,158 @@
+"""TD3 for decisions that are whole movements.
+
+It differs from :class:`stable_baselines3.TD3` in what a movement allows. The critic sees the features of the planned
+movement and learns only the part of the reward that no formula gives. The actor proposes several ways round and learns
+on scenes that are drawn but never simulated: each proposal climbs the critic's judgement, and its score regresses it.
+An episode is one decision, so nothing is bootstrapped.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import TD3
+from stable_baselines3.common.policies import BasePolicy
+from torch.nn import functional
+
+from viapoint.envs.arms import ARMS
+from viapoint.envs.task import Task
+from viapoint.training.policies import ViaPolicy
+from viapoint.training.scene_pool import ScenePool
+
+
+class ViaTD3(TD3):
+    """An off-policy learner of via-points on environments whose episodes are one decision.
+
+    Args:
+        policy: `ViaPolicy`.
+        env: An environment of this package, or many.
+        learning_rate: A number, or a function of the progress that remains.
+        learning_starts: Decisions taken at random before anything is learnt.
+        batch_size: Decisions of a critic's update, and scenes of an actor's.
+        gradient_steps: Updates after each step of all environments.
+        explore_uniformly: Share of decisions taken at random later on.
+        noise: Standard deviation of what is added to the others.
+        temperature: Difference of score that makes one of them e times as likely as another.
+        promising: How many of the best-scored proposals of a scene an update of the actor looks at.
+        others: And how many besides, drawn at random.
+        fresh_scenes: Scenes drawn for the actor after each step of all environments.
+        augment: Whether their mirror images and exchanged ends join them.
+        policy_kwargs: Of :class:`~viapoint.training.policies.ViaPolicy`; the task is asked of `env`.
+        **kwargs: Of :class:`stable_baselines3.TD3`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaPolicy": ViaPolicy}
+    policy: ViaPolicy
+
+    def __init__(
+        self,
+        policy: str | type[ViaPolicy],
+        env: Any,
+        learning_rate: Any = 1e-3,
+        *,
+        learning_starts: int = 512,
+        batch_size: int = 128,
+        gradient_steps: int = 20,
+        explore_uniformly: float = 0.25,
+        noise: float = 0.05,
+        temperature: float = 0.1,
+        promising: int = 3,
+        others: int = 3,
+        fresh_scenes: int = 64,
+        augment: bool = True,
+        policy_kwargs: dict[str, Any] | None = None,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.explore_uniformly, self.noise, self.temperature = explore_uniformly, noise, temperature
+        self.promising, self.others = promising, others
+        self.fresh_scenes, self.augment = fresh_scenes, augment
+        kwargs = {"buffer_size": 50_000, "gamma": 0.0, "train_freq": 1, **kwargs}
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            gradient_steps=gradient_steps,
+            policy_kwargs=dict(policy_kwargs or {}),
+            _init_setup_model=False,
+            **kwargs,
+        )
+        if self.env is not None:
+            self.policy_kwargs.setdefault("task", self.env.get_attr("task", indices=0)[0].as_dict())
+        self.pool: ScenePool | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        """Update critic and actor `gradient_steps` times."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        if self.pool is None:
+            task = Task.from_dict(self.policy_kwargs["task"], ARMS)
+            self.pool = ScenePool(task, self.seed or 0, fresh=self.fresh_scenes, augment=self.augment)
+        self.pool.begin(self._n_updates // gradient_steps)
+        losses = []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            losses.append((self._update_critic(batch_size), *self._update_actor(batch_size)))
+        names = ("critic_loss", "proposal_value", "score_loss")
+        for name, value in zip(names, np.mean(losses, axis=0), strict=True):
+            self.logger.record(f"train/{name}", float(value))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _update_critic(self, batch_size: int) -> float:
+        """Regress what the formulas leave of the reward."""
+        assert self.replay_buffer is not None
+        batch = self.replay_buffer.sample(batch_size)
+        learned, known = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
+        loss = functional.smooth_l1_loss(learned, batch.rewards - known.detach(), beta=0.5)
+        self.critic.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.critic.parameters(), 10.0)
+        self.critic.optimizer.step()
+        return float(loss.item())
+
+    def _update_actor(self, batch_size: int) -> tuple[float, float]:
+        """Improve proposals in the critic's judgement, and let their scores foretell it."""
+        assert self.pool is not None
+        observation = self.pool.sample(batch_size)
+        proposals, scores = self.actor.propose(observation)
+        best = scores.topk(self.promising, dim=-1).indices
+        others = torch.randint(0, scores.shape[1], (batch_size, self.others))
+        looked_at = torch.arange(batch_size).unsqueeze(-1), torch.cat((best, others), dim=-1)
+        self.critic.requires_grad_(False)
+        judgement = torch.add(*self.critic.judge(observation, proposals[looked_at]))
+        self.critic.requires_grad_(True)
+        score_loss = functional.smooth_l1_loss(scores[looked_at], judgement.detach(), beta=0.5)
+        loss = score_loss - judgement.mean()
+        self.actor.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.actor.parameters(), 10.0)
+        self.actor.optimizer.step()
+        return float(judgement[:, : self.promising].mean().item()), float(score_loss.item())
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Random actions at first and for some environments always, noisy proposals for the others."""
+        uniform = 2.0 * torch.rand((n_envs, self.actor.size)) - 1.0
+        if self.num_timesteps < learning_starts:
+            return uniform.numpy(), uniform.numpy()
+        assert self._last_obs is not None
+        with torch.no_grad():
+            observation, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+            proposals, scores = self.actor.propose(observation)  # type: ignore[arg-type]
+            head = torch.distributions.Categorical(logits=scores / self.temperature).sample()
+            chosen = proposals[torch.arange(n_envs), head]
+            noisy = torch.clamp(chosen + self.noise * torch.randn_like(chosen), -1.0, 1.0)
+            explore = torch.rand((n_envs, 1)) < self.explore_uniformly
+            actions = torch.where(explore, uniform, noisy).numpy()
+        return actions, actions
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "pool"]
