@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 from collections.abc import Callable, Iterator
@@ -76,28 +77,47 @@ def film(
     """
     if env.render_mode != "rgb_array_list":
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
-    number = len(scenes.start)
-    if not number:
+    if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
-    camera = Camera(env)
-    fps = camera.fps * speed
-    path, count = Path(path), 0
+    camera, path = Camera(env), Path(path)
     part = path.with_name(f".{path.stem}.part.mp4")
-    writer: Any = None
+    try:
+        count = _write(part, _scenes(camera, scenes, decide, name, pause * speed), camera.fps * speed)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return Film(path=path, frames=count, rendered=camera.rendered)
+
+
+def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: float) -> Iterator[Frame]:
+    """The frames of a movement in each scene, and at its end of a pause [s of the movement's time]."""
+    number = len(scenes.start)
     for i in range(number):
         scene = scenes.take([i])
-        observation, _ = env.reset(options=scene.as_options())
+        observation, _ = camera.env.reset(options=scene.as_options())
         action = np.asarray(decide({k: v[None] for k, v in observation.items()}, scene))[0]
-        info = env.step(action.astype(np.float32))[-1]
+        info = camera.env.step(action.astype(np.float32))[-1]
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        for frame in _with_captions(camera.frames(scene), left, *verdict(info), hold=round(pause * fps)):
-            if writer is None:
-                writer = _open(part, frame, fps)
+        yield from _with_captions(camera.frames(scene), left, *verdict(info), hold=round(pause * camera.fps))
+
+
+def _write(path: Path, frames: Iterator[Frame], fps: float) -> int:
+    """Encode frames of equal size; how many there were."""
+    first = next(frames)
+    height, width = first.shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
+        output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1, ffmpeg_log_level="error",
+    )  # fmt: skip
+    count = 0
+    try:
+        writer.send(None)
+        for frame in itertools.chain([first], frames):
             writer.send(np.ascontiguousarray(frame))
             count += 1
-    writer.close()
-    os.replace(part, path)
-    return Film(path=path, frames=count, rendered=camera.rendered)
+    finally:
+        writer.close()
+    return count
 
 
 def verdict(info: dict[str, Any]) -> tuple[str, Colour]:
@@ -115,7 +135,7 @@ class Camera:
     """Takes the frames of an environment's last movement, by OpenGL where there is one."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env = env
+        self.env = env
         self.fps = float(env.metadata["render_fps"])
         self.rendered = True
         """Whether OpenGL has worked so far."""
@@ -124,7 +144,7 @@ class Camera:
         """The frames of the last movement, which took place in `scene`, each of shape (height, width, 3)."""
         if self.rendered:
             try:
-                yield from self._env.render()  # type: ignore[misc]
+                yield from self.env.render()  # type: ignore[misc]
                 return
             except GLUnavailableError as error:
                 self.rendered = False
@@ -132,7 +152,7 @@ class Camera:
         yield from self._drawn(scene)
 
     def _drawn(self, scene: Scenes) -> Iterator[Frame]:
-        inner: Any = self._env.unwrapped
+        inner: Any = self.env.unwrapped
         figure = Figure(figsize=(4.8, 4.8), dpi=100)
         canvas: Any = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -177,17 +197,6 @@ def _stacked(frame: Frame, caption: Frame) -> Frame:
     whole = np.concatenate((frame, caption))
     height, width = (side - side % BLOCK if side >= BLOCK else side for side in whole.shape[:2])
     return whole[whole.shape[0] - height :, :width]
-
-
-def _open(path: Path, frame: Frame, fps: float) -> Any:
-    """A coroutine that encodes the frames sent to it."""
-    height, width = frame.shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
-        output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1, ffmpeg_log_level="error",
-    )  # fmt: skip
-    writer.send(None)
-    return writer
 
 
 def _bytes(colour: Colour) -> tuple[int, int, int]:

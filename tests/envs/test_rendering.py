@@ -1,0 +1,362 @@
+import gc
+import importlib
+import os
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs import _gl, _stage, rendering
+from viapoint.envs._movement import Movement
+from viapoint.envs.rendering import GLUnavailableError, check_render_mode, frame_steps
+
+OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
+WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
+SCENE = {
+    "start": [-0.1, 0.25],
+    "goal": [-0.1, 0.55],
+    "obstacles": [[-0.4, 0.6, 0.0, 0.0, 0.02], [-0.2, 0.4, 0.09, 0.0, 0.01]],
+}
+STRAIGHT = np.zeros(3, dtype=np.float32)
+AROUND = np.array([0.0, -0.5, 0.5], dtype=np.float32)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    """One pass for each picture: what is tested here does not need to look good."""
+    monkeypatch.setattr(rendering, "FILM_PASSES", 1)
+    monkeypatch.setattr(rendering, "STILL_PASSES", 1)
+
+
+@pytest.fixture(scope="session")
+def _opengl():
+    env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
+    env.reset(seed=0)
+    try:
+        env.render()
+    except GLUnavailableError as error:
+        pytest.skip(f"no picture can be rendered here: {error}")
+    finally:
+        env.close()
+
+
+@pytest.fixture
+def make(_opengl):
+    opened = []
+
+    def made(name=OBSTACLES, mode="rgb_array", *, side=96, **kwargs):
+        opened.append(gym.make(name, render_mode=mode, **{"width": side, "height": side, **kwargs}))
+        return opened[-1]
+
+    yield made
+    for env in opened:
+        env.close()
+
+
+def moved(env, action):
+    env.reset(options={name: np.array(value) for name, value in SCENE.items()})
+    return env.step(action)[-1]
+
+
+def red(frame):
+    r, g, b = (frame[..., i].astype(int) for i in range(3))
+    return int(((r > 130) & (g < 60) & (b < 70)).sum())
+
+
+def test_a_render_mode_that_is_unknown_is_refused_with_the_choices():
+    with pytest.raises(ValueError, match=r"human, rgb_array_list, got 'ansi'"):
+        check_render_mode("ansi", ["human", "rgb_array_list"])
+    assert check_render_mode(None, ["human"]) is None
+
+
+@pytest.mark.parametrize("size", [{"width": 0}, {"height": -3}, {"width": 2.5}, {"height": True}])
+def test_a_size_that_is_none_is_refused(size):
+    with pytest.raises(ValueError, match=next(iter(size))):
+        gym.make(OBSTACLES, render_mode="rgb_array", **size)
+
+
+@pytest.mark.parametrize(("duration", "fps"), [(0.7, 50), (1.3, 25), (0.702, 30), (0.1, 60)])
+def test_the_frames_of_a_film_are_evenly_spaced_from_start_to_end(duration, fps):
+    time = 0.002 * np.arange(1, round(duration / 0.002) + 1)
+    steps = frame_steps(time, fps)
+    assert (steps[0], steps[-1]) == (0, len(time))
+    assert len(steps) == round(duration * fps) + 1
+    assert np.ptp(np.diff(steps)) <= 1
+
+
+@pytest.mark.parametrize(("width", "height"), [(120, 80), (80, 120), (1, 1)])
+@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM, "viapoint.envs:viapoint/PlanarReach-v0"])
+def test_a_picture_has_the_size_asked_for(make, name, width, height):
+    env = make(name, width=width, height=height)
+    env.reset(seed=1)
+    still = env.render()
+    env.step(STRAIGHT)
+    for frame in (still, env.render()):
+        assert frame.shape == (height, width, 3)
+        assert frame.dtype == np.uint8
+        assert (width, height) == (1, 1) or frame.std() > 5.0
+
+
+def test_pictures_larger_than_the_buffer_of_the_model(make):
+    env = make(width=1400, height=64)
+    env.reset(seed=1)
+    assert env.render().shape == (64, 1400, 3)
+
+
+def test_equal_movements_give_equal_pictures(make):
+    pictures = []
+    for _ in range(2):
+        env = make()
+        moved(env, AROUND)
+        pictures += [env.render(), env.render()]
+    for picture in pictures[1:]:
+        np.testing.assert_array_equal(picture, pictures[0])
+
+
+def test_a_film_lasts_as_long_as_the_movement(make):
+    env = make(mode="rgb_array_list", side=48)
+    moved(env, AROUND)
+    frames, rollout = env.render(), env.unwrapped.last_rollout
+    assert isinstance(frames, list)
+    assert len(frames) == round(rollout.time[-1] * env.metadata["render_fps"]) + 1
+    assert all(frame.shape == (48, 48, 3) and frame.dtype == np.uint8 for frame in frames)
+    assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
+
+
+def test_before_the_movement_a_film_has_one_frame(make):
+    env = make(mode="rgb_array_list", side=48)
+    env.reset(seed=0)
+    assert len(env.render()) == 1
+
+
+@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
+def test_contact_is_red_and_nothing_else_is(make, name):
+    env = make(name, side=240)
+    env.reset(options={key: np.array(value) for key, value in SCENE.items()})
+    assert red(env.render()) == 0
+    assert moved(env, STRAIGHT)["collision"]
+    assert red(env.render()) > 60
+    assert not moved(env, AROUND)["collision"]
+    assert red(env.render()) == 0
+
+
+def test_a_film_turns_red_at_contact(make):
+    env = make(mode="rgb_array_list", side=240)
+    info = moved(env, STRAIGHT)
+    reds = np.array([red(frame) for frame in env.render()]) > 20
+    first = info["first_contact_time"] * env.metadata["render_fps"]
+    assert reds.argmax() == pytest.approx(first, abs=1.5)
+    assert reds[reds.argmax() :].all()
+
+
+@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
+def test_the_obstacle_that_was_touched_is_named(name):
+    env = gym.make(name)
+    moved(env, STRAIGHT)
+    inner = env.unwrapped
+    scene, plan, _ = inner.batch._last
+    movement = Movement.of(
+        inner.task.arm, scene, plan, inner.last_rollout, whole_arm=inner.task.whole_arm
+    )  # fmt: skip
+    assert movement.touch.obstacle == 1
+    assert movement.touch.step == inner.last_rollout.contact.argmax()
+    tip = np.array([-0.11, 0.4])
+    assert np.linalg.norm(movement.touch.place - tip) < 0.01 + max(inner.task.arm.link_radii)
+
+
+def test_pictures_leave_no_trace_in_the_simulation(make):
+    plain, drawn = gym.make(OBSTACLES), make(side=16)
+    for env in (plain, drawn):
+        env.reset(seed=3)
+    for _ in range(3):
+        drawn.render()
+        infos = [env.step(AROUND)[-1] for env in (plain, drawn)]
+        drawn.render()
+        assert infos[0] == infos[1]
+        for env in (plain, drawn):
+            env.reset()
+
+
+@pytest.mark.usefixtures("_opengl")
+def test_a_vector_environment_gives_a_picture_of_each():
+    env = gym.make_vec(OBSTACLES, num_envs=2, render_mode="rgb_array", width=32, height=24)
+    env.reset(seed=0)
+    frames = env.render()
+    assert [frame.shape for frame in frames] == [(24, 32, 3)] * 2
+    env.step(np.zeros((2, 3), dtype=np.float32))
+    assert len(env.render()) == 2
+    env.close()
+
+
+@pytest.mark.usefixtures("_opengl")
+def test_a_context_is_opened_with_the_first_picture_and_given_back(monkeypatch):
+    opened, freed = [], []
+    real = _gl._open
+
+    class Context:
+        def __init__(self, context):
+            self.context, self.as_current = context, context.as_current
+
+        def free(self):
+            freed.append(self)
+            self.context.free()
+
+    def counting(model):
+        context, mjr = real(model)
+        opened.append(context)
+        return Context(context), mjr
+
+    monkeypatch.setattr(_gl, "_open", counting)
+    for number in range(1, 7):
+        env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
+        env.reset(seed=0)
+        env.step(STRAIGHT)
+        assert len(opened) == number - 1
+        env.render()
+        env.render()
+        assert len(opened) == number
+        if number % 2:
+            env.close()
+            env.close()
+        del env
+        gc.collect()
+        assert len(freed) == number
+
+
+def test_after_close_a_picture_opens_a_context_again(make):
+    env = make()
+    env.reset(seed=0)
+    before = env.render()
+    env.unwrapped.batch._renderer.close()
+    np.testing.assert_array_equal(env.render(), before)
+
+
+def failing(*names):
+    real = importlib.import_module
+
+    def fail(name, *rest):
+        if name in names:
+            raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+        return real(name, *rest)
+
+    return fail
+
+
+def test_a_missing_library_is_named_with_the_package_to_install(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(_gl.importlib, "import_module", failing("mujoco.egl", "mujoco.glfw", "mujoco.cgl"))
+    env = gym.make(OBSTACLES, render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(GLUnavailableError, match=r"library not found.*apt-get install libegl1 libgl1"):
+        env.render()
+    env.close()
+
+
+def test_rendering_can_be_forbidden(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    env = gym.make(OBSTACLES, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(STRAIGHT)
+    with pytest.raises(GLUnavailableError, match="MUJOCO_GL=off"):
+        env.render()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
+def test_a_window_without_a_display_names_the_other_modes(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    env = gym.make(OBSTACLES, render_mode="human")
+    with pytest.raises(GLUnavailableError, match=r"no display.*rgb_array.*xvfb-run"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("wish", "display", "platforms"),
+    [
+        ("egl", True, ("egl",)),
+        ("osmesa", False, ("osmesa",)),
+        ("", False, ("egl",)),
+        ("", True, ("glfw", "egl")),
+    ],
+)
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the choice")
+def test_egl_is_chosen_without_a_display_and_a_wish_is_respected(monkeypatch, wish, display, platforms):
+    monkeypatch.setattr(_gl, "_has_display", lambda: display)
+    assert _gl._platforms(wish) == platforms
+
+
+def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
+    shown = []
+
+    class Window:
+        def __init__(self, model, width, height, title):
+            pass
+
+        def show(self, scene):
+            shown.append(scene.ngeom)
+            return len(shown) < 5
+
+        def close(self):
+            shown.append("closed")
+
+    monkeypatch.setattr(rendering, "Window", Window)
+    env = gym.make(OBSTACLES, render_mode="human")
+    env.reset(seed=0)
+    assert len(shown) == 1
+    env.step(AROUND)
+    assert len(shown) == 5
+    env.close()
+    assert shown[-1] == "closed"
+
+
+def test_a_full_scene_is_drawn_in_part_and_not_refused(make, monkeypatch):
+    monkeypatch.setattr(_stage, "ROOM", 12)
+    env = make(side=16)
+    moved(env, AROUND)
+    assert env.render().shape == (16, 16, 3)
+
+
+def test_nothing_of_opengl_is_loaded_before_the_first_picture():
+    code = (
+        "import os, sys; before = dict(os.environ)\n"
+        "import gymnasium as gym, viapoint.envs\n"
+        "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array')\n"
+        "env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "assert not {'OpenGL', 'OpenGL.GL', 'OpenGL.EGL', 'mujoco.egl'} & set(sys.modules)\n"
+        "assert dict(os.environ) == before\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "rgb_array_list"])
+def test_gymnasium_records_videos(make, tmp_path, mode):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(
+        make(mode=mode, side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True
+    )
+    moved(env, AROUND)
+    if mode == "rgb_array_list":
+        env.render()
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") >= (2 if mode == "rgb_array" else 40)
+
+
+def test_whole_movements_are_recorded(make, tmp_path):
+    pytest.importorskip("moviepy")
+    from viapoint.envs.recording import RecordMovements
+
+    made = make(mode="rgb_array_list", side=64)
+    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    moved(env, AROUND)
+    expected = 2 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == expected
+
+
+def frames_of(path):
+    reader = pytest.importorskip("imageio_ffmpeg").read_frames(str(path))
+    next(reader)
+    return sum(1 for _ in reader)
