@@ -36,7 +36,7 @@ class Agent(NamedTuple):
         if candidates and not hasattr(self.model.policy, "ranked"):
             kind = type(self.model).__name__
             raise ValueError(f"candidates are ranked by ViaTD3 only; this agent is a {kind}")
-        name = f"agent, {candidates} candidates" if candidates else "agent"
+        name = f"agent, ranks {candidates}" if candidates else "agent"
         return AgentMethod(name, self.model, candidates)
 
 

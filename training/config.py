@@ -66,7 +66,7 @@ class TrainConfig:
     """Run folder; runs/<environment>-<algorithm>-<seed> if not given."""
     resume: bool = False
     """Go on with the run in the folder from its last checkpoint."""
-    eval_every: int = 2_000
+    eval_every: int = 1_000
     """Decisions between two evaluations on the validation scenes; 0 for none."""
     eval_scenes: int = 500
     """Validation scenes used by each, at most."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -82,11 +83,15 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
     if record.get("format") != FORMAT:
         raise BadFileError(path, f"must have format {FORMAT}, got {record.get('format')!r}")
     try:
-        env = env or _own_environment(record["env"])
         hyperparameters = dict(record["hyperparameters"])
-        if env.num_envs == 1:
-            hyperparameters.update({"buffer_size": 1} if "buffer_size" in hyperparameters else {})
-        model = build(record["algorithm"], record["policy"], env, hyperparameters)
+        if env is None and "buffer_size" in hyperparameters:
+            hyperparameters["buffer_size"] = 1
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # PPO finds that its batches do not fill one environment
+            chosen = env or _own_environment(record["env"])
+            model = build(record["algorithm"], record["policy"], chosen, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
         raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
 import threading
@@ -47,7 +46,7 @@ class Monitor(BaseCallback):
         self.run, self.config = run, run.config
         self.curve: list[dict[str, Any]] = []
         """One record for each evaluation so far."""
-        self._best = (-1.0, -math.inf)
+        self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
         self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_every, "evaluation": 0}
         self._every = {
@@ -165,7 +164,7 @@ class Monitor(BaseCallback):
         self.curve.append(self._record(result, seconds))
         self.run.write_curve(self.curve)
         summary = result.summary()
-        ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or math.inf))
+        ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
             self.run.save("best", self.model)

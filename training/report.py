@@ -30,7 +30,7 @@ def _percent(rate: Summary | None) -> str:
 
 
 def _interval(rate: Summary) -> str:
-    return "-" if rate["rate"] is None else f"[{100.0 * rate['low']:.1f}, {100.0 * rate['high']:.1f}]"
+    return "-" if rate["rate"] is None else f"{100.0 * rate['low']:.1f}-{100.0 * rate['high']:.1f}"
 
 
 def _number(name: str, scale: float, digits: int) -> Callable[[Summary], str]:
@@ -64,8 +64,7 @@ NOTES = (
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
     "that solve a scene. Clearance and goal error are medians of all scenes, jerk ratio (to the straight "
     "movement) and duration of the successes. SPL: success weighted by straight distance over path length. "
-    "Decision: wall time of one decision, medians and 98th percentiles; where only the median stands, it is the mean "
-    "in a batch."
+    "Decision: wall time of single decisions; where the 98th percentile is missing, the mean in a batch."
 )
 
 
@@ -99,7 +98,9 @@ def show(record: Record, console: Console | None = None) -> None:
     lines = rows(record)
     table = Table(title=title(record), title_justify="left")
     for i, line in enumerate(lines):
-        table.add_column(escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i)
+        table.add_column(
+            escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i, overflow="fold"
+        )
     for i in range(1, len(lines[0])):
         table.add_row(*(escape(line[i]) for line in lines))
     (console or Console()).print(table)

@@ -1,0 +1,45 @@
+"""Small scenes and small trainings, shared by the tests of training."""
+
+import numpy as np
+import pytest
+import torch
+
+from viapoint.training import frozen_scenes, monitor
+from viapoint.training.frozen_scenes import FrozenScenes
+from viapoint.training.trial import Trial
+
+ENV = "viapoint/PlanarObstacles-v0"
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def small_scenes():
+    """Forty scenes, each with the best of 32 random actions as its solution."""
+    trial = Trial(ENV, 64, threads=1)
+    generator = np.random.default_rng(0)
+    scenes = trial.task.sampler()([generator] * 40)
+    actions = generator.uniform(-1.0, 1.0, (32, 40, trial.task.action.size))
+    tried = [trial(scenes, each) for each in actions]
+    success, reward = np.array([each.success for each in tried]), np.array([each.reward for each in tried])
+    trial.close()
+    return FrozenScenes(
+        name="small",
+        env_id=ENV,
+        scenes=scenes,
+        share=success.mean(axis=0),
+        solution=actions[reward.argmax(axis=0), np.arange(40)],
+    )
+
+
+@pytest.fixture
+def shipped(small_scenes, tmp_path, monkeypatch):
+    """The small scenes in place of every shipped set."""
+    path = tmp_path / "shipped.npz"
+    small_scenes.save(path)
+    for module in (frozen_scenes, monitor):
+        monkeypatch.setattr(module, "shipped_path", lambda name, env_id: path)
+    return small_scenes

@@ -1,0 +1,181 @@
+"""Training leaves what it promises, learns, and goes on as if it had never stopped."""
+
+import dataclasses
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from viapoint.training import monitor
+from viapoint.training.config import TrainConfig
+from viapoint.training.evaluate import evaluate
+from viapoint.training.files import BadFileError, read_arrays
+from viapoint.training.runs import Run, load_model
+from viapoint.training.train import TrainingStoppedError, train
+from viapoint.training.vec_env import ViaVecEnv
+
+TINY = {
+    "viatd3": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "fresh_scenes": 4},
+    "sac": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "buffer_size": 96},
+    "td3": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "buffer_size": 400},
+    "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
+    "tqc": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16},
+}
+STEPS = 192
+
+
+def config(folder, algo="viatd3", **changes):
+    values = {
+        "out": folder,
+        "algo": algo,
+        "n_timesteps": STEPS,
+        "n_envs": 16,
+        "eval_every": 64,
+        "eval_scenes": 8,
+        "checkpoint_every": 64,
+        "env_kwargs": {"threads": 1},
+        "hyperparameters": TINY[algo],
+        "progress": False,
+    }
+    return TrainConfig(**{**values, **changes})
+
+
+def curve(run):
+    return [{name: value for name, value in record.items() if name != "seconds"} for record in run.curve]
+
+
+def same_result(one, other):
+    assert curve(one) == curve(other)
+    for name in ("best", "final"):
+        first, second = (read_arrays(run.folder / name / "weights.safetensors") for run in (one, other))
+        assert set(first) == set(second)
+        for part in first:
+            np.testing.assert_array_equal(first[part], second[part], err_msg=f"{name} {part}")
+    first, second = (json.loads((run.checkpoints()[-1] / "state.json").read_text()) for run in (one, other))
+    for name in ("counters", "random", "env"):
+        assert first[name] == second[name], name
+
+
+def kill_after(monkeypatch, steps):
+    """The process dies in the step after so many."""
+    step_wait = ViaVecEnv.step_wait
+    left = iter(range(steps))
+
+    def mortal(self):
+        if next(left, None) is None:
+            raise SystemError("killed")
+        return step_wait(self)
+
+    monkeypatch.setattr(ViaVecEnv, "step_wait", mortal)
+
+
+@pytest.mark.parametrize("algo", TINY)
+def test_a_killed_run_resumes_to_the_same_result(algo, tmp_path, monkeypatch):
+    whole = train(config(tmp_path / "whole", algo))
+    assert whole.decisions >= STEPS
+    with monkeypatch.context() as patch:
+        kill_after(patch, 7)  # between the checkpoints at 64 and 128 decisions
+        with pytest.raises(SystemError, match="killed"):
+            train(config(tmp_path / "killed", algo))
+    assert 0 < Run(tmp_path / "killed").decisions < STEPS
+    resumed = train(TrainConfig(out=tmp_path / "killed", resume=True, progress=False))
+    same_result(whole, resumed)
+
+
+def test_a_run_is_the_same_watched_or_not(tmp_path):
+    watched = train(config(tmp_path / "watched"))
+    alone = train(config(tmp_path / "alone", eval_every=0, checkpoint_every=10_000))
+    for part, array in read_arrays(watched.folder / "final" / "weights.safetensors").items():
+        np.testing.assert_array_equal(
+            read_arrays(alone.folder / "final" / "weights.safetensors")[part], array
+        )
+    assert alone.curve == []
+    assert alone.model_folder.name == "final"
+
+
+def test_another_seed_is_another_run(tmp_path):
+    runs = [train(config(tmp_path / str(seed), seed=seed, eval_every=0)) for seed in (0, 1)]
+    first, second = (read_arrays(run.folder / "final" / "weights.safetensors") for run in runs)
+    assert any((first[name] != second[name]).any() for name in first)
+
+
+def test_what_a_run_leaves(tmp_path):
+    run = train(config(tmp_path / "run"))
+    assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192]
+    for before, after in zip(run.curve, run.curve[1:], strict=False):
+        assert after["physics_steps"] > before["physics_steps"]
+        assert after["seconds"] >= before["seconds"]
+    for record in run.curve:
+        assert record["success"]["low"] <= record["success"]["rate"] <= record["success"]["high"]
+    assert list((run.folder / "tensorboard").glob("events.*"))
+    best = max(record["success"]["rate"] for record in run.curve)
+    model = load_model(run.model_folder)
+    assert run.model_folder.name == "best"
+    scenes = monitor.validation_scenes(run)
+    method = monitor.AgentMethod("agent", model)
+    again = evaluate([method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False)
+    assert again.results[0].success.mean() == best
+
+
+def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
+    whole = train(config(tmp_path / "whole", checkpoint_every=10_000))
+    step_wait = ViaVecEnv.step_wait
+    left = iter(range(5))
+
+    def interrupted(self):
+        if next(left, "over") == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step_wait(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ViaVecEnv, "step_wait", interrupted)
+        with pytest.raises(TrainingStoppedError, match=r"after 80 decisions.*--resume"):
+            train(config(tmp_path / "stopped", checkpoint_every=10_000))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    stopped = Run(tmp_path / "stopped")
+    assert stopped.decisions == 80
+    assert load_model(stopped.folder / "final").num_timesteps == 80
+    same_result(whole, train(TrainConfig(out=stopped.folder, resume=True, progress=False)))
+
+
+def test_a_finished_run_can_be_extended(tmp_path):
+    run = train(config(tmp_path / "run", n_timesteps=64))
+    longer = train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False))
+    assert longer.decisions == 128
+    assert Run(run.folder).config.n_timesteps == 128
+    again = train(TrainConfig(out=run.folder, resume=True, progress=False))
+    assert curve(again) == curve(longer)
+
+
+def test_what_cannot_be_trained_is_refused(tmp_path):
+    with pytest.raises(BadFileError, match="no run folder"):
+        train(TrainConfig(out=tmp_path / "nothing", resume=True))
+    with pytest.raises(ValueError, match="no hyperparameter 'speed'"):
+        train(config(tmp_path / "run", hyperparameters={"speed": 1}))
+    with pytest.raises(TypeError, match="colour"):
+        train(config(tmp_path / "other", env_kwargs={"colour": 1}))
+
+
+def test_shipped_validation_scenes_are_used(shipped, tmp_path):
+    run = Run.create(dataclasses.replace(config(tmp_path / "run"), env_kwargs={}))
+    scenes = monitor.validation_scenes(run)
+    np.testing.assert_array_equal(scenes.scenes.goal, shipped.scenes.goal[:8])
+    assert scenes.sha256 == shipped.take(slice(0, 8)).sha256
+
+
+def test_learning_happens(tmp_path):
+    """A minute of learning is not needed to be far better than the first decisions."""
+    run = train(
+        config(
+            tmp_path / "run",
+            n_timesteps=768,
+            n_envs=64,
+            eval_every=768,
+            eval_scenes=200,
+            hyperparameters={"learning_starts": 128, "gradient_steps": 20},
+        )
+    )
+    first, last = run.curve[0]["success"], run.curve[-1]["success"]
+    assert last["low"] > first["high"]

@@ -1,0 +1,181 @@
+"""SB3's view of the environment is the environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from viapoint.training.vec_env import ViaVecEnv
+
+ENV = "viapoint/PlanarObstacles-v0"
+
+
+class Countdown(gym.Env):
+    """Ends after `length` steps, by itself or cut off; observes how many are left and pays that number."""
+
+    observation_space = gym.spaces.Box(-1.0, 100.0, (1,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    render_mode = None
+
+    def __init__(self, cut=False):
+        self.cut = cut
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(1, 5))
+        return self._observation(), {}
+
+    def step(self, action):
+        self.left -= 1
+        over = self.left == 0
+        return (
+            self._observation(),
+            float(self.left),
+            over and not self.cut,
+            over and self.cut,
+            {"is_success": over},
+        )
+
+    def _observation(self):
+        return np.array([self.left], np.float32)
+
+
+class NextStep(gym.vector.VectorEnv):
+    single_observation_space = Countdown.observation_space
+    single_action_space = Countdown.action_space
+
+    def __init__(self, num_envs):
+        self.num_envs = num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    gym.register("test/Countdown-v0", entry_point=Countdown)
+    gym.register("test/NextStep-v0", vector_entry_point=NextStep)
+    yield
+    for name in ("test/Countdown-v0", "test/NextStep-v0"):
+        del gym.registry[name]
+
+
+@pytest.fixture
+def env():
+    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
+    yield env
+    env.close()
+
+
+def actions(env, seed=0):
+    return (
+        np.random.default_rng(seed)
+        .uniform(-0.5, 0.5, (env.num_envs, *env.action_space.shape))
+        .astype(np.float32)
+    )
+
+
+def test_it_is_the_vector_environment(env):
+    native = gym.make_vec(ENV, num_envs=6, threads=1)
+    expected, _ = native.reset(seed=3)
+    observed = env.reset()
+    for step in range(3):
+        for name in expected:
+            np.testing.assert_array_equal(observed[name], expected[name])
+        expected, reward, terminated, _, info = native.step(actions(env, step))
+        observed, mine, done, infos = env.step(actions(env, step))
+        np.testing.assert_array_equal(mine, reward.astype(np.float32))
+        np.testing.assert_array_equal(done, terminated)
+        for i, each in enumerate(infos):
+            assert each["is_success"] is bool(info["is_success"][i])
+            assert each["TimeLimit.truncated"] is False
+            assert each["episode"] == {"r": reward[i], "l": 1, "t": each["episode"]["t"]}
+            for name, part in info["final_obs"][i].items():
+                np.testing.assert_array_equal(each["terminal_observation"][name], part)
+    assert env.physics_steps == native.unwrapped.physics_steps > 0
+    native.close()
+
+
+def test_observations_keep_their_values(env):
+    first = env.reset()
+    kept = {name: part.copy() for name, part in first.items()}
+    _, _, _, infos = env.step(actions(env))
+    ends = [{name: part.copy() for name, part in each["terminal_observation"].items()} for each in infos]
+    env.step(actions(env, 1))
+    for name, part in first.items():
+        np.testing.assert_array_equal(part, kept[name])
+    for info, end in zip(infos, ends, strict=True):
+        for name, part in end.items():
+            np.testing.assert_array_equal(info["terminal_observation"][name], part)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_long_episodes_end_each_in_its_time(cut):
+    env = ViaVecEnv("test/Countdown-v0", 5, seed=0, cut=cut)
+    left = env.reset()[:, 0]
+    began = left.copy()
+    lengths = set()
+    for _ in range(12):
+        after, reward, done, infos = env.step(np.zeros((5, 1), np.float32))
+        np.testing.assert_array_equal(done, left == 1)
+        for i in range(5):
+            if not done[i]:
+                assert infos[i] == {}
+                assert after[i, 0] == reward[i] == left[i] - 1
+                continue
+            n = int(began[i])
+            assert infos[i]["episode"]["l"] == n
+            assert infos[i]["episode"]["r"] == sum(range(n))
+            assert infos[i]["terminal_observation"] == [0.0]
+            assert infos[i]["TimeLimit.truncated"] is cut
+            assert infos[i]["is_success"] is True
+            assert after[i, 0] >= 1
+            began[i] = after[i, 0]
+            lengths.add(n)
+        left = after[:, 0]
+    assert len(lengths) > 1
+
+
+def test_other_autoreset_is_refused():
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        ViaVecEnv("test/NextStep-v0", 2)
+
+
+def test_seeds_options_and_attributes(env):
+    env.seed(5)
+    first = env.reset()
+    assert any((first[name] != part).any() for name, part in env.reset().items())
+    env.seed(5)
+    again = env.reset()
+    assert all((first[name] == part).all() for name, part in again.items())
+    scene = env.venv.unwrapped.scenes.take([0])
+    env.set_options({name: value[0] for name, value in scene.as_options().items()})
+    given = env.reset()
+    assert np.ptp(given["goal"], axis=0).max() == 0.0
+    env.set_options([{name: value[0] for name, value in scene.as_options().items()}] * 6)
+    assert all((given[name] == part).all() for name, part in env.reset().items())
+    assert len(env.get_attr("task")) == 6
+    assert env.get_attr("num_envs", indices=0) == [6]
+    env.set_attr("mark", 1)
+    assert env.get_attr("mark", indices=[2, 3]) == [1, 1]
+    with pytest.raises(ValueError, match="share mark"):
+        env.set_attr("mark", 2, indices=[0])
+    with pytest.raises(AttributeError):
+        env.get_attr("nothing")
+    assert env.env_is_wrapped(gym.Wrapper) == [False] * 6
+    assert env.env_method("__str__", indices=1) == [str(env.venv.unwrapped)]
+
+
+def test_a_restored_state_goes_on_alike(env):
+    env.reset()
+    env.step(actions(env))
+    state = env.state()
+    expected = [env.step(actions(env, seed)) for seed in (1, 2)]
+    other = ViaVecEnv(ENV, 6, seed=99, threads=1)
+    other.reset()
+    other.restore(state)
+    for seed, (observed, reward, _, _) in zip((1, 2), expected, strict=True):
+        mine = other.step(actions(env, seed))
+        np.testing.assert_array_equal(mine[1], reward)
+        for name, part in observed.items():
+            np.testing.assert_array_equal(mine[0][name], part)
+    assert other.physics_steps == env.physics_steps
+    other.close()
