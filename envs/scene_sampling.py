@@ -21,10 +21,12 @@ from viapoint.envs.scenes import Scenes
 
 Float = NDArray[np.float64]
 
-ENDS, WITNESSES, CANDIDATES, PHASES, WAYS = 16, 6, 32, 40, 25
+ENDS, WITNESSES, CANDIDATES, PHASES, WAYS = 16, 6, 32, 40, 15
 """How many pairs of ends, witnesses and obstacles are drawn at once, at how many times a movement is looked at,
 and how many ways round are told apart."""
 ATTEMPTS = 200
+INWARD = 0.85
+"""Share of witnesses that pass between base and obstacles, where links count: few others leave room for them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +51,10 @@ class SceneDistribution:
     """Hardness is a uniform number to this power: less is harder."""
     witness_margin: float = 0.006
     """Least clearance of the witness, [m]: what sampling times and tracking may cost, and to spare."""
+    link_margin: float = 0.015
+    """Least clearance of the witness's links, [m]: they are looked at less often."""
     end_margin: float = 0.025
-    """Least clearance of the arm at start and goal, [m]."""
+    """Least clearance of the hand at start and goal, [m]."""
     reach_margin: float = 0.03
     """How far inside the arm's reach start, goal and witness stay, [m]."""
 
@@ -111,7 +115,7 @@ class SceneSampler:
     @property
     def _size(self) -> int:
         """Uniform numbers of one attempt."""
-        return 4 * ENDS + 2 * WITNESSES + 7 * CANDIDATES + 2 + self._rows
+        return 4 * ENDS + 3 * WITNESSES + 7 * CANDIDATES + 2 + self._rows
 
     def _attempt(self, u: _Uniforms, ends: tuple[Float, Float] | None) -> tuple[NDArray[np.bool_], Scenes]:
         """Scenes, and which of them are good."""
@@ -119,9 +123,7 @@ class SceneSampler:
         path, reached = self._witness(u, start, goal)
         hardness = u.take(1) ** self.distribution.ease
         rows = self._candidates(u, start, goal, path, hardness)
-        clearance = self._least_clearance(path, rows)
-        resting = np.minimum(self._least_clearance(start[:, None], rows), self._least_clearance(goal[:, None], rows))
-        free = (clearance > self.distribution.witness_margin) & (resting > self.distribution.end_margin)
+        free = self._free(path, start, goal, rows)
         obstacles, enough = self._choose(u, (start, goal), rows, free, hardness)
         return good & reached & enough, Scenes(start, goal, obstacles)
 
@@ -152,6 +154,8 @@ class SceneSampler:
         along = 1.6 * u.take(WITNESSES) - 0.8
         side = 2.0 * u.take(WITNESSES) - 1.0
         across = np.copysign(0.15 + 0.8 * np.abs(side), side)
+        if self.whole_arm:
+            across = np.where(u.take(WITNESSES) < INWARD, np.abs(across) * _side_of_base(start, goal), across)
         action = np.stack((along, across, np.zeros_like(along)), axis=-1)
         ends = np.broadcast_to(start[:, None], (*action.shape[:2], start.shape[-1]))
         plan = self._layout.decode(action, ends, np.broadcast_to(goal[:, None], ends.shape))
@@ -185,14 +189,18 @@ class SceneSampler:
         centre = foot + normal * np.where(beside, away, d.spread * offset)[..., None]
         return np.concatenate((centre, axis, radius[..., None]), axis=-1)
 
-    def _least_clearance(self, path: Float, rows: Float) -> Float:
-        """Clearance of the arm from each candidate while its hand is on `path`, shape (N, CANDIDATES), [m]."""
+    def _free(self, path: Float, start: Float, goal: Float, rows: Float) -> NDArray[np.bool_]:
+        """Which candidates leave room for the witness, and for the arm at its ends, shape (N, CANDIDATES)."""
+        d, radius = self.distribution, self.arm.hand_radius
         present = np.ones(rows.shape[:-1], dtype=bool)
-        clearance = hand_clearance(path, self.arm.hand_radius, rows, present)
+        ends = np.stack((start, goal), axis=1)
+        free = hand_clearance(path, radius, rows, present) > d.witness_margin
+        free &= hand_clearance(ends, radius, rows, present) > d.end_margin
         if self.whole_arm:
-            links = self.arm.links(self.arm.posture(path))
-            clearance = np.minimum(clearance, arm_clearance(links, self.arm.link_radii, rows, present))
-        return np.asarray(clearance)
+            some = np.concatenate((path[:, ::3], path[:, -1:]), axis=1)
+            links = self.arm.links(self.arm.posture(some))
+            free &= arm_clearance(links, self.arm.link_radii, rows, present) > d.link_margin
+        return np.asarray(free)
 
     def _choose(
         self,
@@ -238,7 +246,7 @@ class SceneSampler:
         ways = self._ways[np.round(fraction * (len(self._ways) - 1)).astype(np.int64)]
         lateral = (centre * across).sum(axis=-1)[..., None]
         reach = np.abs((axis * across).sum(axis=-1)) + radius + self.arm.hand_radius
-        return np.asarray(np.abs(ways - lateral) < reach[..., None])
+        return np.asarray(np.abs(ways - lateral.astype(np.float32)) < reach[..., None].astype(np.float32))
 
 
 class _Uniforms:
@@ -254,7 +262,7 @@ class _Uniforms:
         return self._values[:, self._next - count : self._next]
 
 
-def _ways_round(layout: ActionLayout, distance: float) -> Float:
+def _ways_round(layout: ActionLayout, distance: float) -> NDArray[np.float32]:
     """Distance from the straight line of movements through one via-point, at 21 places along it, shape (21, ways), [m]."""
     along, across = (g.ravel() for g in np.meshgrid((-0.7, 0.0, 0.7), np.linspace(-1.0, 1.0, WAYS)))
     action = np.zeros((len(along), layout.size))
@@ -265,7 +273,13 @@ def _ways_round(layout: ActionLayout, distance: float) -> Float:
     plan = layout.decode(action, start, goal)
     path = plan.trajectory()(plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, 200))
     places = np.linspace(0.0, distance, 21)
-    return np.stack([np.interp(places, way[:, 0], way[:, 1]) for way in path], axis=-1)
+    return np.stack([np.interp(places, way[:, 0], way[:, 1]) for way in path], axis=-1).astype(np.float32)
+
+
+def _side_of_base(start: Float, goal: Float) -> Float:
+    """1 where the arm's base lies to the left of the straight line, -1 where to its right, shape (N, 1)."""
+    line, middle = goal - start, 0.5 * (start + goal)
+    return np.where(line[:, :1] * middle[:, 1:2] < line[:, 1:2] * middle[:, :1], 1.0, -1.0)
 
 
 def _unit(vectors: Float) -> Float:

@@ -23,6 +23,11 @@ BAND_EDGES = (0.2, 0.05, 0.01)
 FIELDS = ("start", "goal", "obstacles", "share", "solution")
 
 
+def bands(share: Float) -> NDArray[np.int64]:
+    """Index into BANDS of each solution share, shape (N,)."""
+    return np.searchsorted(-np.array(BAND_EDGES), -share, side="left").astype(np.int64)
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrozenScenes:
     """A set of N scenes."""
@@ -39,7 +44,7 @@ class FrozenScenes:
     @property
     def band(self) -> NDArray[np.int64]:
         """Index into BANDS, shape (N,)."""
-        return np.searchsorted(-np.array(BAND_EDGES), -self.share, side="left").astype(np.int64)
+        return bands(self.share)
 
     @property
     def sha256(self) -> str:

@@ -14,9 +14,13 @@ from cmaes import CMA
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes import Scenes
+from viapoint.training.screening import screen
 from viapoint.training.trial import Trial
 
 Float = NDArray[np.float64]
+
+HOPELESS = -3.0
+"""Reward put down for an action that fails for certain and is not simulated; less than any simulated one's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +47,7 @@ class Planned(NamedTuple):
     success: NDArray[np.bool_]
     """Shape (N,)."""
     tried: NDArray[np.int64]
-    """Simulated actions, shape (N,)."""
+    """Actions looked at, shape (N,)."""
 
 
 class Planner:
@@ -78,14 +82,19 @@ class Planner:
     def _try(self, scenes: Scenes, rows: NDArray[np.int64], actions: Float, found: Planned) -> Float:
         """Simulate a few actions in each of some scenes, keep what is better than what was found, return the rewards."""
         count = actions.shape[1]
-        trials = self._trial(scenes.take(np.repeat(rows, count)), actions.reshape(-1, self._size))
-        rewards = trials.reward.reshape(-1, count)
+        every, flat = scenes.take(np.repeat(rows, count)), actions.reshape(-1, self._size)
+        screened = screen(self._trial.task, every, flat)
+        rewards, success = HOPELESS + screened.merit, np.zeros(len(flat), dtype=bool)
+        if not screened.fails.all():
+            trials = self._trial(every.take(~screened.fails), flat[~screened.fails])
+            rewards[~screened.fails], success[~screened.fails] = trials.reward, trials.success
+        rewards, success = rewards.reshape(-1, count), success.reshape(-1, count)
         best = rewards.argmax(axis=-1)
         each = np.arange(len(rows))
         better = rewards[each, best] > found.reward[rows]
         found.action[rows[better]] = actions[each, best][better]
         found.reward[rows[better]] = rewards[each, best][better]
-        found.success[rows[better]] = trials.success.reshape(-1, count)[each, best][better]
+        found.success[rows[better]] = success[each, best][better]
         found.tried[rows] += count
         return rewards
 
