@@ -10,7 +10,11 @@ from viapoint.training import statistics
 
 def test_wilson_equals_published_values():
     # Newcombe 1998, Stat. Med. 17, 857-872, table I, method 3
-    for successes, trials, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (1, 29, 0.0061, 0.1718)):
+    for successes, trials, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (1, 29, 0.0061, 0.1718),
+    ):
         interval = statistics.wilson(successes, trials)
         assert (round(interval.low, 4), round(interval.high, 4)) == (low, high)
     assert statistics.wilson(0, 20).low == 0.0
@@ -90,7 +94,9 @@ def test_stratified_bootstrap_keeps_tasks_apart():
 
 
 def test_spl_by_its_formula():
-    assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(2.5 / 4)
+    assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
+        2.5 / 4
+    )
 
 
 @pytest.mark.parametrize(
