@@ -90,9 +90,9 @@ def measure(
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
         min_clearance=least_clearance(arm, joints, hand, scenes, whole_arm=whole_arm),
         goal_error=goal_error,
-        path_length=moved.sum(axis=-1),
+        path_length=_sum_in_order(moved),
         peak_speed=moved.max(axis=-1) / timestep,
-        tracking_error=np.sqrt(deviation.sum(axis=-1) / steps),
+        tracking_error=np.sqrt(_sum_in_order(deviation) / steps),
         reachable=np.ones(len(steps), dtype=bool),
         unstable=record.unstable,
     )
@@ -137,3 +137,8 @@ def least_clearance(arm: Arm, joints: Float, hand: Float, scenes: Scenes, *, who
 def norm(vectors: Float) -> Float:
     """Euclidean length along the last axis."""
     return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1)))
+
+
+def _sum_in_order(values: Float) -> Float:
+    """Sum along the last axis, one after the other, so that zeros behind change no bit of it."""
+    return np.asarray(np.cumsum(values, axis=-1)[..., -1])

@@ -23,6 +23,8 @@ from viapoint.training.trial import Trial
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}
 """First seeds of the sets; training draws from seeds below a million."""
 SIZES = {"validation": 500, "test": 1000}
+WITHOUT_OBSTACLES = 100
+"""Scenes of a set with nothing in the way."""
 ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0")
 DRAWN_AT_ONCE = 2048
 MOST_DRAWN = 64 * DRAWN_AT_ONCE
@@ -38,8 +40,8 @@ def make(env_id: str, name: str, size: int | None = None) -> FrozenScenes:
         name: `validation` or `test`.
         size: Number of scenes N; by default the set's.
     """
-    size = size or SIZES[name]
     trial = Trial(env_id)
+    size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
     drawn = _draw(trial, np.random.default_rng(SEEDS[name]), size)
     pieces = []
     for i in tqdm(range(0, len(drawn.start), 64), desc=f"{env_id} {name}", unit="x64 scenes", file=sys.stderr):

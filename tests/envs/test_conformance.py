@@ -1,0 +1,194 @@
+"""What every registered environment keeps to."""
+
+import pickle
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_checker import check_env as sb3_check
+
+from viapoint.envs import TASKS
+from viapoint.envs.reward import RewardTerms
+
+IDS = sorted(TASKS)
+INFO = {
+    "is_success", "collision", "first_contact_time", "min_clearance", "goal_error", "duration", "path_length",
+    "jerk_cost", "jerk_ratio", "peak_speed", "tracking_error", "reachable", "unstable",
+}  # fmt: skip
+
+
+@pytest.fixture(params=IDS)
+def env_id(request):
+    return request.param
+
+
+def episodes(env_id, seeds, actions, **kwargs):
+    """One step from each seed, environment by environment."""
+    env = gym.make(env_id, **kwargs)
+    result = []
+    for seed, action in zip(seeds, actions, strict=True):
+        first, _ = env.reset(seed=int(seed))
+        last, reward, *_, info = env.step(action)
+        result.append((first, last, reward, info))
+    env.close()
+    return result
+
+
+def actions_for(env_id, number, scale=1.0):
+    size = gym.make(env_id).action_space.shape[0]
+    return (scale * np.random.default_rng(3).uniform(-1.0, 1.0, (number, size))).astype(np.float32)
+
+
+def test_both_checkers_pass_without_a_warning(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gymnasium_check(gym.make(env_id).unwrapped, skip_render_check=True)
+        sb3_check(gym.make(env_id), warn=True, skip_render_check=True)
+
+
+def test_make_imports_and_makes_in_one_call(env_id):
+    env = gym.make(f"viapoint.envs:{env_id}")
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert info == {}
+
+
+def test_info_is_complete_finite_and_scalar(env_id):
+    for *_, info in episodes(env_id, range(20), actions_for(env_id, 20)):
+        assert set(info) >= INFO
+        assert set(info) >= {f"reward_{name}" for name in RewardTerms._fields}
+        for name, value in info.items():
+            assert isinstance(value, bool | float), name
+            assert np.isfinite(value), name
+
+
+def test_reward_is_the_sum_of_its_terms(env_id):
+    for *_, reward, info in episodes(env_id, range(20), actions_for(env_id, 20)):
+        assert reward == pytest.approx(sum(v for k, v in info.items() if k.startswith("reward_")), abs=1e-12)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_single_equals_batch_bit_for_bit(env_id, threads):
+    number = 70  # more than one group
+    actions = actions_for(env_id, number)
+    env = gym.make_vec(env_id, num_envs=number, threads=threads)
+    first, _ = env.reset(seed=5)
+    _, reward, terminated, truncated, info = env.step(actions)
+    assert terminated.all()
+    assert not truncated.any()
+    for i, (alone, last, r, single) in enumerate(episodes(env_id, 5 + np.arange(number), actions)):
+        assert r == reward[i]
+        for name in alone:
+            np.testing.assert_array_equal(alone[name], first[name][i])
+            np.testing.assert_array_equal(last[name], info["final_obs"][i][name])
+        assert single == {k: info["final_info"][k][i].item() for k in single}
+        assert single == {k: info[k][i].item() for k in single}
+    env.close()
+
+
+def test_the_next_episodes_are_those_of_a_reset(env_id):
+    """Autoreset draws what reset would have drawn."""
+    env, single = gym.make_vec(env_id, num_envs=3), gym.make(env_id)
+    env.reset(seed=8)
+    following, *_ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    single.reset(seed=10)
+    single.step(np.zeros(single.action_space.shape, dtype=np.float32))
+    again, _ = single.reset()
+    for name, part in again.items():
+        np.testing.assert_array_equal(part, following[name][2])
+
+
+def test_equal_seeds_give_equal_episodes_and_others_do_not(env_id):
+    env = gym.make(env_id)
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert not all(np.array_equal(first[name], other[name]) for name in first)
+
+
+def test_observations_share_no_memory_and_stay_in_their_space(env_id):
+    env = gym.make_vec(env_id, num_envs=16)
+    before, _ = env.reset(seed=0)
+    kept = {name: part.copy() for name, part in before.items()}
+    for action in actions_for(env_id, 8):
+        after, *_, info = env.step(np.tile(action, (16, 1)))
+        assert env.observation_space.contains(after)
+        assert all(env.single_observation_space.contains(last) for last in info["final_obs"])
+        assert not any(np.shares_memory(before[name], after[name]) for name in before)
+    for name, part in kept.items():
+        np.testing.assert_array_equal(part, before[name])
+
+
+def test_no_element_of_the_observation_is_constant(env_id):
+    observation, _ = gym.make_vec(env_id, num_envs=64).reset(seed=0)
+    for name, part in observation.items():
+        assert part.dtype == np.float32
+        assert (np.ptp(part, axis=0) > 0.0).all(), name
+
+
+def test_everything_in_the_model_has_a_name(env_id):
+    model = gym.make(env_id).unwrapped.model
+    for kind, count in (("body", model.nbody), ("geom", model.ngeom), ("joint", model.njnt), ("actuator", model.nu)):
+        for index in range(count):
+            assert getattr(model, kind)(index).name, f"{kind} {index}"
+    assert isinstance(model, mujoco.MjModel)
+
+
+def test_pickles(env_id):
+    env = pickle.loads(pickle.dumps(gym.make(env_id).unwrapped))
+    native = pickle.loads(pickle.dumps(gym.make_vec(env_id, num_envs=2)))
+    assert env.reset(seed=4)[0].keys() == native.reset(seed=4)[0].keys()
+
+
+def test_vector_environment_names_its_autoreset_mode_and_counts_physics_steps(env_id):
+    env = gym.make_vec(env_id, num_envs=4)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    env.reset(seed=0)
+    assert env.physics_steps == 0
+    *_, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    assert env.physics_steps >= info["duration"].sum() / env.model.opt.timestep
+
+
+def test_a_reset_mask_resets_only_those(env_id):
+    env = gym.make_vec(env_id, num_envs=4)
+    before, _ = env.reset(seed=0)
+    mask = np.array([True, False, True, False])
+    after, _ = env.reset(options={"reset_mask": mask})
+    for name, part in before.items():
+        np.testing.assert_array_equal(part[~mask], after[name][~mask])
+    assert not np.array_equal(before["goal"][mask], after["goal"][mask])
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(np.nan, "finite"), (np.inf, "finite")],
+)
+def test_non_finite_actions_are_refused(env_id, action, message):
+    env = gym.make(env_id, disable_env_checker=True)
+    env.reset(seed=0)
+    bad = np.zeros(env.action_space.shape, dtype=np.float32)
+    bad[-1] = action
+    with pytest.raises(ValueError, match=message):
+        env.step(bad)
+
+
+def test_wrong_shapes_and_unknown_arguments_are_refused(env_id):
+    env = gym.make(env_id, disable_env_checker=True)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="shape"):
+        env.step(np.zeros(env.action_space.shape[0] + 1, dtype=np.float32))
+    with pytest.raises(TypeError, match=r"'speed'; allowed are .*n_via"):
+        gym.make(env_id, speed=3)
+    with pytest.raises(ValueError, match="timing must be one of optimal, learned"):
+        gym.make(env_id, timing="fast")
+    with pytest.raises(ValueError, match="render_mode must be"):
+        gym.make(env_id, render_mode="rgb").unwrapped
+
+
+def test_stepping_before_a_reset_is_refused(env_id):
+    env = gym.make(env_id).unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
