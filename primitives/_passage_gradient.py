@@ -34,7 +34,7 @@ def attach(
     if fractions.shape[-1] == 1:
         return fractions
     if fractions.shape[-1] == 2 and all(value is None for value in boundary.values()):
-        return attach_gradient(fractions, waypoints)
+        return attach_gradient(fractions, waypoints, xp)
     fractions = detach(fractions)
     whole = xp.all(fractions > 0, axis=-1)[..., None]
     safe = xp.where(whole, fractions, xp.ones_like(fractions) / fractions.shape[-1])

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ._arrays import Array, detach
+from ._arrays import Array, Namespace, like, to_numpy
 
 Number: TypeAlias = Any
 """A float, or an array with one entry per movement: the same operations, the same bits."""
@@ -119,25 +119,37 @@ def residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number
     return c * s + a * w - q * m, a * dw - 2.0 * c - dq * m - q * (b * dw - 2.0 * a)
 
 
-def attach_gradient(fractions: Array, waypoints: Array) -> Array:
+def attach_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> Array:
     """Make the fractions differentiable by the implicit function theorem, dt/dp = -(dF/dp) / (dF/dt).
 
     The gradient grows without bound, like |E|^(-2/3), as the via-point meets an end point; it is clipped
     there, and stays finite when all points coincide.
     """
-    first = waypoints[..., 1, :] - waypoints[..., 0, :]
-    second = waypoints[..., 2, :] - waypoints[..., 1, :]
+    rates, is_late = _root_rates(
+        to_numpy(waypoints).astype(np.float64), to_numpy(fractions).astype(np.float64)
+    )
     whole = waypoints[..., 2, :] - waypoints[..., 0, :]
-    is_late = (fractions[..., 1] < fractions[..., 0])[..., None]
-    near = is_late * second + ~is_late * first
-    t = fractions.min(-1).values
-    a, b, c = (near * whole).sum(-1), (whole * whole).sum(-1), (near * near).sum(-1)
-    _, slope = residual(t, detach(a), detach(b), detach(c))
-    extent = detach(b + c)
-    floor = _FLOOR ** (5 / 3) * extent  # |dF/dt| falls like |E|^(5/3)
-    slope = -(-slope).clip(min=floor + (extent <= 0))
-    value, _ = residual(t, a, b, c)
-    step = -value / slope
-    step = step - detach(step)  # the value is exact already: only the gradient is wanted
-    sign = 1.0 - 2.0 * is_late[..., 0].to(step.dtype)
-    return fractions + (sign * step)[..., None] * fractions.new_tensor([1.0, -1.0])
+    near = waypoints[..., 1:, :] - waypoints[..., :-1, :]
+    near = (near * like(xp, np.stack([~is_late, is_late], axis=-1)[..., None], near)).sum(-2)
+    by_a, by_b, by_c = (like(xp, rate, near)[..., None] for rate in rates)
+    # The sum over dimensions of by_a a + by_b b + by_c c; only its gradient is wanted, the value is exact.
+    change = (near * (by_a * whole + by_c * near) + by_b * (whole * whole)).sum(-1)
+    change = change - change.detach()
+    return fractions + xp.stack([change, -change], axis=-1)
+
+
+def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]:
+    """Return d(first fraction) / d(a, b, c), each (...,), and whether the via-point is nearer to the goal."""
+    start, via, goal = (np.moveaxis(points[..., k, :], -1, 0) for k in range(3))
+    is_late = fractions[..., 1] < fractions[..., 0]
+    t = fractions.min(axis=-1)
+    near = np.where(is_late, goal - via, via - start)
+    whole = goal - start
+    a, b, c = dot(near, whole), dot(whole, whole), dot(near, near)
+    _, slope = residual(t, a, b, c)
+    extent = b + c
+    floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
+    sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
+    cube, s = t * t * t, 1.0 - 2.0 * t
+    w, q = cube * (2.0 - t), cube * (10.0 + t * (6.0 * t - 15.0))
+    return (sign * (w - q * s), -sign * q * w, sign * s), is_late

@@ -33,8 +33,6 @@ def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Names
     Returns:
         (..., (degree + 1) S, T); row k S + s is u_s^k where segment s is current, else 0.
     """
-    if xp is np:
-        return _power_basis_in_place(time, starts, rates, degree)
     power = (time[..., None, :] - starts[..., None]) * rates[..., None]
     current = xp.ones_like(power)
     if starts.shape[-1] > 1:
@@ -47,22 +45,21 @@ def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Names
     return xp.concat(rows, axis=-2)
 
 
-def _power_basis_in_place(time: Any, starts: Any, rates: Any, degree: int) -> Any:
-    """Do the same, to the bit, without temporary arrays: most of the time of sampling is spent here."""
-    segments, count = starts.shape[-1], time.shape[-1]
-    batch = np.broadcast_shapes(time.shape[:-1], starts.shape[:-1])
-    basis = np.empty((*batch, degree + 1, segments, count), dtype=starts.dtype)
+def _power_basis_into(basis: Any, time: Any, starts: Any, rates: Any) -> Any:
+    """Do the same for NumPy in a buffer (..., degree + 1, S, T): here most of the time is spent."""
+    segments = starts.shape[-1]
     current, local = basis[..., 0, :, :], basis[..., 1, :, :]
-    np.subtract(time[..., None, :], starts[..., None], out=local)
-    local *= rates[..., None]
     if segments == 1:
         current[...] = 1.0
+        np.multiply(time[..., None, :] - starts[..., None], rates[..., None], out=local)
     else:
         current[...] = _current_segment(time, starts, np)
-        local *= current
-    for k in range(2, degree + 1):
+        # A product with a single 1 among zeros picks start and rate of the current segment exactly.
+        picked = np.matmul(np.stack([starts, rates], axis=-2), current)
+        np.multiply(((time - picked[..., 0, :]) * picked[..., 1, :])[..., None, :], current, out=local)
+    for k in range(2, basis.shape[-3]):
         np.multiply(basis[..., k - 1, :, :], local, out=basis[..., k, :, :])
-    return basis.reshape(*batch, -1, count)
+    return basis.reshape(*basis.shape[:-3], -1, basis.shape[-1])
 
 
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
@@ -117,9 +114,14 @@ def evaluate(
     if out is None:
         batch = np.broadcast_shapes(coefficients.shape[:-3], time.shape[:-1])
         out = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
-    for where, shared in _blocks(coefficients, starts, time):
-        basis = power_basis(time[shared[0]], starts[shared[1]], rates[shared[1]], degree, np)
-        _products(basis, [weight[where] for weight in weights], [buffer[where] for buffer in out], np)
+    buffer = None
+    for where, own in _blocks(coefficients, starts, time):
+        at, begin, rate = time[own[0]], starts[own[1]], rates[own[1]]
+        shape = np.broadcast_shapes(at.shape[:-1], begin.shape[:-1])
+        if buffer is None or buffer.shape[:-3] != shape:  # one buffer for all blocks but a shorter last one
+            buffer = np.empty((*shape, degree + 1, segments, time.shape[-1]), dtype=starts.dtype)
+        basis = _power_basis_into(buffer, at, begin, rate)
+        _products(basis, [weight[where] for weight in weights], [array[where] for array in out], np)
     return list(out)
 
 
