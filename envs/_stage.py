@@ -25,7 +25,7 @@ LOW, TALL = 0.030, 0.060
 """Height of the obstacles over the hand: below the links that pass above, or in the way of the links, [m]."""
 PLAN, DONE = 0.0065, 0.0030
 """Radius of a planned and of an executed path, [m]: the one shows as a rim of the other."""
-SPACING = 0.008
+SPACING = 0.011
 """Between the points of a drawn path, [m]."""
 ROOM = 2000
 """Most shapes in a scene."""

@@ -21,7 +21,7 @@ __all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame
 
 Frame = NDArray[np.uint8]
 
-STILL_PASSES, FILM_PASSES = 16, 3
+STILL_PASSES, FILM_PASSES = 16, 2
 """How many pictures one picture is the mean of: many for one that is looked at, few for one of a film."""
 LAMP_RADIUS = 0.30
 """[m]"""

@@ -47,6 +47,10 @@ class Film:
     rendered: bool
     """Whether by OpenGL; if not, it is drawn."""
 
+    def __str__(self) -> str:
+        """Where it is, and what it lacks."""
+        return f"{self.path}" if self.rendered else f"{self.path} (drawn from above, for want of OpenGL)"
+
 
 def film(
     path: str | Path,
