@@ -88,9 +88,9 @@ def parse(words: Sequence[str]) -> Any:
 
 
 def _unboxed(text: str) -> str:
-    """The words in tyro's boxes, without the frame and its title."""
+    """The words in tyro's boxes, without the frame, its title and its rules."""
     lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
-    return " ".join(line for line in lines if line) or text
+    return " ".join(line for line in lines if line.strip("-")) or text
 
 
 def _one_line(error: Exception) -> str:

@@ -1,0 +1,32 @@
+"""The benchmark measures what it says; how fast is not a matter for tests."""
+
+import json
+
+import pytest
+
+from viapoint.training import bench
+from viapoint.training.config import BenchConfig
+
+
+def test_measurements_take_turns():
+    calls = []
+    times = bench.fastest(3, lambda: calls.append("a"), lambda: calls.append("b"))
+    assert calls == ["a", "b"] * 3
+    assert len(times) == 2
+    assert all(time >= 0.0 for time in times)
+
+
+def test_every_ratio_is_of_its_two_sides(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench, "TRAJECTORIES", 32)
+    path = tmp_path / "bench.json"
+    bench.run(BenchConfig(num_envs=8, repeats=1, json=path))
+    ratios = json.loads(path.read_text())
+    assert len(ratios) == 4
+    for name, ratio in ratios.items():
+        assert ratio["measured"] > 0.0
+        assert ratio["floor"] > 0.0
+        assert ratio["ratio"] == pytest.approx(ratio["measured"] / ratio["floor"]), name
+    assert (
+        sorted(ratio["unit"] for ratio in ratios.values()) == ["physics steps/s"] * 2 + ["us/trajectory"] * 2
+    )
+    assert "make_vec" in capsys.readouterr().out

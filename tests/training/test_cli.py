@@ -1,0 +1,130 @@
+"""The command, from the words to the files."""
+
+import json
+import shlex
+
+import pytest
+
+from viapoint.training import cli
+from viapoint.training.config import EvaluateConfig, TrainConfig
+
+ENV = "viapoint/PlanarObstacles-v0"
+
+
+def run(*words):
+    cli.main([str(word) for word in words])
+
+
+def failed(capsys, *words, code=2):
+    """The one line that a command left on the standard error output."""
+    with pytest.raises(SystemExit) as end:
+        run(*words)
+    assert end.value.code == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("viapoint: ")
+    return lines[0]
+
+
+def test_words_become_a_configuration():
+    config = cli.parse(
+        shlex.split("train --env viapoint/PlanarReach-v0 --algo sac --seed 3 --n-timesteps 9 --resume")
+    )
+    assert config == TrainConfig(
+        env="viapoint/PlanarReach-v0", algo="sac", seed=3, n_timesteps=9, resume=True
+    )
+    config = cli.parse(["train", "--env-kwargs", "n_via=2", "timing=learned", "--hyperparameters", "tau=0.1"])
+    assert config.env_kwargs == {"n_via": 2, "timing": "learned"}
+    assert config.hyperparameters == {"tau": 0.1}
+    config = cli.parse(shlex.split("evaluate runs/x --methods agent planner --json a.json"))
+    assert isinstance(config, EvaluateConfig)
+    assert (str(config.run), config.methods, str(config.json)) == ("runs/x", ("agent", "planner"), "a.json")
+
+
+@pytest.mark.parametrize("words", [[], *([name] for name in cli.COMMANDS)])
+def test_help_is_short_and_has_an_example(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        run(*words, "--help")
+    assert not end.value.code
+    text = capsys.readouterr().out
+    assert "Example: viapoint" in text
+    assert len(text.splitlines()) < 60
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("", "train, evaluate, play, bench, demo"),
+        ("fly", "fly"),
+        ("train --env viapoint/Nothing-v0", "env must be one of viapoint/PlanarReach-v0"),
+        ("train --algo dqn", "dqn"),
+        ("train --seed x", "--seed"),
+        ("train --speed 3", "--speed"),
+        ("train --env-kwargs n_via", "NAME=VALUE"),
+        ("evaluate", "name a run folder"),
+        ("evaluate nowhere", "no run folder"),
+        ("evaluate --pretrained viapoint/Nothing-v0", "no pretrained agent for 'viapoint/Nothing-v0'"),
+        (f"evaluate --methods magic --env {ENV} --scenes test", "magic"),
+        (f"evaluate --methods straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
+        ("evaluate --methods straight", "--env"),
+        ("play nowhere", "no run folder"),
+        ("train --out . --n-timesteps 1", "is not empty"),
+    ],
+)
+def test_an_error_is_one_line_that_names_the_offender(words, named, capsys, shipped):
+    assert named in failed(capsys, *words.split())
+
+
+def test_unexpected_errors_say_their_kind_and_debug_shows_them(capsys, monkeypatch):
+    def broken(self, config):
+        raise ZeroDivisionError("over nothing")
+
+    monkeypatch.setattr(cli.Command, "__call__", broken)
+    assert failed(capsys, "bench") == "viapoint: ZeroDivisionError: over nothing (--debug shows where)"
+    with pytest.raises(ZeroDivisionError):
+        run("bench", "--debug")
+
+
+def test_ctrl_c_is_no_error_message(capsys, monkeypatch):
+    def stopped(self, config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.Command, "__call__", stopped)
+    assert failed(capsys, "bench", code=130) == "viapoint: stopped"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of a few decisions."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    run(
+        "train", "--env", ENV, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
+        "--out", folder, "--no-progress", "--env-kwargs", "threads=1",
+        "--hyperparameters", "learning_starts=32", "gradient_steps=1", "fresh_scenes=4",
+    )  # fmt: skip
+    return folder
+
+
+def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
+    results = tmp_path / "new" / "results.json"
+    words = ["evaluate", trained, "--methods", "agent", "straight", "--scenes", "test", "--json", results]
+    run(*words, "--n-scenes", 12)
+    printed = capsys.readouterr().out
+    assert "straight" in printed
+    assert str(results) in printed
+    record = json.loads(results.read_text())
+    assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
+    assert record["env"] == ENV
+    run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4)
+    assert "ranks" in capsys.readouterr().out
+
+
+def test_a_second_training_in_the_folder_is_refused(trained, capsys):
+    assert "--resume" in failed(capsys, "train", "--out", trained)
+
+
+def test_play_films(trained, shipped, tmp_path, capsys):
+    video = tmp_path / "film" / "a.mp4"
+    run("play", trained, "--video", video, "--n-scenes", 1)
+    assert video.stat().st_size > 1000
+    assert str(video) in capsys.readouterr().out

@@ -1,0 +1,101 @@
+"""Configurations are checked when made, frozen, and survive JSON."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from viapoint.training import config as configs
+from viapoint.training.config import (
+    BenchConfig,
+    DemoConfig,
+    EvaluateConfig,
+    PlayConfig,
+    TrainConfig,
+    as_json,
+    from_json,
+)
+from viapoint.training.model_files import ALGORITHMS
+from viapoint.training.presets import PRESETS
+
+EXAMPLES = [
+    TrainConfig(),
+    TrainConfig(
+        env="viapoint/PlanarReach-v0",
+        algo="ppo",
+        out=Path("runs") / "x",
+        n_timesteps=5,
+        env_kwargs={"n_via": 2, "timing": "learned"},
+        hyperparameters={"batch_size": 3},
+    ),
+    EvaluateConfig(run=Path("runs/x"), methods=("agent", "random80"), json=Path("a.json")),
+    PlayConfig(pretrained="viapoint/PlanarReach-v0"),
+    BenchConfig(num_envs=3),
+    DemoConfig(out=Path("d"), n_scenes=4),
+]
+
+
+@pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
+def test_round_trip(config):
+    assert from_json(type(config), json.loads(json.dumps(as_json(config)))) == config
+
+
+@pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
+def test_frozen_keyword_only_and_documented(config):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.env = "other"
+    with pytest.raises(TypeError):
+        type(config)("viapoint/PlanarReach-v0")
+    lines = Path(configs.__file__).read_text().splitlines()
+    for field in dataclasses.fields(config):
+        declared = [i for i, line in enumerate(lines) if line.startswith(f"    {field.name}: ")]
+        assert declared, field.name
+        assert all(lines[i + 1].startswith('    """') for i in declared), field.name
+    assert "Example: viapoint " in type(config).__doc__
+
+
+def test_nothing_is_shared_between_two_configurations():
+    TrainConfig().env_kwargs["n_via"] = 2
+    assert TrainConfig().env_kwargs == {}
+    PRESETS["sac"].arguments()["policy_kwargs"]["net_arch"] = []
+    assert PRESETS["sac"].arguments()["policy_kwargs"] == {"net_arch": [256, 256]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "named"),
+    [
+        (TrainConfig, {"env": "viapoint/Nothing-v0"}, "env must be one of viapoint/"),
+        (TrainConfig, {"algo": "dqn"}, "algo must be one of viatd3"),
+        (TrainConfig, {"seed": -1}, "seed"),
+        (TrainConfig, {"seed": 1.5}, "seed"),
+        (TrainConfig, {"n_timesteps": 0}, "n_timesteps"),
+        (TrainConfig, {"n_envs": True}, "n_envs"),
+        (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
+        (EvaluateConfig, {}, "name a run folder"),
+        (EvaluateConfig, {"run": Path("a"), "pretrained": "b"}, "not both"),
+        (EvaluateConfig, {"run": Path("a"), "methods": ()}, "methods"),
+        (EvaluateConfig, {"methods": ("planner",), "env": "nothing"}, "env"),
+        (PlayConfig, {}, "name a run folder"),
+        (PlayConfig, {"run": Path("a"), "n_scenes": 0}, "n_scenes"),
+        (BenchConfig, {"num_envs": 0}, "num_envs"),
+        (DemoConfig, {"candidates": 0}, "candidates"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(kind, values, named):
+    with pytest.raises(ValueError, match=named):
+        kind(**values)
+
+
+def test_unknown_names_in_a_file_are_refused():
+    with pytest.raises(ValueError, match="colour"):
+        from_json(TrainConfig, {"colour": "red"})
+
+
+def test_every_algorithm_has_a_preset_that_fits():
+    assert set(PRESETS) == set(ALGORITHMS)
+    for name, preset in PRESETS.items():
+        assert preset.policy in ALGORITHMS[name].policy_aliases
+        assert TrainConfig(algo=name).total_timesteps == preset.n_timesteps
+        assert TrainConfig(algo=name, n_timesteps=7, n_envs=3).copies == 3
+    assert TrainConfig(algo="sac", seed=4).folder == Path("runs/PlanarObstacles-v0-sac-4")

@@ -1,0 +1,187 @@
+"""Every method meets the same scenes, and the figures are what their names say."""
+
+import json
+
+import numpy as np
+import pytest
+
+from viapoint.training.baselines import make_method
+from viapoint.training.demo import Certified
+from viapoint.training.evaluate import SLOW_DECISION, MethodResult, evaluate
+from viapoint.training.frozen_scenes import BANDS
+from viapoint.training.trial import Trial
+
+ENV = "viapoint/PlanarObstacles-v0"
+
+
+class Given:
+    """Decides what it is told, and remembers what it was shown."""
+
+    def __init__(self, name, actions):
+        self.name, self.actions = name, actions
+        self.goals, self.observed = [], []
+
+    def decide(self, observation, scenes):
+        done = sum(map(len, self.goals))
+        self.goals.append(scenes.goal)
+        self.observed.append(observation["goal"])
+        return self.actions[done : done + len(scenes.goal)]
+
+
+def run(methods, scenes, **kwargs):
+    return evaluate(methods, scenes, ENV, env_kwargs={"threads": 1}, **{"time_decisions": False, **kwargs})
+
+
+def test_every_method_meets_the_same_scenes(small_scenes):
+    number, size = small_scenes.solution.shape
+    methods = [Given("a", np.zeros((number, size))), Given("b", small_scenes.solution)]
+    evaluation = run(methods, small_scenes, batch=16)
+    for method in methods:
+        assert [len(goals) for goals in method.goals] == [16, 16, 8]
+        np.testing.assert_array_equal(np.concatenate(method.goals), small_scenes.scenes.goal)
+        np.testing.assert_allclose(np.concatenate(method.observed), small_scenes.scenes.goal, atol=1e-6)
+    trial = Trial(ENV, 8, threads=1)
+    for result, method in zip(evaluation.results, methods, strict=True):
+        direct = trial(small_scenes.scenes, method.actions)
+        for name, values in direct.info.items():
+            np.testing.assert_array_equal(result.outcomes[name], values, err_msg=name)
+        np.testing.assert_array_equal(result.outcomes["reward"], direct.reward)
+    trial.close()
+    assert evaluation.sha256 == small_scenes.sha256
+    assert evaluation.results[0].success.sum() == 0  # the straight line always hits something
+
+
+def test_results_do_not_depend_on_the_batch(small_scenes):
+    one, other = (run([Certified(small_scenes)], small_scenes, batch=batch).results[0] for batch in (7, 40))
+    for name, values in one.outcomes.items():
+        np.testing.assert_array_equal(values, other.outcomes[name], err_msg=name)
+
+
+def test_certified_solutions_solve_what_has_been_solved(small_scenes):
+    result = run([Certified(small_scenes)], small_scenes).results[0]
+    np.testing.assert_array_equal(result.success, small_scenes.share > 0.0)
+
+
+def fake(success, **changes):
+    n = len(success)
+    outcomes = {
+        "is_success": np.array(success),
+        "collision": ~np.array(success),
+        "reachable": np.ones(n, dtype=bool),
+        "min_clearance": np.linspace(-0.01, 0.01, n),
+        "goal_error": np.zeros(n),
+        "tracking_error": np.zeros(n),
+        "jerk_ratio": np.where(success, 2.0, 100.0),
+        "duration": np.where(success, 0.8, 9.0),
+        "path_length": np.where(success, 0.5, 7.0),
+    }
+    values = {
+        "name": "fake",
+        "outcomes": outcomes,
+        "actions": np.zeros((n, 3)),
+        "decision_times": np.linspace(0.001, 0.003, 101),
+        "band": np.arange(n) % 4,
+        "distance": np.full(n, 0.4),
+        "partial": False,
+    }
+    return MethodResult(**{**values, **changes})
+
+
+def test_the_metrics_are_what_their_names_say():
+    success = [True, False, True, True, False, False, True, True]
+    summary = fake(success).summary()
+    assert summary["success"]["rate"] == summary["success"]["count"] / summary["success"]["of"] == 5 / 8
+    assert summary["success"]["low"] < 5 / 8 < summary["success"]["high"]
+    assert summary["collision"]["rate"] == pytest.approx(3 / 8)
+    assert summary["unreachable"]["rate"] == 0.0
+    assert summary["success_by_band"] == {
+        band: {**summary["success_by_band"][band], "rate": rate, "of": 2}
+        for band, rate in zip(BANDS, (0.5, 0.0, 1.0, 1.0), strict=True)
+    }
+    assert (summary["jerk_ratio"], summary["duration"], summary["path_length"]) == (2.0, 0.8, 0.5)
+    assert summary["spl"] == pytest.approx(5 / 8 * 0.4 / 0.5)
+    assert summary["min_clearance"] == pytest.approx(0.0)
+    assert summary["decision_time"] == pytest.approx(0.002)
+    assert summary["decision_time_98"] == pytest.approx(0.00296)
+
+
+def test_without_a_success_there_are_no_figures_of_successes():
+    summary = fake([False] * 4, decision_times=np.array([0.5])).summary()
+    assert summary["jerk_ratio"] is summary["duration"] is summary["decision_time_98"] is None
+    assert summary["spl"] == 0.0
+    assert summary["decision_time"] == 0.5
+    assert fake([True] * 4, band=np.full(4, -1)).summary()["success_by_band"] == {}
+
+
+class Interrupted(Given):
+    def decide(self, observation, scenes):
+        if len(self.goals) == 2:
+            raise KeyboardInterrupt
+        return super().decide(observation, scenes)
+
+
+def test_an_interrupted_evaluation_keeps_what_is_done(small_scenes):
+    zeros = np.zeros(small_scenes.solution.shape)
+    methods = [Given("first", zeros), Interrupted("second", zeros), Given("third", zeros)]
+    evaluation = run(methods, small_scenes, batch=10)
+    assert evaluation.partial
+    assert [(r.name, len(r.success), r.partial) for r in evaluation.results] == [
+        ("first", 40, False),
+        ("second", 20, True),
+    ]
+    record = json.loads(json.dumps(evaluation.as_json(), allow_nan=False))
+    assert record["methods"]["second"]["scenes"] == 20
+    at_once = run([Interrupted("x", zeros)], small_scenes.take(slice(0, 0 + 30)), batch=10)
+    assert at_once.results[0].partial
+
+
+def test_an_evaluation_interrupted_before_its_first_scene_can_be_written(small_scenes):
+    class AtOnce:
+        name = "at once"
+
+        def decide(self, observation, scenes):
+            raise KeyboardInterrupt
+
+    record = json.loads(json.dumps(run([AtOnce()], small_scenes).as_json(), allow_nan=False))
+    assert record["partial"] is True
+    assert record["methods"]["at once"]["success"]["rate"] is None
+
+
+def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes, monkeypatch):
+    import viapoint.training.evaluate as module
+
+    class Timed(Given):
+        cost = 0.001
+
+        def decide(self, observation, scenes):
+            clock["now"] += self.cost * len(scenes.goal)
+            self.goals.append(scenes.goal)
+            return np.zeros((len(scenes.goal), 3))
+
+    clock = {"now": 0.0}
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock["now"])
+    zeros = np.zeros(small_scenes.solution.shape)
+    quick, slow = Timed("quick", zeros), Timed("slow", zeros)
+    slow.cost = 2.0 * SLOW_DECISION
+    results = run([quick, slow], small_scenes, time_decisions=True).results
+    assert results[0].decision_times == pytest.approx(np.full(39, 0.001))
+    assert results[1].decision_times == pytest.approx([slow.cost])
+    assert [len(goals) for goals in quick.goals] == [40, *[1] * 40]
+
+
+def test_comparisons_are_with_the_first(small_scenes):
+    zeros = np.zeros(small_scenes.solution.shape)
+    record = run([Given("straight", zeros), Certified(small_scenes)], small_scenes).as_json()
+    comparison = record["compared_with_first"]["planner (stored)"]
+    solved = int((small_scenes.share > 0).sum())
+    assert (comparison["only_first"], comparison["only_second"]) == (solved, 0)
+    assert comparison["p_value"] == pytest.approx(2.0 * 0.5**solved)
+    assert set(record["outcomes"]) == {"straight", "planner (stored)"}
+    assert len(record["outcomes"]["straight"]["action"]) == 40
+
+
+def test_unknown_methods_and_none_are_refused(small_scenes):
+    with pytest.raises(ValueError, match="straight, constant, random"):
+        make_method("magic", ENV)
+    with pytest.raises(ValueError, match="at least one method"):
+        run([], small_scenes)
