@@ -91,9 +91,9 @@ def minimum_jerk_coefficients(
     """
     names = ("x0", "dx0", "ddx0", "xT", "dxT", "ddxT", "T")
     xp, arrays = as_floats(**dict(zip(names, (x0, dx0, ddx0, xT, dxT, ddxT, T), strict=True)))
+    require(xp, arrays[-1] > 0, "T", arrays[-1], "must be positive")
     shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(names, arrays, strict=True)})
     x0, dx0, ddx0, xT, dxT, ddxT, T = (broadcast_to(xp, a, shape)[..., None] for a in arrays)
-    require(xp, T > 0, "T", T[..., 0], "must be positive")
     movement = point_to_point(
         x0,
         xT,

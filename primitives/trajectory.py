@@ -264,7 +264,7 @@ class Trajectory:
 
 
 def _whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
-    orders = (nu,) if isinstance(nu, int | np.integer) else tuple(nu)
+    orders = tuple(nu) if isinstance(nu, Sequence | np.ndarray) else (nu,)
     if not orders or any(not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 0 for n in orders):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
     return tuple(int(order) for order in orders)

@@ -11,7 +11,7 @@ mpmath.mp.dps = 40
 
 
 class Reference:
-    """The minimum-jerk movement of one axis, rest to rest, by dense elimination in 40 digits: states, then segments."""
+    """The minimum-jerk movement of one axis, rest to rest, by dense elimination in 40 digits."""
 
     def __init__(self, points, durations):
         self.x = [mpmath.mpf(float(x)) for x in points]
@@ -113,13 +113,15 @@ def test_passage_times_agree_with_40_digits():
         x, y = mpmath.mpf(float(x)), mpmath.mpf(float(y))
         a, b, c = x, mpmath.mpf(1), x * x + y * y
         polynomial = [c, -2 * c, 0, -8 * a, 34 * a, -36 * a, 12 * a - 20 * b, 40 * b, -27 * b, 6 * b]
-        root = mpmath.findroot(lambda t, p=polynomial: mpmath.polyval(p[::-1], t), mpmath.mpf(float(found[0])))
+        root = mpmath.findroot(
+            lambda t, p=polynomial: mpmath.polyval(p[::-1], t), mpmath.mpf(float(found[0]))
+        )
         smaller = min(root, 1 - root)
         assert abs(found.min() - smaller) <= 1e-12 * smaller
 
 
 def test_the_primers_own_example():
-    """Its Matlab code, with T = 2: coefficients a such that x_t = sum_k a_k t^(k-1) meets all six conditions."""
+    """Its Matlab code, with T = 2: x_t = sum_k a_k t^(k-1) meets all six conditions."""
     state = {"x0": 0.3, "dx0": -1.0, "ddx0": 2.0, "xT": 1.5, "dxT": 0.5, "ddxT": -3.0}
     duration = 2.0
     a = minimum_jerk_coefficients(**state, T=duration)

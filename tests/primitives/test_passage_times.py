@@ -124,3 +124,47 @@ def test_single_precision_is_accurate():
     single = passage_durations(waypoints, 1.0)
     assert single.dtype == np.float32
     np.testing.assert_allclose(single, passage_durations(waypoints.astype(float), 1.0), rtol=2e-7)
+
+
+@pytest.mark.parametrize("goal_velocity", ["given", FREE])
+@pytest.mark.parametrize("goal_acceleration", [None, FREE])
+@pytest.mark.parametrize("pace", [0.3, 3.0, 10.0])
+def test_one_via_point_with_moving_ends_is_passed_at_the_global_minimum(
+    goal_velocity, goal_acceleration, pace
+):
+    count = 150
+    waypoints = RNG.normal(size=(count, 3, 2))
+    ends = {
+        "start_velocity": pace * RNG.normal(size=(count, 2)),
+        "start_acceleration": pace * RNG.normal(size=(count, 2)),
+    }
+    given = pace * RNG.normal(size=(count, 2)) if isinstance(goal_velocity, str) else goal_velocity
+    ends |= {"goal_velocity": given, "goal_acceleration": goal_acceleration}
+    cost = through(waypoints, passage_durations(waypoints, 1.0, **ends), **ends).cost()
+    for t in np.linspace(0.005, 0.995, 100):
+        anywhere = through(waypoints, np.tile([t, 1 - t], (count, 1)), **ends).cost()
+        assert (cost <= anywhere * (1 + 1e-9)).all()
+
+
+def test_of_three_minima_the_lowest_is_found():
+    waypoints = np.array([[0.0, 0.0], [0.807, 0.752], [1.0, 0.0]])
+    ends = {"start_velocity": np.array([8.83, 6.31]), "goal_velocity": np.array([1.49, -15.13])}
+    np.testing.assert_allclose(passage_durations(waypoints, 1.0, **ends)[0], 0.1065, atol=5e-5)
+
+
+@pytest.mark.parametrize("vias", [2, 3, 5, 20])
+def test_the_movement_backwards_has_the_same_passage_times(vias):
+    waypoints = RNG.normal(size=(60, vias + 2, 2))
+    there = passage_durations(waypoints, 1.0)
+    back = passage_durations(waypoints[:, ::-1], 1.0)[:, ::-1]
+    assert (np.abs(there - back) / there.min(axis=-1, keepdims=True)).max() < 1e-9
+
+
+def test_what_does_not_converge_is_flagged():
+    """Two via-points a ten-thousandth apart: their passage times all but merge."""
+    waypoints = RNG.normal(size=(300, 4, 2))
+    waypoints[:, 2] = waypoints[:, 1] + 1e-7 * RNG.normal(size=(300, 2))
+    with pytest.warns(RuntimeWarning, match="did not converge"):
+        durations = passage_durations(waypoints, 1.0)
+    assert (durations > 0).all()
+    np.testing.assert_allclose(durations.sum(axis=-1), 1.0, rtol=1e-12)

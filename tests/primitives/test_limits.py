@@ -1,0 +1,105 @@
+"""Exact extremes, and the shortest duration within limits."""
+
+import numpy as np
+import pytest
+
+from viapoint.primitives import minimum_duration, passage_durations, point_to_point, through
+
+RNG = np.random.default_rng(60)
+
+
+def movements(count=25, vias=2, order=3):
+    waypoints = RNG.normal(size=(count, vias + 2, 2))
+    durations = RNG.uniform(0.2, 1.0, (count, vias + 1))
+    return through(waypoints, durations, start_velocity=RNG.normal(size=(count, 2)), order=order)
+
+
+def test_peaks_of_the_straight_reach_are_the_closed_forms():
+    reach = point_to_point([0.0, 0.0], [3.0, 4.0], 2.0)
+    amplitude, duration = 5.0, 2.0
+    np.testing.assert_allclose(reach.peak(1), 1.875 * amplitude / duration, rtol=1e-14)
+    np.testing.assert_allclose(reach.peak(2), 10 / np.sqrt(3) * amplitude / duration**2, rtol=1e-14)
+    np.testing.assert_allclose(reach.peak(3), 60 * amplitude / duration**3, rtol=1e-14)
+    assert reach.peak(6) == 0
+    np.testing.assert_allclose(reach.extrema(1).maximum_time, [1.0, 1.0], rtol=1e-7)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("nu", [0, 1, 2, 3])
+def test_no_sample_exceeds_the_extremes_and_dense_samples_reach_them(nu, order):
+    trajectory = movements(order=order)
+    values = trajectory.sample(5001, nu)[0]
+    norm = np.linalg.norm(values, axis=-1).max(axis=1)
+    peak = trajectory.peak(nu)
+    assert (norm <= peak * (1 + 1e-9)).all()
+    np.testing.assert_allclose(norm, peak, rtol=2e-3)
+    extrema = trajectory.extrema(nu)
+    size = np.abs(values).max(axis=(1, 2))[:, None]
+    assert (values.max(axis=1) <= extrema.maximum + 1e-9 * size).all()
+    assert (values.min(axis=1) >= extrema.minimum - 1e-9 * size).all()
+    np.testing.assert_allclose(values.max(axis=1) / size, extrema.maximum / size, atol=2e-3)
+    if nu < 2 * order - 2:  # continuous: the value is reached at the time given
+        for d in range(2):
+            at = trajectory(extrema.minimum_time[:, d, None], nu)[:, 0, d]
+            np.testing.assert_allclose(at, extrema.minimum[:, d], atol=1e-9 * size.max())
+
+
+def test_extremes_of_a_batch_are_those_of_each_item_bit_for_bit():
+    trajectory = movements(8)
+    waypoints = np.moveaxis(trajectory(trajectory.knots), 0, 0)
+    batch = through(waypoints, np.diff(trajectory.knots, axis=-1))
+    peaks, extrema = batch.peak(1), batch.extrema(2)
+    for i in range(8):
+        alone = through(waypoints[i], np.diff(trajectory.knots[i]))
+        assert alone.peak(1) == peaks[i]
+        np.testing.assert_array_equal(alone.extrema(2).maximum, extrema.maximum[i])
+
+
+def test_a_dropped_via_point_does_not_count_as_standing_still():
+    trajectory = through([[0.0], [0.0], [1.0]], [0.0, 1.0], start_velocity=[2.0], goal_velocity=[3.0])
+    assert trajectory.extrema(1).minimum > -10
+    plain = point_to_point([0.0], [1.0], 1.0, start_velocity=[2.0], goal_velocity=[3.0])
+    np.testing.assert_allclose(trajectory.extrema(1).minimum, plain.extrema(1).minimum)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"velocity": 0.7},
+        {"acceleration": np.array([3.0, 2.0])},
+        {"velocity": np.full((25, 1), 0.4), "acceleration": 5.0, "jerk": np.array([9.0, 30.0])},
+    ],
+)
+def test_the_performance_limited_movement_touches_a_limit_and_exceeds_none(limits):
+    trajectory = movements()
+    limited = trajectory.stretched(minimum_duration(trajectory, **limits))
+    ratios = []
+    for nu, name in enumerate(("velocity", "acceleration", "jerk"), start=1):
+        if name not in limits:
+            continue
+        limit = np.asarray(limits[name])
+        if limit.ndim == 0 or limit.shape[-1] == 1:
+            ratios.append(limited.peak(nu) / (limit[..., 0] if limit.ndim else limit))
+        else:
+            extrema = limited.extrema(nu)
+            ratios.append((np.maximum(-extrema.minimum, extrema.maximum) / limit).max(axis=-1))
+    np.testing.assert_allclose(np.max(ratios, axis=0), 1.0, rtol=1e-12)
+
+
+def test_limits_do_not_depend_on_the_pace_that_was_chosen_first():
+    waypoints = RNG.normal(size=(5, 3, 2))
+    slow, fast = (through(waypoints, passage_durations(waypoints, t)) for t in (0.1, 30.0))
+    limits = {"velocity": 1.0, "jerk": 40.0}
+    np.testing.assert_allclose(minimum_duration(slow, **limits), minimum_duration(fast, **limits), rtol=1e-11)
+
+
+def test_bad_limits_are_named():
+    trajectory = movements()
+    for limits, name in (
+        ({}, "at least one"),
+        ({"velocity": -1.0}, "velocity"),
+        ({"jerk": [1.0, 2.0, 3.0]}, "jerk"),
+        ({"acceleration": np.inf}, "acceleration"),
+    ):
+        with pytest.raises(ValueError, match=name):
+            minimum_duration(trajectory, **limits)

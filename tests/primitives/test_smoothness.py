@@ -1,0 +1,124 @@
+"""Measures of smoothness: closed forms, invariances, and what the paper says about speed and curvature."""
+
+import numpy as np
+import pytest
+
+from viapoint.primitives import (
+    curvature,
+    dimensionless_jerk,
+    log_dimensionless_jerk,
+    passage_durations,
+    point_to_point,
+    spectral_arc_length,
+    speed,
+    speed_peaks,
+    speed_valleys,
+    through,
+)
+
+RNG = np.random.default_rng(70)
+MEASURES = [dimensionless_jerk, log_dimensionless_jerk, spectral_arc_length]
+
+
+def via_movement(along, across, duration=1.0):
+    """From (0, 0) to (1, 0) by way of (along, across)."""
+    waypoints = np.array([[0.0, 0.0], [along, across], [1.0, 0.0]])
+    return through(waypoints, passage_durations(waypoints, duration))
+
+
+@pytest.mark.parametrize("duration", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("order", [3])
+def test_the_straight_reach_has_its_closed_forms(duration, order):
+    reach = point_to_point([0.0, 0.0], [0.3, 0.4], duration, order=order)
+    np.testing.assert_allclose(reach.energy(3), 720 * 0.25 / duration**5, rtol=1e-13)
+    np.testing.assert_allclose(reach.cost(), 360 * 0.25 / duration**5, rtol=1e-13)
+    np.testing.assert_allclose(dimensionless_jerk(reach), 204.8, rtol=1e-12)
+    np.testing.assert_allclose(log_dimensionless_jerk(reach), -5.3220, atol=5e-5)
+    np.testing.assert_allclose(spectral_arc_length(reach), -1.4024, atol=5e-5)
+
+
+@pytest.mark.parametrize("measure", MEASURES, ids=lambda f: f.__name__)
+def test_measures_do_not_depend_on_place_size_or_orientation(measure):
+    waypoints = RNG.normal(size=(6, 4, 2))
+    movement = through(waypoints, passage_durations(waypoints, 1.0))
+    rotation = np.array([[0.6, -0.8], [0.8, 0.6]])
+    elsewhere = movement.transformed(rotation, np.array([5.0, 6.0]), 3.0)
+    np.testing.assert_allclose(measure(elsewhere), measure(movement), rtol=1e-9)
+
+
+@pytest.mark.parametrize("measure", [dimensionless_jerk, log_dimensionless_jerk])
+def test_jerk_measures_do_not_depend_on_duration(measure):
+    waypoints = RNG.normal(size=(6, 4, 2))
+    movement = through(waypoints, passage_durations(waypoints, 1.0))
+    np.testing.assert_allclose(measure(movement.stretched(7.0)), measure(movement), rtol=1e-11)
+
+
+def test_detours_are_less_smooth():
+    reach = point_to_point([0.0, 0.0], [1.0, 0.0], 1.0)
+    detour = via_movement(0.2, 0.6)
+    for measure in (log_dimensionless_jerk, spectral_arc_length):
+        assert measure(detour) < measure(reach)
+
+
+def test_curvature_is_that_of_the_path():
+    movement = via_movement(0.3, 0.4)
+    time = np.linspace(0.2, 0.8, 7)
+    step = 1e-5
+    heading = [np.arctan2(*movement(time + s, 1).T[::-1]) for s in (-step, step)]
+    turning = (heading[1] - heading[0]) / (2 * step)
+    np.testing.assert_allclose(curvature(movement, time), turning / speed(movement, time), rtol=1e-6)
+
+
+def test_signed_curvature_changes_sign_in_the_mirror_and_space_has_its_size():
+    movement = via_movement(0.3, 0.4)
+    time = np.linspace(0.1, 0.9, 9)
+    mirrored = movement.transformed(np.diag([1.0, -1.0]))
+    np.testing.assert_allclose(curvature(mirrored, time), -curvature(movement, time), rtol=1e-12)
+    lifted = movement.transformed(RNG.normal(size=(3, 2)) @ np.zeros((2, 2)) + np.eye(3)[:, :2])
+    np.testing.assert_allclose(curvature(lifted, time), np.abs(curvature(movement, time)), rtol=1e-12)
+    with pytest.raises(ValueError, match="dimension"):
+        curvature(movement.transformed(np.ones((1, 2))), time)
+
+
+def test_curvature_is_undefined_at_rest():
+    assert np.isnan(curvature(via_movement(0.5, 0.3), [0.0])).all()
+
+
+@pytest.mark.parametrize(("height", "valleys"), [(0.28, 0), (9 / 32 - 1e-4, 0), (9 / 32 + 1e-4, 1), (1.0, 1)])
+def test_a_symmetric_via_point_makes_a_speed_valley_beyond_nine_thirty_seconds(height, valleys):
+    movement = via_movement(0.5, height)
+    found = speed_valleys(movement)
+    assert found.time.shape == (valleys,)
+    assert speed_peaks(movement).time.shape == (valleys + 1,)
+    np.testing.assert_allclose(found.time, 0.5, atol=1e-9)
+
+
+def test_valley_curvature_peak_and_passage_are_three_instants_in_general():
+    movement = via_movement(0.28125, 0.5)
+    valley = speed_valleys(movement)
+    np.testing.assert_allclose(valley.time, [0.43793], atol=5e-6)
+    np.testing.assert_allclose(movement.knots[1], 0.45437, atol=5e-6)
+    time = np.linspace(0.4, 0.5, 100001)
+    bend = np.abs(curvature(movement, time))
+    np.testing.assert_allclose(time[np.argmax(bend)], 0.44866, atol=5e-6)
+
+
+def test_speed_events_are_local_extremes_and_pad_with_nan():
+    waypoints = RNG.normal(size=(12, 5, 2))
+    waypoints[0] = np.linspace([0, 0], [1, 1], 5)
+    movement = through(waypoints, passage_durations(waypoints, 2.0))
+    for events, sign in ((speed_valleys(movement), 1), (speed_peaks(movement), -1)):
+        exists = ~np.isnan(events.time)
+        assert exists[1:].any()
+        time = np.where(exists, events.time, 1.0)
+        for shift in (-1e-4, 1e-4):
+            nearby = speed(movement, time + shift)
+            assert (sign * (nearby - events.speed)[exists] > -1e-12).all()
+    assert np.isnan(speed_valleys(movement).time[0]).all()
+    assert (~np.isnan(speed_peaks(movement).time[0])).sum() == 1
+
+
+def test_standing_still_has_no_measure():
+    still = point_to_point([1.0, 1.0], [1.0, 1.0], 1.0)
+    assert np.isnan(dimensionless_jerk(still))
+    assert speed_valleys(still).time.shape == (0,)
