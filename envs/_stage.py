@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -84,6 +85,8 @@ class Stage:
         mujoco.mjv_updateScene(
             self.model, self._data, self._option, None, self._camera, everything, self.scene
         )  # fmt: skip
+        for geom in self._shown(self.model.geom("table").id):
+            geom.castshadow = False  # it has none to throw them on, and would speckle itself
 
     def _geoms_of_links(self) -> list[int]:
         """The geoms of the moving bodies but the hand, in order; hides the obstacles' own geoms."""
@@ -114,9 +117,13 @@ class Stage:
 
     def _paint(self, part: int, colour: Colour) -> None:
         """Give one geom of the model a colour."""
-        for geom in self.scene.geoms[: self.scene.ngeom]:
-            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid == part:
-                geom.rgba = np.array((*colour, 1.0), dtype=np.float32)
+        for geom in self._shown(part):
+            geom.rgba = np.array((*colour, 1.0), dtype=np.float32)
+
+    def _shown(self, number: int) -> list[Any]:
+        """A geom of the model as it stands in the scene."""
+        geoms = self.scene.geoms[: self.scene.ngeom]
+        return [g for g in geoms if g.objtype == mujoco.mjtObj.mjOBJ_GEOM and g.objid == number]
 
     def _draw_fittings(self, pencil: Pencil) -> None:
         """The base and the joints of a planar arm, and the handle where the hand is below the links."""
