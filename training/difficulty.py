@@ -40,13 +40,15 @@ def planned_share(trial: Trial, scenes: Scenes, *, seed: int = 0, draws: int = 2
 
 def _count(trial: Trial, scenes: Scenes, draws: Float) -> NDArray[np.int64]:
     """How many of the draws solve each scene, shape (N,)."""
-    solved = np.zeros(len(scenes.start), dtype=np.int64)
-    for i in range(0, len(draws), 64):
-        some = draws[i : i + 64]
-        rows = np.repeat(np.arange(len(solved)), len(some))
-        actions = np.tile(some, (len(solved), 1))
+    number = len(scenes.start)
+    open_rows, open_actions = [], []
+    for some in np.split(draws, range(64, len(draws), 64)):
+        rows, actions = np.repeat(np.arange(number), len(some)), np.tile(some, (number, 1))
         open_ = ~screen(trial.task, scenes.take(rows), actions).fails
-        if open_.any():
-            success = trial(scenes.take(rows[open_]), actions[open_]).success
-            np.add.at(solved, rows[open_], success)
-    return solved
+        open_rows.append(rows[open_])
+        open_actions.append(actions[open_])
+    rows, actions = np.concatenate(open_rows), np.concatenate(open_actions)
+    if not len(rows):
+        return np.zeros(number, dtype=np.int64)
+    success = trial(scenes.take(rows), actions).success
+    return np.bincount(rows[success], minlength=number)

@@ -27,12 +27,22 @@ class Trials(NamedTuple):
 
 
 class Trial:
-    """Simulates actions in given scenes, `num_envs` at a time."""
+    """Simulates actions in given scenes, `num_envs` at a time.
+
+    Args:
+        env_id: Of a registered environment.
+        num_envs: Simulated together at most.
+        **kwargs: Of the environment.
+    """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
         self.env_id = env_id
-        self._env: ReachVectorEnv = gym.make_vec(env_id, num_envs=num_envs, **kwargs)  # type: ignore[assignment]
-        self.task = self._env.task
+        sizes = {num_envs, min(num_envs, 64)}
+        self._envs: dict[int, ReachVectorEnv] = {
+            size: gym.make_vec(env_id, num_envs=size, **kwargs)  # type: ignore[misc]
+            for size in sorted(sizes)
+        }
+        self.task = self._envs[num_envs].task
         self._capacity = num_envs
 
     def observe(self, scenes: Scenes) -> dict[str, NDArray[np.float32]]:
@@ -41,7 +51,7 @@ class Trial:
         return self.task.observation.observe(joints, scenes.start, scenes)
 
     def __call__(self, scenes: Scenes, actions: Float) -> Trials:
-        """Simulate one action in each of N scenes."""
+        """Simulate one action in each of N scenes, one or more."""
         pieces = [
             self._some(scenes.take(slice(i, i + self._capacity)), actions[i : i + self._capacity])
             for i in range(0, len(actions), self._capacity)
@@ -50,15 +60,18 @@ class Trial:
         return Trials(np.concatenate([piece.reward for piece in pieces]), info)
 
     def _some(self, scenes: Scenes, actions: Float) -> Trials:
-        """As many as there are environments at most; the others repeat the first."""
+        """As many as there are environments at most; those left over repeat the first."""
         number = len(actions)
-        self._env.reset(options=_filled(scenes, self._capacity).as_options())
-        _, reward, info = self._env.decide(np.concatenate((actions, np.tile(actions[:1], (self._capacity - number, 1)))))
+        size = next(size for size in self._envs if size >= number)
+        env = self._envs[size]
+        env.reset(options=_filled(scenes, size).as_options())
+        _, reward, info = env.decide(np.concatenate((actions, np.tile(actions[:1], (size - number, 1)))))
         return Trials(reward[:number], {name: value[:number] for name, value in info.items()})
 
     def close(self) -> None:
-        """Let the environment go."""
-        self._env.close()
+        """Let the environments go."""
+        for env in self._envs.values():
+            env.close()
 
 
 def _filled(scenes: Scenes, number: int) -> Scenes:

@@ -1,0 +1,113 @@
+"""Laws of the arms."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from viapoint.envs.arms import ADULT, ARMS
+from viapoint.envs.scenes import TARGETS
+from viapoint.envs.simulator import Simulator
+from viapoint.primitives import point_to_point
+
+
+@pytest.fixture(params=sorted(ARMS))
+def arm(request):
+    return ARMS[request.param]
+
+
+def postures(arm, number=500, seed=0):
+    low, high = np.array(arm.joint_range).T
+    return np.random.default_rng(seed).uniform(low + 0.05, high - 0.05, (number, len(low)))
+
+
+def test_posture_inverts_hand(arm):
+    joints = postures(arm)
+    np.testing.assert_allclose(arm.posture(arm.hand(joints)), joints, atol=1e-9)
+
+
+def test_kinematics_agree_with_mujoco(arm):
+    model = arm.compile(0, whole_arm=True)
+    data = mujoco.MjData(model)
+    for joints in postures(arm, 20):
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(data.site("hand").xpos[: arm.dimension], arm.hand(joints), atol=1e-12)
+        np.testing.assert_allclose(arm.links(joints)[-1, 1], arm.hand(joints), atol=1e-12)
+
+
+def test_links_hang_together_and_have_their_lengths(arm):
+    links = arm.links(postures(arm))
+    np.testing.assert_allclose(links[:, 1:, 0], links[:, :-1, 1], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(links[:, :, 1] - links[:, :, 0], axis=-1), np.tile(arm.lengths, (500, 1)), atol=1e-12
+    )
+
+
+def test_reach_margin_is_positive_exactly_where_a_posture_gets_there():
+    """Inside the ranges of the joints it is positive, just beyond each of their limits negative."""
+    low, high = np.array(ADULT.joint_range).T
+    assert (ADULT.reach_margin(ADULT.hand(postures(ADULT))) > 0.0).all()
+    middle = 0.5 * (low + high)
+    for joint in range(2):
+        for limit, step in ((low, -0.02), (high, 0.02)):
+            beyond = middle.copy()
+            beyond[joint] = limit[joint] + step
+            assert ADULT.reach_margin(ADULT.hand(beyond)) < 0.0 or joint == 1
+    far = ADULT.hand(np.array([middle[0], low[1]]))
+    near = ADULT.hand(np.array([middle[0], high[1]]))
+    assert ADULT.reach_margin(1.001 * far) < 0.0 < ADULT.reach_margin(0.999 * far)
+    assert ADULT.reach_margin(0.999 * near) < 0.0 < ADULT.reach_margin(1.001 * near)
+
+
+def test_controls_are_the_inverse_dynamics_of_mujoco():
+    """On the reference itself the servo is silent and the torque that of mj_inverse."""
+    model = ADULT.compile(0, whole_arm=False)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        goal, start = (ADULT.hand(postures(ADULT, 1, int(rng.integers(1 << 30)))[0]) for _ in range(2))
+        time = np.array([0.37])
+        path = point_to_point(start, goal, np.asarray(0.9))
+        position, velocity, acceleration = (path(time, nu) for nu in range(3))
+        if ADULT.reach_margin(position) < 0.02:
+            continue
+        step = 1e-4
+        around = ADULT.posture(path(time + step * np.array([-1.0, 0.0, 1.0])))
+        data.qpos[:], data.qvel[:] = around[1], (around[2] - around[0]) / (2 * step)
+        data.qacc[:] = (around[2] - 2 * around[1] + around[0]) / step**2
+        mujoco.mj_inverse(model, data)
+        control = ADULT.controls(position, velocity, acceleration)[0]
+        torque = control - ADULT.stiffness * data.qpos - ADULT.damping * data.qvel
+        np.testing.assert_allclose(torque, data.qfrc_inverse, rtol=1e-4, atol=1e-3)
+
+
+def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
+    targets = {name: np.array(place) for name, place in TARGETS.items()}
+    simulator = Simulator(ADULT, n_obstacles=0, whole_arm=False, num_envs=1, threads=1)
+    none = np.zeros((1, 0, 5)), np.zeros((1, 0), dtype=bool)
+    for first, second in (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T3", "T6")):
+        start, goal = targets[first], targets[second]
+        path = point_to_point(start, start + 0.4 * (goal - start) / np.linalg.norm(goal - start), np.asarray(0.8))
+        times = simulator.timestep * np.arange(451)
+        position, velocity, acceleration = (path(times, nu) for nu in range(3))
+        simulator.place(np.array([0]), ADULT.posture(start)[None], *none)
+        record = simulator.rollout(
+            np.array([0]), ADULT.controls(position[:-1], velocity[:-1], acceleration[:-1])[None]
+        )
+        error = np.linalg.norm(ADULT.hand(record.joints[0]) - position[1:], axis=-1)
+        assert np.sqrt((error**2).mean()) < 2e-3
+        assert error[-1] < 1e-4
+
+
+def test_torch_and_numpy_give_the_same(arm):
+    hand = arm.hand(postures(arm, 50))
+    for function in (arm.posture, arm.reach_margin, lambda h: arm.links(arm.posture(h)), lambda h: arm.controls(h, h, h)):
+        np.testing.assert_allclose(function(torch.as_tensor(hand)).numpy(), function(hand), atol=1e-9)
+
+
+def test_the_targets_are_in_reach_and_the_diagonals_cross_in_the_middle():
+    places = {name: np.array(place) for name, place in TARGETS.items()}
+    assert all(ADULT.reach_margin(place) > 0.02 for place in places.values())
+    middles = [0.5 * (places[a] + places[b]) for a, b in (("T1", "T4"), ("T2", "T5"), ("T3", "T6"))]
+    np.testing.assert_allclose(middles, [middles[0]] * 3, atol=1e-12)

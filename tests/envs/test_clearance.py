@@ -1,0 +1,90 @@
+"""Clearance is exact, and it is what MuJoCo's contacts say."""
+
+import numpy as np
+import pytest
+import torch
+
+from viapoint.envs.arms import ADULT
+from viapoint.envs.clearance import FAR, arm_clearance, clearance_profile, hand_clearance, segment_distance_squared
+from viapoint.envs.simulator import Simulator
+
+
+def rows(dimension, shape, seed=0):
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform(-0.5, 0.5, (*shape, dimension))
+    axis = rng.uniform(-0.12, 0.12, (*shape, dimension)) * (rng.random((*shape, 1)) < 0.6)
+    return np.concatenate((centre, axis, rng.uniform(0.006, 0.04, (*shape, 1))), axis=-1)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_segment_distance_is_the_least_of_all_point_distances(dimension):
+    rng = np.random.default_rng(1)
+    obstacles = rows(dimension, (200, 1))
+    first, second = rng.uniform(-0.5, 0.5, (2, 200, 1, dimension))
+    exact = np.sqrt(segment_distance_squared(first, second, obstacles))[:, 0, 0]
+    s = np.linspace(0.0, 1.0, 301)
+    on_link = first + s[:, None] * (second - first)
+    centre, axis = obstacles[..., :dimension], obstacles[..., dimension : 2 * dimension]
+    on_axis = centre + (2.0 * s[:, None] - 1.0) * axis
+    brute = np.linalg.norm(on_link[:, :, None] - on_axis[:, None], axis=-1).min(axis=(1, 2))
+    assert (exact <= brute + 1e-12).all()
+    np.testing.assert_allclose(exact, brute, atol=3e-3)
+
+
+def test_parallel_and_degenerate_segments():
+    link = np.array([[[0.0, 0.0]]]), np.array([[[1.0, 0.0]]])
+    obstacles = np.array([[[0.5, 0.2, 0.1, 0.0, 0.01], [2.0, 0.0, 0.3, 0.0, 0.01], [0.5, 0.0, 0.0, 0.0, 0.01]]])
+    np.testing.assert_allclose(np.sqrt(segment_distance_squared(*link, obstacles))[0, :, 0], [0.2, 0.7, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("whole_arm", [False, True])
+def test_contact_exactly_where_clearance_is_negative(whole_arm):
+    number = 3000
+    rng = np.random.default_rng(2)
+    joints = np.stack((rng.uniform(-0.4, 2.4, number), rng.uniform(0.2, 2.4, number)), axis=-1)
+    obstacles, present = rows(2, (number, 3)), rng.random((number, 3)) < 0.8
+    obstacles[..., 1] += 0.25
+    simulator = Simulator(ADULT, n_obstacles=3, whole_arm=whole_arm, num_envs=number, threads=2)
+    simulator.place(np.arange(number), joints, obstacles, present)
+    contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 2))).contact[:, 0]
+    clearance = hand_clearance(ADULT.hand(joints)[:, None], ADULT.hand_radius, obstacles, present)
+    if whole_arm:
+        links = ADULT.links(joints)[:, None]
+        clearance = np.minimum(clearance, arm_clearance(links, ADULT.link_radii, obstacles, present))
+    np.testing.assert_array_equal(contact, clearance.min(axis=-1) < 0.0)
+    assert 0.01 < contact.mean() < 0.5
+
+
+def test_the_profile_has_the_clearance_as_its_least_value():
+    rng = np.random.default_rng(3)
+    joints = np.cumsum(rng.uniform(-0.05, 0.05, (10, 40, 2)), axis=1) + 1.0
+    obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
+    hand, links = ADULT.hand(joints), ADULT.links(joints)
+    profile = clearance_profile(hand, ADULT.hand_radius, obstacles, present, links, ADULT.link_radii)
+    least = np.minimum(
+        hand_clearance(hand, ADULT.hand_radius, obstacles, present),
+        arm_clearance(links, ADULT.link_radii, obstacles, present),
+    )
+    np.testing.assert_allclose(profile.min(axis=-1), least.min(axis=-1), atol=1e-12)
+
+
+def test_absent_obstacles_are_far_and_order_is_irrelevant():
+    rng = np.random.default_rng(4)
+    points, obstacles = rng.uniform(-0.5, 0.5, (5, 30, 2)), rows(2, (5, 4))
+    nothing = hand_clearance(points, 0.015, obstacles, np.zeros((5, 4), dtype=bool))
+    np.testing.assert_array_equal(nothing, FAR)
+    there = np.ones((5, 4), dtype=bool)
+    forwards = hand_clearance(points, 0.015, obstacles, there)
+    np.testing.assert_array_equal(hand_clearance(points, 0.015, obstacles[:, ::-1], there), forwards[:, ::-1])
+
+
+def test_torch_gives_the_same_and_finite_gradients_even_inside_an_obstacle():
+    points = np.random.default_rng(5).uniform(-0.5, 0.5, (5, 30, 2))
+    obstacles = rows(2, (5, 4))
+    points[:, 0] = obstacles[:, 0, :2]  # on an axis, where the distance has a kink
+    there = np.ones((5, 4), dtype=bool)
+    tensor = torch.as_tensor(points).requires_grad_()
+    profile = clearance_profile(tensor, 0.015, torch.as_tensor(obstacles), torch.as_tensor(there))
+    np.testing.assert_allclose(profile.detach().numpy(), clearance_profile(points, 0.015, obstacles, there), atol=1e-9)
+    profile.sum().backward()
+    assert torch.isfinite(tensor.grad).all()
