@@ -81,7 +81,8 @@ class ViaVecEnv(VecEnv):
         self._reset_seeds()
         self._batched_options = None
         self._returns[:], self._lengths[:] = 0.0, 0
-        return _fresh(observation)
+        started: Observation = observation
+        return started
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Remember the actions, shape (N, m)."""
@@ -104,7 +105,7 @@ class ViaVecEnv(VecEnv):
         rows = np.flatnonzero(done)
         if rows.size:
             self._close_episodes(rows, infos, info, truncated & ~terminated)
-        return _fresh(observation), np.asarray(reward, dtype=np.float32), done, infos
+        return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def _close_episodes(
         self,
@@ -182,10 +183,3 @@ class ViaVecEnv(VecEnv):
     def _rows(self, indices: Any) -> list[int]:
         chosen: Iterable[int] = self._get_indices(indices)
         return list(chosen)
-
-
-def _fresh(observation: Any) -> Observation:
-    """A copy: the environment may reuse its arrays, SB3 keeps the last observation."""
-    if isinstance(observation, Mapping):
-        return {name: np.array(part) for name, part in observation.items()}
-    return np.array(observation)
