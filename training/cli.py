@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
-        _leave(_one_line(error), 2)
+        _leave(_one_line(error), getattr(error, "exit_code", 2))
 
 
 def parse(words: Sequence[str]) -> Any:

@@ -20,7 +20,7 @@ from viapoint.training.config import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import load
-from viapoint.training.runs import find_model, load_model
+from viapoint.training.runs import Run, find_model, load_model
 
 
 class Agent(NamedTuple):
@@ -69,6 +69,9 @@ def pretrained_folder(env_id: str) -> Path:
 
 def train(config: TrainConfig) -> None:
     """Train, and say where everything is."""
+    if config.resume:
+        run = Run(config.folder)
+        print(f"going on with {run.config.algo} on {run.config.env} after {run.decisions} decisions")
     run = training.train(config)
     last = run.curve[-1] if run.curve else None
     reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
@@ -83,13 +86,20 @@ def evaluate(config: EvaluateConfig) -> None:
         raise ValueError("without an agent, --env must say which environment is meant")
     env_kwargs = agent.env_kwargs if agent else {}
     frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))
-    methods = [_method(name, agent, config.candidates, env_id, env_kwargs) for name in config.methods]
+    methods: list[Method] = []
+    for name in config.methods:
+        if name != "agent":
+            methods.append(make_method(name, env_id, **env_kwargs))
+        elif agent:
+            methods += [agent.method(count) for count in sorted({0, config.candidates})]
     with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
         result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()
     report.show(record)
     if result.partial:
         print("interrupted: the results are partial", file=sys.stderr)
+    if config.run is not None and (config.run / "config.json").is_file():
+        print(f"kept as {Run(config.run).write_evaluation(Path(config.scenes).stem, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
@@ -106,9 +116,9 @@ def play(config: PlayConfig) -> None:
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     method = agent.method(config.candidates)
     config.video.parent.mkdir(parents=True, exist_ok=True)
-    note = film(config.video, env, scenes.take(rows), method.decide)
+    film(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()
-    print(f"{len(rows)} movements: {note or config.video}")
+    print(f"{len(rows)} movements: {config.video}")
 
 
 def spread(number: int, count: int) -> Any:
@@ -126,12 +136,3 @@ def progress_bar(methods: Sequence[Method], scenes: int) -> Iterator[Callable[[s
             bar.update(done - (bar.n % total))
 
         yield progress
-
-
-def _method(
-    name: str, agent: Agent | None, candidates: int, env_id: str, env_kwargs: dict[str, Any]
-) -> Method:
-    if name == "agent":
-        assert agent is not None
-        return agent.method(candidates)
-    return make_method(name, env_id, **env_kwargs)

@@ -120,7 +120,7 @@ class EvaluateConfig:
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
     """agent, straight, constant, random, random16, random80, planner."""
     candidates: int = 0
-    """Actions that the agent's critic ranks at each decision; 0 is the policy alone."""
+    """If not 0, the agent gets a second row, in which its critic ranks so many actions at each decision."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int | None = None

@@ -65,7 +65,11 @@ def run(config: DemoConfig) -> None:
     pictures: dict[str, Callable[[Path], Any]] = {
         "learning_curve.png": lambda path: plots.learning_curve(path, {"agent": trained.curve}),
         "success_by_band.png": lambda path: plots.success_by_band(path, record),
-        "gallery.png": lambda path: gallery(path, entries(agent, frozen, PICTURES)),
+        "gallery.png": lambda path: gallery(
+            path,
+            entries(agent, frozen, PICTURES),
+            heading=f"The agent alone in {frozen.name} scenes, easy to hard",
+        ),
         "movements.mp4": lambda path: _film(path, agent, frozen),
     }
     for name, draw in pictures.items():

@@ -32,6 +32,9 @@ LOGGED = ("collision", "min_clearance", "jerk_ratio", "duration", "reachable")
 class TrainingStoppedError(Exception):
     """Training was stopped by Ctrl-C after its state was saved."""
 
+    exit_code = 130
+    """As shells count an end by Ctrl-C."""
+
 
 class Monitor(BaseCallback):
     """Validates, keeps the best model, writes checkpoints, logs, and shows progress.
@@ -122,8 +125,8 @@ class Monitor(BaseCallback):
             self._keep()
             self.run.save("final", self.model)
             raise TrainingStoppedError(
-                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, "
-                "and the same command with --resume goes on"
+                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
+                "goes on from there (viapoint train --resume, or viapoint demo again)"
             )
 
     def _on_training_end(self) -> None:

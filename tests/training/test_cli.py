@@ -116,7 +116,8 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == ENV
     run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4)
-    assert "ranks" in capsys.readouterr().out
+    kept = json.loads((trained / "evaluations" / "test.json").read_text())
+    assert list(kept["methods"]) == ["agent", "agent, ranks 8"]
 
 
 def test_a_second_training_in_the_folder_is_refused(trained, capsys):
