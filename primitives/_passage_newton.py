@@ -33,12 +33,14 @@ def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, An
         better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
         pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
         best = Minima(*(np.where(better, new, old) for new, old in pairs))
-    h = _softmax(best.z)
+    lost = ~np.isfinite(best.z).all(axis=0)
+    h = np.where(lost, 1.0 / len(best.z), _softmax(np.where(lost, 0.0, best.z)))
     hard = np.flatnonzero(~best.converged | (h.min(axis=0) < _SHORT))
     if hard.size:
         refined = _from_start(cost.refined(hard), h[:, hard].astype(np.longdouble))
-        h[:, hard] = _softmax(refined.z)
-        best.converged[hard] = refined.converged
+        good = np.isfinite(refined.z).all(axis=0)
+        h[:, hard[good]] = _softmax(refined.z[:, good])
+        best.converged[hard] = refined.converged & good
     return np.ascontiguousarray(h.T), best.converged
 
 
@@ -96,7 +98,7 @@ def _starts(steps: Floats, several: bool) -> list[Floats]:
     for d in range(1, steps.shape[1]):
         square = square + steps[:, d] * steps[:, d]
     chord = np.cbrt(np.sqrt(square))
-    starts = [chord / chord.max(axis=0)]
+    starts = [np.maximum(chord / chord.max(axis=0), 1e-3)]
     if several:
         segments, count = chord.shape
         starts.append(np.ones_like(chord))

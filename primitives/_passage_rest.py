@@ -48,6 +48,10 @@ _FLOATS = _Functions(
 )
 
 
+_SHORTEST = 1e-50
+"""Least fraction that a via-point apart from its neighbour may get: a higher power of it must not underflow."""
+
+
 def fractions_at_rest(points: Any) -> Any:
     """Fractions of the duration before and after the via-point.
 
@@ -63,8 +67,9 @@ def fractions_at_rest(points: Any) -> Any:
     else:
         rows, math_functions = np.ascontiguousarray(points.transpose(1, 2, 0)), _ARRAYS
     start, via, goal = rows
-    a, b, c, is_late = _invariants(start, via, goal, math_functions)
+    a, b, c, is_late, apart = _invariants(start, via, goal, math_functions)
     smaller = _root(a, b, c, math_functions)
+    smaller = math_functions.where(apart & (smaller < _SHORTEST), _SHORTEST, smaller)
     larger = 1.0 - smaller
     before = math_functions.where(is_late, larger, smaller)
     after = math_functions.where(is_late, smaller, larger)
@@ -74,14 +79,23 @@ def fractions_at_rest(points: Any) -> Any:
 def _invariants(
     start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: _Functions
 ) -> tuple[Number, ...]:
-    """Return a, b, c as seen from the nearer end point, and whether that is the goal."""
+    """Return a, b, c as seen from the nearer end, whether that is the goal, and whether the via-point is apart."""
     first = [x1 - x0 for x0, x1 in zip(start, via, strict=True)]
     second = [x1 - x0 for x0, x1 in zip(via, goal, strict=True)]
     whole = [x1 - x0 for x0, x1 in zip(start, goal, strict=True)]
     c_first, c_second = dot(first, first), dot(second, second)
     is_late = c_second < c_first
     a = f.where(is_late, dot(second, whole), dot(first, whole))
-    return a, dot(whole, whole), f.where(is_late, c_second, c_first), is_late
+    apart = f.where(is_late, _longest(second, f), _longest(first, f)) > 0
+    return a, dot(whole, whole), f.where(is_late, c_second, c_first), is_late, apart
+
+
+def _longest(vector: Sequence[Number], f: _Functions) -> Number:
+    """Return the largest component, which unlike a square does not underflow."""
+    largest = abs(vector[0])
+    for component in vector[1:]:
+        largest = f.where(abs(component) > largest, abs(component), largest)
+    return largest
 
 
 def dot(x: Sequence[Number], y: Sequence[Number]) -> Number:

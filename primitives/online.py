@@ -67,25 +67,34 @@ def retarget(
     xp, (time, goal, arrival, via, *ends, _) = as_floats(
         time=time, goal=goal, arrival=arrival, via=via, **named, coefficients=trajectory.coefficients
     )
-    require_vectors("goal", goal, trajectory.dimension)
-    shapes = {"trajectory": trajectory.batch_shape, "time": tuple(time.shape), "goal": tuple(goal.shape[:-1])}
-    shapes["arrival"] = tuple(arrival.shape)
-    if via is not None:
-        require_vectors("via", via, trajectory.dimension)
-        shapes["via"] = tuple(via.shape[:-1])
-    given = check_boundary_shapes(dict(zip(named, ends, strict=True)), trajectory.dimension)
-    batch = broadcast_batch(**shapes, **given)
+    targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
+    batch = _common_batch(trajectory, time, arrival, targets, via)
     time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
     end = broadcast_to(xp, trajectory.duration, batch)
     require(xp, time >= 0, "time", time, "must not be negative")
     require(xp, time < end, "time", time, "must lie before the end of the movement")
-    targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
     if freeze > 0:
         frozen = end - time < freeze
         arrival = xp.where(frozen, end, arrival)
         targets, via = _keep_old_target(trajectory, frozen, targets, via, xp)
     require(xp, arrival > time, "arrival", arrival, "must lie after time")
     return _plan(trajectory, time, arrival - time, targets, via, batch, xp)
+
+
+def _common_batch(
+    trajectory: Trajectory, time: Array, arrival: Array, targets: dict[str, Any], via: Array | None
+) -> tuple[int, ...]:
+    """Return the common leading shape, or raise ValueError naming what is wrong."""
+    require_vectors("goal", targets["goal"], trajectory.dimension)
+    shapes = {
+        "trajectory": trajectory.batch_shape,
+        "time": tuple(time.shape),
+        "arrival": tuple(arrival.shape),
+    }
+    if via is not None:
+        require_vectors("via", via, trajectory.dimension)
+        shapes["via"] = tuple(via.shape[:-1])
+    return broadcast_batch(**shapes, **check_boundary_shapes(targets, trajectory.dimension))
 
 
 def _plan(

@@ -113,10 +113,22 @@ def _fractions(points: Any, ends: list[Any]) -> Any:
     return result
 
 
+def _scaled(points: Any, ends: list[Any]) -> tuple[Any, list[Any]]:
+    """Bring each movement to a size of about 1, by a power of two: exact, and no square under- or overflows."""
+    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
+    for value in ends:
+        if isinstance(value, np.ndarray):
+            size = np.maximum(size, np.abs(value).max(axis=1))
+    exponent = -np.frexp(size)[1]
+    scaled = [np.ldexp(v, exponent[:, None]) if isinstance(v, np.ndarray) else v for v in ends]
+    return np.ldexp(points, exponent[:, None, None]), scaled
+
+
 def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     """(N, S) fractions where neighbouring waypoints differ."""
     if points.shape[1] == 2:
         return np.ones((len(points), 1))
+    points, ends = _scaled(points, ends)
     if points.shape[1] == 3:
         return fractions_moving(points, ends) if moving else fractions_at_rest(points)
     rows = [

@@ -92,17 +92,22 @@ def test_shapes_fit_or_are_named(points, times):
             through(np.ones(points), np.ones(times))
 
 
-@FEW
+@pytest.mark.filterwarnings("ignore:passage times:RuntimeWarning")
+@settings(max_examples=150, deadline=None)
 @given(
-    hnp.arrays(float, (3, 2), elements=st.floats(-1e6, 1e6)),
+    st.integers(3, 5).flatmap(lambda n: hnp.arrays(float, (n, 2), elements=st.floats(-1e6, 1e6))),
     st.floats(1e-3, 1e3),
+    st.booleans(),
 )
-def test_any_finite_waypoints_give_finite_durations_that_add_up(waypoints, duration):
-    durations = passage_durations(waypoints, duration)
+def test_any_finite_waypoints_give_a_finite_movement(waypoints, duration, moving):
+    ends = {"start_velocity": np.ones(2)} if moving else {}
+    durations = passage_durations(waypoints, duration, **ends)
     assert (durations >= 0).all()
     np.testing.assert_allclose(durations.sum(), duration, rtol=1e-14)
-    if (durations > 0).all():
-        assert np.isfinite(through(waypoints, durations).coefficients).all()
+    assert ((durations > 0) == (np.diff(waypoints, axis=0) != 0).any(axis=1))[:-1].all()
+    movement = through(waypoints, durations, **ends)
+    assert np.isfinite(movement.coefficients).all()
+    assert np.isfinite(movement.sample(9)).all()
 
 
 @FEW
