@@ -64,6 +64,8 @@ class ActionLayout:
         if self.timing not in get_args(Timing):
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
         check_increasing_pair("duration_range", self.duration_range)
+        low, high = self.duration_range
+        object.__setattr__(self, "duration_range", (float(low), float(high)))
 
     @property
     def size(self) -> int:
@@ -137,7 +139,9 @@ class ActionLayout:
         components = []
         for k in range(self.n_via):
             offset = waypoints[..., k + 1, :] - (start + line * ((k + 1) / (self.n_via + 1)))
-            components += [xp.sum(offset * a, axis=-1) / s for a, s in zip(frame(line), self.via_scale, strict=False)]
+            components += [
+                xp.sum(offset * a, axis=-1) / s for a, s in zip(frame(line), self.via_scale, strict=False)
+            ]
         total = xp.sum(durations, axis=-1)
         components.append(xp.log(total / self.centre_duration) / self._log_half_range)
         if self.timing == "learned":

@@ -7,11 +7,9 @@ batched over leading dimensions and accept NumPy arrays and torch tensors.
 
 from __future__ import annotations
 
-from typing import Any
-
 from array_api_compat import array_namespace
 
-Array = Any
+from viapoint.envs._arrays import Array, clamp
 
 FAR = 1.0
 """Clearance is reported up to this distance, [m]: also where there is no obstacle."""
@@ -60,7 +58,7 @@ def clearance_profile(
     hand_radius: float,
     obstacles: Array,
     present: Array,
-    links: Array | None = None,
+    links: Array = None,
     link_radii: tuple[float, ...] = (),
 ) -> Array:
     """Clearance from the nearest obstacle at each time, for the hand and, where given, the links.
@@ -101,7 +99,7 @@ def point_distance_squared(points: Array, obstacles: Array) -> Array:
     axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
     square = sum(a * a for a in axis)
     along = sum(o * a for o, a in zip(offset, axis, strict=True)) / xp.where(square > _TINY, square, 1.0)
-    along = xp.clip(along, -1.0, 1.0)
+    along = clamp(along, -1.0, 1.0)
     rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
     return sum(r * r for r in rest)
 
@@ -132,10 +130,12 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> A
     c, f = _dot(link, gap), _dot(axis, gap)
     e = xp.where(e > _TINY, e, xp.full_like(e, _TINY))
     determinant = a * e - b * b
-    crossing = (b * f - c * e) / xp.where(determinant > _TINY * a * e, determinant, xp.full_like(determinant, 1.0))
-    on_link = xp.clip(xp.where(determinant > _TINY * a * e, crossing, xp.zeros_like(crossing)), 0.0, 1.0)
-    on_axis = xp.clip((b * on_link + f) / e, 0.0, 1.0)
-    on_link = xp.clip((b * on_axis - c) / a, 0.0, 1.0)
+    crossing = (b * f - c * e) / xp.where(
+        determinant > _TINY * a * e, determinant, xp.full_like(determinant, 1.0)
+    )
+    on_link = clamp(xp.where(determinant > _TINY * a * e, crossing, xp.zeros_like(crossing)), 0.0, 1.0)
+    on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
+    on_link = clamp((b * on_axis - c) / a, 0.0, 1.0)
     rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
     return _dot(rest, rest)
 
@@ -147,4 +147,4 @@ def _dot(first: list[Array], second: list[Array]) -> Array:
 def _clearance(squared: Array, radii: Array, present: Array) -> Array:
     xp = array_namespace(squared)
     distance = xp.sqrt(squared + 1e-24) - radii
-    return xp.where(present, xp.clip(distance, None, FAR), xp.full_like(distance, FAR))
+    return xp.where(present, xp.minimum(distance, FAR), xp.full_like(distance, FAR))

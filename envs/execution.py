@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
-from viapoint.envs.clearance import FAR
 from viapoint.envs.outcome import Outcome, blank, least_clearance, measure, norm, refused
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record, Simulator
@@ -22,7 +21,7 @@ R = TypeVar("R")
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
 LOOK_EVERY = 4
-"""The clearance of the plan is taken at every fourth physics step: it shapes the reward, contact decides."""
+"""Clearance and reach of the plan are looked at every fourth physics step, which is every few millimetres."""
 GROUP = 64
 """Movements carried out together: few enough for the cache, many enough for the threads."""
 
@@ -94,7 +93,7 @@ class Executor:
 
     def final_joints(self, scenes: Scenes) -> Float:
         """Where the arms ended, shape (N, J), [rad]."""
-        joints = np.array(self.arm.posture(scenes.start))
+        joints = np.asarray(self.arm.posture(scenes.start))
         for group, record in zip(self._groups, self._records, strict=True):
             if record is not None:
                 run = group.reachable
@@ -114,9 +113,11 @@ class Executor:
             joints, contact = record.joints[ran, :steps].copy(), record.contact[ran, :steps].copy()
         hand = np.asarray(self.arm.hand(joints))
         each = Scenes(*(np.repeat(field, steps, axis=0) for field in scene))
-        clearance = least_clearance(self.arm, joints[:, None], hand[:, None], each, whole_arm=self.whole_arm)
-        time = self.simulator.timestep * np.arange(1, steps + 1)
-        return Rollout(time, group.planned[row, :steps].copy(), joints, hand, contact, clearance)
+        clearance = least_clearance(
+            self.arm, hand[:, None], each, whole_arm=self.whole_arm, joints=joints[:, None]
+        )
+        time = np.arange(1, steps + 1) * float(self.simulator.timestep)
+        return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
 
     def close(self) -> None:
         """Let the threads go."""
@@ -132,21 +133,22 @@ class Executor:
             self._pool = ThreadPoolExecutor(self._threads or None, thread_name_prefix="viapoint")
         return list(self._pool.map(function, items))
 
-    def _refer(self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]) -> References:
+    def _refer(
+        self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]
+    ) -> References:
         """References at the physics rate, and the controls that follow them, for one group."""
         trajectory = plan.take(sims).trajectory()
         time = self.simulator.timestep * np.arange(steps[sims].max() + 1)
-        position, velocity, acceleration = (trajectory(time, nu) for nu in (0, 1, 2))
-        looked_at = position[:, ::LOOK_EVERY]
-        joints = self.arm.posture(looked_at)
+        position, velocity, acceleration = trajectory.sample(time)
+        seen = position[:, ::LOOK_EVERY]
         return References(
             sims=sims,
             steps=steps[sims],
             planned=position[:, 1:],
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
-            reachable=(self.arm.reach_margin(position) >= 0.0).all(axis=-1),
+            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1),
             jerk_cost=np.asarray(trajectory.cost()),
-            clearance=least_clearance(self.arm, joints, looked_at, scenes.take(sims), whole_arm=self.whole_arm),
+            clearance=least_clearance(self.arm, seen, scenes.take(sims), whole_arm=self.whole_arm),
         )
 
     def _simulate(self, group: References) -> Record | None:
@@ -157,17 +159,25 @@ class Executor:
         """The outcome of one group, but for duration and jerk ratio."""
         group, record = self._groups[index], self._records[index]
         scene, run = scenes.take(group.sims), group.reachable
-        outcome = refused(scene, self.arm, whole_arm=self.whole_arm)
-        if record is not None:
-            done = measure(
-                record,
-                group.steps[run],
-                group.planned[run],
-                scene.take(run),
-                self.arm,
-                whole_arm=self.whole_arm,
-                timestep=self.simulator.timestep,
-            )
+        if run.all():
+            outcome = self._measured(group, record, scene)
+        else:
+            outcome = refused(scene, self.arm, whole_arm=self.whole_arm)
+            done = self._measured(group, record, scene.take(run)) if record is not None else blank(0)
             for mine, theirs in zip(outcome, done, strict=True):
                 mine[run] = theirs
         return outcome._replace(jerk_cost=group.jerk_cost, planned_clearance=group.clearance)
+
+    def _measured(self, group: References, record: Record | None, scene: Scenes) -> Outcome:
+        """The outcome of those that ran."""
+        assert record is not None
+        run = slice(None) if group.reachable.all() else group.reachable
+        return measure(
+            record,
+            group.steps[run],
+            group.planned[run],
+            scene,
+            self.arm,
+            whole_arm=self.whole_arm,
+            timestep=self.simulator.timestep,
+        )

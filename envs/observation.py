@@ -77,7 +77,7 @@ class ObservationLayout:
     ) -> dict[str, NDArray[np.float32]]:
         """Observations of N environments, shape (N, .) each, in fresh arrays."""
         low, high = (np.array(side) for side in zip(*self.joint_range, strict=True))
-        parts = {
+        parts: dict[str, Any] = {
             "hand": np.clip(hand, -FARTHEST, FARTHEST),
             "goal": scenes.goal,
             "joints": np.clip(joints, low - BEYOND_LIMIT, high + BEYOND_LIMIT),

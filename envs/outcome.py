@@ -57,7 +57,14 @@ class Outcome(NamedTuple):
 
 
 def measure(
-    record: Record, steps: NDArray[np.int64], planned: Float, scenes: Scenes, arm: Arm, *, whole_arm: bool, timestep: float
+    record: Record,
+    steps: NDArray[np.int64],
+    planned: Float,
+    scenes: Scenes,
+    arm: Arm,
+    *,
+    whole_arm: bool,
+    timestep: float,
 ) -> Outcome:
     """The outcome of n movements that were carried out, all but what the plan alone decides.
 
@@ -81,14 +88,14 @@ def measure(
     low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
     within = (joints.min(axis=1) >= low - LIMIT_TOLERANCE) & (joints.max(axis=1) <= high + LIMIT_TOLERANCE)
     goal_error = norm(hand[last] - scenes.goal)
-    collision = contact.any(axis=-1)
+    collision: Any = contact.any(axis=-1)
     at_rest = moved[last] < REST_SPEED * timestep
     arrived = at_rest & (goal_error < GOAL_TOLERANCE)
     return blank(len(steps))._replace(
         is_success=arrived & ~collision & ~record.unstable & within.all(axis=-1),
         collision=collision,
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
-        min_clearance=least_clearance(arm, joints, hand, scenes, whole_arm=whole_arm),
+        min_clearance=least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints),
         goal_error=goal_error,
         path_length=_sum_in_order(moved),
         peak_speed=moved.max(axis=-1) / timestep,
@@ -100,9 +107,8 @@ def measure(
 
 def refused(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
     """The outcome of plans out of the arm's reach: it stays at rest at the start."""
-    joints = np.asarray(arm.posture(scenes.start))[:, None]
-    return blank(len(joints))._replace(
-        min_clearance=least_clearance(arm, joints, scenes.start[:, None], scenes, whole_arm=whole_arm),
+    return blank(len(scenes.start))._replace(
+        min_clearance=least_clearance(arm, scenes.start[:, None], scenes, whole_arm=whole_arm),
         goal_error=norm(scenes.goal - scenes.start),
     )
 
@@ -115,22 +121,25 @@ def blank(number: int) -> Outcome:
     return Outcome(**{**fields, "first_contact_time": np.full(number, -1.0)})
 
 
-def least_clearance(arm: Arm, joints: Float, hand: Float, scenes: Scenes, *, whole_arm: bool) -> Float:
+def least_clearance(
+    arm: Arm, hand: Float, scenes: Scenes, *, whole_arm: bool, joints: Float | None = None
+) -> Float:
     """Least clearance over time and obstacles, shape (N,), [m].
 
     Args:
         arm: That moves.
-        joints: Shape (N, T, J), [rad].
-        hand: Its positions there, shape (N, T, D), [m].
+        hand: Positions, shape (N, T, D), [m].
         scenes: N of them.
         whole_arm: Whether the links count.
+        joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
     """
     if not scenes.obstacles.shape[1]:
-        return np.full(len(joints), FAR)
+        return np.full(len(hand), FAR)
     present = scenes.present
     each = hand_clearance(hand, arm.hand_radius, scenes.obstacles, present)
     if whole_arm:
-        each = np.minimum(each, arm_clearance(arm.links(joints), arm.link_radii, scenes.obstacles, present))
+        links = arm.links(arm.posture(hand) if joints is None else joints)
+        each = np.minimum(each, arm_clearance(links, arm.link_radii, scenes.obstacles, present))
     return np.asarray(each.min(axis=-1))
 
 

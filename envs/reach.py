@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -36,6 +36,9 @@ METADATA: dict[str, Any] = {
 }
 
 
+SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "autoreset_mode"}
+
+
 class Decision(NamedTuple):
     """What one decision of N environments led to."""
 
@@ -66,7 +69,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
     """
 
-    metadata: ClassVar[dict[str, Any]] = METADATA
+    metadata = METADATA
 
     def __init__(
         self,
@@ -97,7 +100,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             arm=arm,
             whole_arm=bool(whole_arm),
             action=ActionLayout(
-                dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=tuple(duration_range)
+                dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=duration_range
             ),
             weights=RewardWeights.of(reward_weights),
             scenes=SceneDistribution(n_obstacles=_fewest_and_most(n_obstacles)),
@@ -214,7 +217,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def render(self) -> Any:
         """The last movement of each environment as the render mode says; before the first, the scenes."""
-        frames = tuple(self._render_one(sim) for sim in range(self.num_envs if self.render_mode != "human" else 1))
+        frames = tuple(
+            self._render_one(sim) for sim in range(self.num_envs if self.render_mode != "human" else 1)
+        )
         return None if self.render_mode in (None, "human") else frames
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -224,12 +229,18 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:
-            gym.logger.warn("render() does nothing without a render_mode; choose one of " + ", ".join(METADATA["render_modes"]))
+            gym.logger.warn(
+                "render() does nothing without a render_mode; choose one of "
+                + ", ".join(METADATA["render_modes"])
+            )
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
+            assert self.scenes is not None
             return self._renderer.still(sim, self.scenes.take([sim]))
         scenes, plan, _ = self._last
-        return self._renderer.movement(sim, scenes.take([sim]), plan.take([sim]), self._executor.rollout(sim, scenes))
+        return self._renderer.movement(
+            sim, scenes.take([sim]), plan.take([sim]), self._executor.rollout(sim, scenes)
+        )
 
     def _seed(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None and self._generators:
@@ -270,7 +281,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self.scenes = scenes
         else:
             self.scenes.put(rows, scenes)
-        self._simulator.place(rows, np.asarray(self.arm.posture(scenes.start)), scenes.obstacles, scenes.present)
+        self._simulator.place(
+            rows, np.asarray(self.arm.posture(scenes.start)), scenes.obstacles, scenes.present
+        )
 
     def _observe_start(self) -> Observation:
         assert self.scenes is not None
@@ -284,18 +297,22 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         except (TypeError, ValueError):
             raise ValueError(f"action must be numbers of shape {shape}, got {actions!r}") from None
         if array.shape != shape:
-            raise ValueError(f"action must have shape {shape} ({', '.join(self.action_layout.names)}), got {array.shape}")
+            raise ValueError(
+                f"action must have shape {shape} ({', '.join(self.action_layout.names)}), got {array.shape}"
+            )
         if not np.isfinite(array).all():
             env, component = np.argwhere(~np.isfinite(array))[0]
             name = self.action_layout.names[component]
-            raise ValueError(f"action must be finite, got {array[env, component]} for {name} of environment {env}")
+            raise ValueError(
+                f"action must be finite, got {array[env, component]} for {name} of environment {env}"
+            )
         return np.clip(array, -1.0, 1.0)
 
 
 class ReachEnv(gym.Env[Any, Any], EzPickle):
     """A batch of one of :class:`ReachVectorEnv`, with the same keyword arguments."""
 
-    metadata: ClassVar[dict[str, Any]] = {k: v for k, v in METADATA.items() if k != "autoreset_mode"}
+    metadata = SINGLE_METADATA
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
         EzPickle.__init__(self, threads=threads, **kwargs)
@@ -382,12 +399,16 @@ def _fewest_and_most(n_obstacles: Any) -> tuple[int, int]:
         fewest, most = pair
         return _whole_number("n_obstacles", fewest, 0), _whole_number("n_obstacles", most, 0)
     except (TypeError, ValueError):
-        raise ValueError(f"n_obstacles must be a whole number or (fewest, most), got {n_obstacles!r}") from None
+        raise ValueError(
+            f"n_obstacles must be a whole number or (fewest, most), got {n_obstacles!r}"
+        ) from None
 
 
 def _refuse_unknown(unknown: Mapping[str, Any]) -> None:
     if unknown:
-        allowed = [name for name in ReachVectorEnv.__init__.__annotations__ if name not in ("unknown", "return")]
+        allowed = [
+            name for name in ReachVectorEnv.__init__.__annotations__ if name not in ("unknown", "return")
+        ]
         raise TypeError(
             f"unknown keyword argument {', '.join(map(repr, sorted(unknown)))}; allowed are {', '.join(allowed)}"
         )
@@ -398,7 +419,9 @@ def _masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
         return np.arange(num_envs)
     mask = np.asarray(mask)
     if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
-        raise ValueError(f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}")
+        raise ValueError(
+            f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}"
+        )
     if not running and not mask.all():
         raise ValueError("options['reset_mask'] must name every environment at the first reset")
     return np.flatnonzero(mask)

@@ -44,7 +44,9 @@ class RewardWeights:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
-                raise ValueError(f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}")
+                raise ValueError(
+                    f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}"
+                )
 
     @classmethod
     def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:
@@ -90,11 +92,11 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
         centre_duration: Duration of the zero action, [s].
         weights: Of the terms.
     """
-    relative = outcome.duration / centre_duration
+    relative: Any = outcome.duration / centre_duration
     log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
     return RewardTerms(
-        success=weights.success * outcome.is_success,
-        collision=-weights.collision * outcome.collision,
+        success=np.multiply(weights.success, outcome.is_success, dtype=np.float64),
+        collision=np.multiply(-weights.collision, outcome.collision, dtype=np.float64),
         clearance=weights.clearance * np.clip(outcome.planned_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
         goal_error=-weights.goal_error * np.minimum(outcome.goal_error / GOAL_ERROR_UNIT, 1.0),
         smoothness=-weights.smoothness * log_jerk,

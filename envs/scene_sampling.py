@@ -63,7 +63,7 @@ class SceneDistribution:
         fewest, most = self.n_obstacles
         if not 0 <= fewest <= most <= CANDIDATES // 2:
             raise ValueError(
-                f"n_obstacles must be (fewest, most) with 0 <= fewest <= most <= {CANDIDATES // 2}, got {self.n_obstacles}"
+                f"n_obstacles must be (fewest, most), 0 <= fewest <= most <= {CANDIDATES // 2}, got {self.n_obstacles}"
             )
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
@@ -100,7 +100,7 @@ class SceneSampler:
         )
         pending = np.arange(number)
         for _ in range(ATTEMPTS):
-            drawn = _Uniforms(np.stack([generators[i].random(self._size) for i in pending]))
+            drawn = _Uniforms(np.stack([generators[int(i)].random(self._size) for i in pending]))
             given = None if ends is None else (ends[0][pending], ends[1][pending])
             found, attempt = self._attempt(drawn, given)
             scenes.put(pending[found], attempt.take(found))
@@ -130,6 +130,7 @@ class SceneSampler:
     def _ends(self, u: _Uniforms, ends: tuple[Float, Float] | None) -> tuple[Float, Float, NDArray[np.bool_]]:
         """Starts and goals inside the workspace with the straight line between them inside the reach."""
         low, high = (np.array(corner) for corner in self.arm.workspace)
+        inside: Any
         start = low + (high - low) * np.stack([u.take(ENDS), u.take(ENDS)], axis=-1)
         angle = 2.0 * np.pi * u.take(ENDS)
         length = _between(self.distribution.distance, u.take(ENDS))
@@ -144,7 +145,7 @@ class SceneSampler:
         inside = ((goal >= low) & (goal <= high)).all(axis=-1)
         if ends is not None:
             inside |= ~np.isnan(ends[1]).any(axis=-1)[:, None]
-        good = inside & (margin > self.distribution.reach_margin)
+        good: Any = inside & (margin > self.distribution.reach_margin)
         first = good.argmax(axis=-1)
         rows = np.arange(len(first))
         return start[rows, first], goal[rows, first], good.any(axis=-1)
@@ -263,7 +264,7 @@ class _Uniforms:
 
 
 def _ways_round(layout: ActionLayout, distance: float) -> NDArray[np.float32]:
-    """Distance from the straight line of movements through one via-point, at 21 places along it, shape (21, ways), [m]."""
+    """How far movements through one via-point are from the straight line, at 21 places along it: (21, ways), [m]."""
     along, across = (g.ravel() for g in np.meshgrid((-0.7, 0.0, 0.7), np.linspace(-1.0, 1.0, WAYS)))
     action = np.zeros((len(along), layout.size))
     action[:, 0], action[:, 1] = along, across

@@ -74,7 +74,9 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
     Returns:
         The ordered pairs of targets, 0.3 m or more apart, and their scenes.
     """
-    pairs = [(a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3]
+    pairs = [
+        (a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3
+    ]
     start = np.array([TARGETS[a] for a, _ in pairs])
     goal = np.array([TARGETS[b] for _, b in pairs])
     along = (goal - start) / np.sqrt(((goal - start) ** 2).sum(-1, keepdims=True))
@@ -114,7 +116,9 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
                 f"({number}, n, {2 * arm.dimension + 1}) with n at most {rows}, got {given.shape}"
             )
         fields["obstacles"][:] = 0.0
-        fields["obstacles"][:, :count] = _broadcast("obstacles", given, (number, count, 2 * arm.dimension + 1))
+        fields["obstacles"][:, :count] = _broadcast(
+            "obstacles", given, (number, count, 2 * arm.dimension + 1)
+        )
     return Scenes(**fields)
 
 
@@ -125,13 +129,18 @@ def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
         ValueError: With the scene, the offender and what is allowed.
     """
     apart = np.sqrt(((scenes.goal - scenes.start) ** 2).sum(axis=-1))
-    _refuse(apart < SHORTEST, lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {SHORTEST} m is needed")
+    _refuse(
+        apart < SHORTEST,
+        lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {SHORTEST} m is needed",
+    )
     _check_sizes(scenes)
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
         margin = np.asarray(arm.reach_margin(point))
         _refuse(
             margin < 0.0,
-            lambda i, n=name, p=point, m=margin: f"{n} {_shown(p[i])} m is {-m[i]:.4f} m out of the arm's reach",
+            lambda i, n=name, p=point, m=margin: (
+                f"{n} {_shown(p[i])} m is {-m[i]:.4f} m out of the arm's reach"
+            ),
         )
         clearance = rest_clearance(scenes, point, arm, whole_arm=whole_arm)
         touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
@@ -145,12 +154,14 @@ def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
 
 
 def rest_clearance(scenes: Scenes, point: Float, arm: Arm, *, whole_arm: bool) -> Float:
-    """Clearance of the arm with its hand at rest at `point` (N, D) from each obstacle and one far away: (N, n + 1), [m]."""
+    """Clearance of the arm, its hand at rest at `point` (N, D), from n obstacles and one far away: (N, n + 1), [m]."""
     hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
     if whole_arm:
         links = arm.links(arm.posture(point))[:, None]
         hand = np.minimum(hand, arm_clearance(links, arm.link_radii, scenes.obstacles, scenes.present))
-    return np.concatenate((hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1)
+    return np.concatenate(
+        (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
+    )
 
 
 def _check_sizes(scenes: Scenes) -> None:
@@ -161,7 +172,10 @@ def _check_sizes(scenes: Scenes) -> None:
         (radius < 0.0, "has a negative radius"),
         (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
         (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
-        ((np.abs(scenes.obstacles[..., :dimension]) > 1.0).any(axis=-1), "has its centre over 1 m from the origin"),
+        (
+            (np.abs(scenes.obstacles[..., :dimension]) > 1.0).any(axis=-1),
+            "has its centre over 1 m from the origin",
+        ),
     ):
         _refuse(
             wrong.any(axis=-1),
@@ -176,13 +190,15 @@ def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> Float:
         array = np.asarray(value, dtype=np.float64)
         result = np.broadcast_to(array, shape)
     except (TypeError, ValueError):
-        raise ValueError(f"options[{name!r}] must have shape {shape} or {shape[1:]}, got {np.shape(value)}") from None
+        raise ValueError(
+            f"options[{name!r}] must have shape {shape} or {shape[1:]}, got {np.shape(value)}"
+        ) from None
     if not np.isfinite(array).all():
         raise ValueError(f"options[{name!r}] must be finite, got {array[~np.isfinite(array)][0]}")
     return result
 
 
-def _refuse(wrong: NDArray[np.bool_], reason: Any) -> None:
+def _refuse(wrong: Any, reason: Any) -> None:
     if wrong.any():
         first = int(wrong.argmax())
         raise ValueError(f"scene {first}: {reason(first)}")

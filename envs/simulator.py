@@ -50,7 +50,9 @@ class Simulator:
         """Length of a physics step, [s]."""
         return float(self.model.opt.timestep)
 
-    def place(self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]) -> None:
+    def place(
+        self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
+    ) -> None:
         """Put arms at rest and obstacles where they belong.
 
         Args:

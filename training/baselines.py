@@ -74,7 +74,7 @@ class RandomVias:
             return actions[:, 0]
         every = scenes.take(np.repeat(np.arange(number), self._count))
         reward = self._trial(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
-        return actions[np.arange(number), reward.argmax(axis=-1)]
+        return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
 class PlannerMethod:

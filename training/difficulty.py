@@ -35,7 +35,9 @@ def planned_share(trial: Trial, scenes: Scenes, *, seed: int = 0, draws: int = 2
     actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (draws, trial.task.action.size))
     number = len(scenes.start)
     every = scenes.take(np.repeat(np.arange(number), draws))
-    return np.asarray((screen(trial.task, every, np.tile(actions, (number, 1))).merit > 0.0).reshape(number, -1).mean(-1))
+    return np.asarray(
+        (screen(trial.task, every, np.tile(actions, (number, 1))).merit > 0.0).reshape(number, -1).mean(-1)
+    )
 
 
 def _count(trial: Trial, scenes: Scenes, draws: Float) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ functions of observation and action, differentiable through the primitives; what
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,7 +53,9 @@ class Foresight(NamedTuple):
 
     def vector(self) -> Tensor:
         """The features as a network likes them, of size one, shape (B, H, GEOMETRY + 1)."""
-        return torch.cat((_sized(self.clearance, self.reach_margin), 0.3 * self.log_jerk.unsqueeze(-1)), dim=-1)
+        return torch.cat(
+            (_sized(self.clearance, self.reach_margin), 0.3 * self.log_jerk.unsqueeze(-1)), dim=-1
+        )
 
 
 def scene_view(observation: Observation, task: Task) -> SceneView:
@@ -154,7 +156,7 @@ HEIGHT = (0.12, 0.28, 0.45, 0.62)
 
 def _turns(dimension: int) -> NDArray[np.float64]:
     """Directions sideways: left and right in the plane, eight all round in space."""
-    return np.array([0.0, np.pi]) if dimension == 2 else np.arange(8) * np.pi / 4.0
+    return np.linspace(0.0, 2.0 * np.pi, 2 if dimension == 2 else 8, endpoint=False)
 
 
 def _sized(clearance: Tensor, reach_margin: Tensor) -> Tensor:
@@ -163,7 +165,7 @@ def _sized(clearance: Tensor, reach_margin: Tensor) -> Tensor:
     return torch.cat(parts, dim=-1).clamp(-2.0, 2.0)
 
 
-def _clearance(observation: Observation, hand: Tensor, task: Task) -> Tensor:
+def _clearance(observation: Observation, hand: Tensor, task: Task) -> Any:
     if "obstacles" not in observation:
         return torch.full_like(hand[..., 0], 1.0)
     rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])

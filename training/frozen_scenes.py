@@ -94,7 +94,9 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
     """
     path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
     if not path.is_file():
-        raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s} ({path} is none)")
+        raise ValueError(
+            f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s} ({path} is none)"
+        )
     try:
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256")}

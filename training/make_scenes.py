@@ -44,7 +44,9 @@ def make(env_id: str, name: str, size: int | None = None) -> FrozenScenes:
     size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
     drawn = _draw(trial, np.random.default_rng(SEEDS[name]), size)
     pieces = []
-    for i in tqdm(range(0, len(drawn.start), 64), desc=f"{env_id} {name}", unit="x64 scenes", file=sys.stderr):
+    for i in tqdm(
+        range(0, len(drawn.start), 64), desc=f"{env_id} {name}", unit="x64 scenes", file=sys.stderr
+    ):
         scenes = drawn.take(slice(i, i + 64))
         share, planned = solution_share(trial, scenes, seed=SEEDS[name]), Planner(trial)(scenes)
         solved = planned.success & (share > 0.0)
@@ -83,7 +85,9 @@ def _balanced(share: NDArray[np.float64], size: int) -> NDArray[np.int64]:
 
 def main() -> None:
     """Make the sets named on the command line, or all, and say whether they are as they were."""
-    parser = argparse.ArgumentParser(description="Make the frozen scenes and compare their hashes with those shipped.")
+    parser = argparse.ArgumentParser(
+        description="Make the frozen scenes and compare their hashes with those shipped."
+    )
     parser.add_argument("--env", nargs="*", default=list(ENV_IDS), help="environment ids")
     parser.add_argument("--sets", nargs="*", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
     parser.add_argument("--out", type=Path, default=None, help="folder to write to instead of the package's")

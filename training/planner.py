@@ -80,7 +80,7 @@ class Planner:
         return found
 
     def _try(self, scenes: Scenes, rows: NDArray[np.int64], actions: Float, found: Planned) -> Float:
-        """Simulate a few actions in each of some scenes, keep what is better than what was found, return the rewards."""
+        """Simulate a few actions in each of some scenes and keep what is better than what was found."""
         count = actions.shape[1]
         every, flat = scenes.take(np.repeat(rows, count)), actions.reshape(-1, self._size)
         screened = screen(self._trial.task, every, flat)
@@ -88,13 +88,13 @@ class Planner:
         if not screened.fails.all():
             trials = self._trial(every.take(~screened.fails), flat[~screened.fails])
             rewards[~screened.fails], success[~screened.fails] = trials.reward, trials.success
-        rewards, success = rewards.reshape(-1, count), success.reshape(-1, count)
+        rewards = rewards.reshape(-1, count)
         best = rewards.argmax(axis=-1)
         each = np.arange(len(rows))
         better = rewards[each, best] > found.reward[rows]
         found.action[rows[better]] = actions[each, best][better]
         found.reward[rows[better]] = rewards[each, best][better]
-        found.success[rows[better]] = success[each, best][better]
+        found.success[rows[better]] = success.reshape(-1, count)[each, best][better]
         found.tried[rows] += count
         return rewards
 

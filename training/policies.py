@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gymnasium import spaces
@@ -55,7 +55,9 @@ class ViaActor(BaseModel):
     and right of an obstacle, wide and narrow are there from the start, and no gradient need cross an obstacle.
     """
 
-    def __init__(self, observation_space: spaces.Dict, action_space: spaces.Box, *, task: Task, width: int) -> None:
+    def __init__(
+        self, observation_space: spaces.Dict, action_space: spaces.Box, *, task: Task, width: int
+    ) -> None:
         super().__init__(observation_space, action_space)
         self.task, self.anchors = task, Anchors(task)
         self.encoder = SetEncoder(task.arm.dimension, width // 4)
@@ -80,7 +82,7 @@ class ViaActor(BaseModel):
         return actions[torch.arange(len(actions)), scores.argmax(dim=-1)]
 
     def _predict(self, observation: Observation, deterministic: bool = False) -> Tensor:
-        return self(observation)
+        return cast(Tensor, self(observation))
 
 
 class ViaCritic(BaseModel):
@@ -125,8 +127,8 @@ class ViaPolicy(TD3Policy):
             each decision; 0 takes the actor's own choice.
     """
 
-    actor: ViaActor
-    critic: ViaCritic
+    actor: ViaActor  # type: ignore[assignment]
+    critic: ViaCritic  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -145,15 +147,17 @@ class ViaPolicy(TD3Policy):
 
     def make_actor(self, features_extractor: Any = None) -> Any:
         """An actor for the task."""
-        return ViaActor(self.observation_space, self.action_space, task=self.task, width=self.width).to(self.device)
+        spaces_: Any = (self.observation_space, self.action_space)
+        return ViaActor(*spaces_, task=self.task, width=self.width).to(self.device)
 
     def make_critic(self, features_extractor: Any = None) -> Any:
         """A critic for the task."""
-        return ViaCritic(self.observation_space, self.action_space, task=self.task, width=self.width).to(self.device)
+        spaces_: Any = (self.observation_space, self.action_space)
+        return ViaCritic(*spaces_, task=self.task, width=self.width).to(self.device)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         if not self.candidates:
-            return self.actor(observation)
+            return cast(Tensor, self.actor(observation))
         return self.ranked(observation, self.candidates)
 
     def ranked(self, observation: Observation, candidates: int) -> Tensor:
@@ -171,5 +175,6 @@ class ViaPolicy(TD3Policy):
         return actions[rows[:, 0], (learned + known).argmax(dim=-1)]
 
     def _offsets(self, count: int) -> Tensor:
-        sobol = torch.quasirandom.SobolEngine(self.actor.size, scramble=True, seed=1).draw(count)
-        return 0.5 * (2.0 * sobol - 1.0) ** 3  # denser near the proposal
+        engine: Any = torch.quasirandom.SobolEngine
+        sobol = engine(self.actor.size, scramble=True, seed=1).draw(count)
+        return cast(Tensor, 0.5 * (2.0 * sobol - 1.0) ** 3)  # denser near the proposal

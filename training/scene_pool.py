@@ -28,7 +28,9 @@ class ScenePool:
         augment: Whether the companions enter.
     """
 
-    def __init__(self, task: Task, seed: int, *, fresh: int = 64, rounds: int = 64, augment: bool = True) -> None:
+    def __init__(
+        self, task: Task, seed: int, *, fresh: int = 64, rounds: int = 64, augment: bool = True
+    ) -> None:
         self._task, self._seed, self._fresh, self._rounds = task, seed, fresh, rounds
         self._augment = augment
         self._sampler = task.sampler()

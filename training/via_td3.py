@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.policies import ViaPolicy
+from viapoint.training.policies import ViaActor, ViaCritic, ViaPolicy
 from viapoint.training.scene_pool import ScenePool
 
 
@@ -46,6 +46,8 @@ class ViaTD3(TD3):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaPolicy": ViaPolicy}
     policy: ViaPolicy
+    actor: ViaActor  # type: ignore[assignment]
+    critic: ViaCritic  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -108,11 +110,11 @@ class ViaTD3(TD3):
     def _update_critic(self, batch_size: int) -> float:
         """Regress what the formulas leave of the reward."""
         assert self.replay_buffer is not None
-        batch = self.replay_buffer.sample(batch_size)
+        batch: Any = self.replay_buffer.sample(batch_size)
         learned, known = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
         loss = functional.smooth_l1_loss(learned, batch.rewards - known.detach(), beta=0.5)
         self.critic.optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), 10.0)
         self.critic.optimizer.step()
         return float(loss.item())
@@ -131,7 +133,7 @@ class ViaTD3(TD3):
         score_loss = functional.smooth_l1_loss(scores[looked_at], judgement.detach(), beta=0.5)
         loss = score_loss - judgement.mean()
         self.actor.optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), 10.0)
         self.actor.optimizer.step()
         return float(judgement[:, : self.promising].mean().item()), float(score_loss.item())
@@ -145,9 +147,9 @@ class ViaTD3(TD3):
             return uniform.numpy(), uniform.numpy()
         assert self._last_obs is not None
         with torch.no_grad():
-            observation, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+            observation, _ = self.policy.obs_to_tensor(self._last_obs)
             proposals, scores = self.actor.propose(observation)  # type: ignore[arg-type]
-            head = torch.distributions.Categorical(logits=scores / self.temperature).sample()
+            head = torch.multinomial(torch.softmax(scores / self.temperature, dim=-1), 1)[:, 0]
             chosen = proposals[torch.arange(n_envs), head]
             noisy = torch.clamp(chosen + self.noise * torch.randn_like(chosen), -1.0, 1.0)
             explore = torch.rand((n_envs, 1)) < self.explore_uniformly

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import mujoco
 
-Array = Any
-"""A NumPy array or a torch tensor; what comes in decides what goes out."""
+from viapoint.envs._arrays import Array
 
 
 class Arm(Protocol):
@@ -17,18 +16,29 @@ class Arm(Protocol):
     Positions are in the frame of the arm's base, which is the world's.
     """
 
-    name: str
-    dimension: int
-    """Spatial dimension D of the hand's movement: 2 or 3."""
-    hand_radius: float
-    """Radius of the sphere that is the hand, [m]."""
-    link_radii: tuple[float, ...]
-    """Radii of the L link capsules, [m]."""
-    joint_range: tuple[tuple[float, float], ...]
-    """Lowest and highest angle of each of the J joints, [rad]."""
+    @property
+    def name(self) -> str:
+        """A short name, unlike every other arm's."""
 
-    workspace: tuple[tuple[float, ...], tuple[float, ...]]
-    """Two opposite corners of the box in which movements start and end, [m]."""
+    @property
+    def dimension(self) -> int:
+        """Spatial dimension D of the hand's movement: 2 or 3."""
+
+    @property
+    def hand_radius(self) -> float:
+        """Radius of the sphere that is the hand, [m]."""
+
+    @property
+    def link_radii(self) -> tuple[float, ...]:
+        """Radii of the L link capsules, [m]."""
+
+    @property
+    def joint_range(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest angle of each of the J joints, [rad]."""
+
+    @property
+    def workspace(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Two opposite corners of the box in which movements start and end, [m]."""
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
         """The MuJoCo model of the arm with `n_obstacles` movable capsules.
@@ -49,4 +59,4 @@ class Arm(Protocol):
         """How far inside its reach the hand is, shape (...,), [m]; negative where no posture gets there."""
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Actuator controls, shape (..., U), that make the hand follow the references, each of shape (..., D)."""
+        """Actuator controls, shape (..., U), that make the hand follow references of shape (..., D) each."""

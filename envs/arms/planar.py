@@ -11,10 +11,7 @@ import mujoco
 import numpy as np
 from array_api_compat import array_namespace
 
-Array = Any
-
-
-
+from viapoint.envs._arrays import Array, clamp
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +80,9 @@ class PlanarArm:
     @functools.cached_property
     def damping(self) -> tuple[float, float]:
         """Of the joints' servo, critical together with the joints' viscosity, [N m s/rad]."""
-        return _pair(2.0 * k / self.bandwidth - v for k, v in zip(self.stiffness, self.viscosity, strict=True))
+        return _pair(
+            2.0 * k / self.bandwidth - v for k, v in zip(self.stiffness, self.viscosity, strict=True)
+        )
 
     @functools.cached_property
     def reach(self) -> tuple[float, float]:
@@ -111,7 +110,9 @@ class PlanarArm:
         xp = array_namespace(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
-        return xp.stack((l1 * xp.cos(upper) + l2 * xp.cos(both), l1 * xp.sin(upper) + l2 * xp.sin(both)), axis=-1)
+        return xp.stack(
+            (l1 * xp.cos(upper) + l2 * xp.cos(both), l1 * xp.sin(upper) + l2 * xp.sin(both)), axis=-1
+        )
 
     def links(self, joints: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
@@ -172,7 +173,7 @@ class PlanarArm:
         low, high = self.joint_range[1]
         x, y = hand[..., 0], hand[..., 1]
         cosine = (x * x + y * y - (l1**2 + l2**2)) * (0.5 / (l1 * l2))
-        cosine = xp.clip(cosine, float(np.cos(high)), float(np.cos(low)))
+        cosine = clamp(cosine, float(np.cos(high)), float(np.cos(low)))
         sine = xp.sqrt(1.0 - cosine * cosine)
         along, across = l1 + l2 * cosine, l2 * sine
         scale = 1.0 / (along * along + across * across)
@@ -181,7 +182,12 @@ class PlanarArm:
         return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
 
     def _rates(
-        self, hand: Array, upper_arm: tuple[Array, Array], forearm: tuple[Array, Array], sine: Array, rate: Array
+        self,
+        hand: Array,
+        upper_arm: tuple[Array, Array],
+        forearm: tuple[Array, Array],
+        sine: Array,
+        rate: Array,
     ) -> tuple[Array, Array]:
         """Joint rates that give the hand `rate`: the inverse of the Jacobian, applied."""
         l1, l2 = self.lengths
@@ -212,7 +218,9 @@ def _pair(values: Any) -> tuple[float, float]:
 
 
 def _read(model_file: str) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string((files("viapoint.envs") / "assets" / model_file).read_text(encoding="utf-8"))
+    return mujoco.MjSpec.from_string(
+        (files("viapoint.envs") / "assets" / model_file).read_text(encoding="utf-8")
+    )
 
 
 def _lower_into_plane(spec: mujoco.MjSpec) -> None:

@@ -8,7 +8,10 @@ from viapoint.envs.action import ActionLayout, frame
 from viapoint.primitives import point_to_point
 
 LAYOUTS = [
-    ActionLayout(dimension=d, n_via=k, timing=timing) for d in (2, 3) for k in (0, 1, 2, 3) for timing in ("optimal", "learned")
+    ActionLayout(dimension=d, n_via=k, timing=timing)
+    for d in (2, 3)
+    for k in (0, 1, 2, 3)
+    for timing in ("optimal", "learned")
 ]
 
 
@@ -59,7 +62,9 @@ def test_the_frame_is_orthonormal_and_starts_along_the_line(dimension):
     if dimension == 3:
         goal[0] = start[0] + [0.0, 0.0, 0.2]  # straight up
     axes = np.stack(frame(goal - start), axis=-2)
-    np.testing.assert_allclose(axes @ np.swapaxes(axes, -1, -2), np.tile(np.eye(dimension), (20, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        axes @ np.swapaxes(axes, -1, -2), np.tile(np.eye(dimension), (20, 1, 1)), atol=1e-12
+    )
     along = (goal - start) / np.linalg.norm(goal - start, axis=-1, keepdims=True)
     np.testing.assert_allclose(axes[:, 0], along, atol=1e-12)
 

@@ -88,7 +88,9 @@ def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
     none = np.zeros((1, 0, 5)), np.zeros((1, 0), dtype=bool)
     for first, second in (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T3", "T6")):
         start, goal = targets[first], targets[second]
-        path = point_to_point(start, start + 0.4 * (goal - start) / np.linalg.norm(goal - start), np.asarray(0.8))
+        path = point_to_point(
+            start, start + 0.4 * (goal - start) / np.linalg.norm(goal - start), np.asarray(0.8)
+        )
         times = simulator.timestep * np.arange(451)
         position, velocity, acceleration = (path(times, nu) for nu in range(3))
         simulator.place(np.array([0]), ADULT.posture(start)[None], *none)
@@ -102,7 +104,12 @@ def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
 
 def test_torch_and_numpy_give_the_same(arm):
     hand = arm.hand(postures(arm, 50))
-    for function in (arm.posture, arm.reach_margin, lambda h: arm.links(arm.posture(h)), lambda h: arm.controls(h, h, h)):
+    for function in (
+        arm.posture,
+        arm.reach_margin,
+        lambda h: arm.links(arm.posture(h)),
+        lambda h: arm.controls(h, h, h),
+    ):
         np.testing.assert_allclose(function(torch.as_tensor(hand)).numpy(), function(hand), atol=1e-9)
 
 

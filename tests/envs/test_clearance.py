@@ -5,7 +5,13 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ADULT
-from viapoint.envs.clearance import FAR, arm_clearance, clearance_profile, hand_clearance, segment_distance_squared
+from viapoint.envs.clearance import (
+    FAR,
+    arm_clearance,
+    clearance_profile,
+    hand_clearance,
+    segment_distance_squared,
+)
 from viapoint.envs.simulator import Simulator
 
 
@@ -33,8 +39,12 @@ def test_segment_distance_is_the_least_of_all_point_distances(dimension):
 
 def test_parallel_and_degenerate_segments():
     link = np.array([[[0.0, 0.0]]]), np.array([[[1.0, 0.0]]])
-    obstacles = np.array([[[0.5, 0.2, 0.1, 0.0, 0.01], [2.0, 0.0, 0.3, 0.0, 0.01], [0.5, 0.0, 0.0, 0.0, 0.01]]])
-    np.testing.assert_allclose(np.sqrt(segment_distance_squared(*link, obstacles))[0, :, 0], [0.2, 0.7, 0.0], atol=1e-12)
+    obstacles = np.array(
+        [[[0.5, 0.2, 0.1, 0.0, 0.01], [2.0, 0.0, 0.3, 0.0, 0.01], [0.5, 0.0, 0.0, 0.0, 0.01]]]
+    )
+    np.testing.assert_allclose(
+        np.sqrt(segment_distance_squared(*link, obstacles))[0, :, 0], [0.2, 0.7, 0.0], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("whole_arm", [False, True])
@@ -85,6 +95,8 @@ def test_torch_gives_the_same_and_finite_gradients_even_inside_an_obstacle():
     there = np.ones((5, 4), dtype=bool)
     tensor = torch.as_tensor(points).requires_grad_()
     profile = clearance_profile(tensor, 0.015, torch.as_tensor(obstacles), torch.as_tensor(there))
-    np.testing.assert_allclose(profile.detach().numpy(), clearance_profile(points, 0.015, obstacles, there), atol=1e-9)
+    np.testing.assert_allclose(
+        profile.detach().numpy(), clearance_profile(points, 0.015, obstacles, there), atol=1e-9
+    )
     profile.sum().backward()
     assert torch.isfinite(tensor.grad).all()

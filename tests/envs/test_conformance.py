@@ -131,7 +131,12 @@ def test_no_element_of_the_observation_is_constant(env_id):
 
 def test_everything_in_the_model_has_a_name(env_id):
     model = gym.make(env_id).unwrapped.model
-    for kind, count in (("body", model.nbody), ("geom", model.ngeom), ("joint", model.njnt), ("actuator", model.nu)):
+    for kind, count in (
+        ("body", model.nbody),
+        ("geom", model.ngeom),
+        ("joint", model.njnt),
+        ("actuator", model.nu),
+    ):
         for index in range(count):
             assert getattr(model, kind)(index).name, f"{kind} {index}"
     assert isinstance(model, mujoco.MjModel)
@@ -185,7 +190,7 @@ def test_wrong_shapes_and_unknown_arguments_are_refused(env_id):
     with pytest.raises(ValueError, match="timing must be one of optimal, learned"):
         gym.make(env_id, timing="fast")
     with pytest.raises(ValueError, match="render_mode must be"):
-        gym.make(env_id, render_mode="rgb").unwrapped
+        gym.make(env_id, render_mode="rgb")
 
 
 def test_stepping_before_a_reset_is_refused(env_id):

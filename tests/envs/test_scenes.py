@@ -33,7 +33,9 @@ def test_one_to_five_obstacles_all_numbers_posts_and_bars(sampled):
 
 def test_the_straight_line_always_hits_something(sampled):
     scenes, _ = sampled
-    gap = np.sqrt(segment_distance_squared(scenes.start[:, None], scenes.goal[:, None], scenes.obstacles)[..., 0])
+    gap = np.sqrt(
+        segment_distance_squared(scenes.start[:, None], scenes.goal[:, None], scenes.obstacles)[..., 0]
+    )
     clearance = np.where(scenes.present, gap - scenes.obstacles[..., -1] - ADULT.hand_radius, np.inf)
     assert (clearance.min(axis=-1) < -0.003).all()
 
@@ -105,7 +107,10 @@ def test_what_is_not_given_is_sampled_to_fit():
         ({"start": [0.0, 0.05]}, "start .* out of the arm's reach"),
         ({"goal": [-0.3, 0.4]}, "start and goal are 0.0000 m apart"),
         ({"obstacles": [[-0.3, 0.41, 0.0, 0.0, 0.02]]}, r"obstacle 0 .* touches the arm at the start"),
-        ({"obstacles": [[0.4, 0.4, 0, 0, 0.02], [0.1, 0.41, 0, 0, 0.02]]}, r"obstacle 1 .* touches the arm at the goal"),
+        (
+            {"obstacles": [[0.4, 0.4, 0, 0, 0.02], [0.1, 0.41, 0, 0, 0.02]]},
+            r"obstacle 1 .* touches the arm at the goal",
+        ),
         ({"obstacles": [[-0.1, 0.4, 0.0, 0.1]]}, "obstacles"),
         ({"obstacles": np.zeros((6, 5))}, "at most 5"),
         ({"obstacles": [[-0.1, 0.4, 0.0, 0.1, -0.01]]}, "negative radius"),
