@@ -7,7 +7,7 @@ torch is imported by array-api-compat, and only when the caller hands in tensors
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias
@@ -142,6 +142,21 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     except ValueError:
         listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
         raise ValueError(f"leading dimensions do not broadcast: {listed}") from None
+
+
+def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
+    """Return orders of derivative as a tuple, or raise ValueError."""
+    orders = tuple(nu) if isinstance(nu, Sequence | np.ndarray) else (nu,)
+    if not orders or any(not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 0 for n in orders):
+        raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
+    return tuple(int(order) for order in orders)
+
+
+def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless `out` are `count` arrays of the shape."""
+    shapes = [tuple(buffer.shape) for buffer in out]
+    if shapes != [shape] * count:
+        raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")
 
 
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +14,12 @@ from ._arrays import (
     as_floats,
     broadcast_batch,
     broadcast_to,
+    check_buffers,
     constant,
     error_state,
     require,
     require_vectors,
+    whole_orders,
 )
 from ._extremes import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
 from ._hermite import energy_table
@@ -108,7 +111,7 @@ class Trajectory:
         Raises:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
-        if isinstance(time, int | float):
+        if isinstance(time, int | float | np.generic):
             return self.sample([time], nu)[0][..., 0, :]
         return self.sample(time, nu)[0]
 
@@ -132,12 +135,12 @@ class Trajectory:
             ValueError: bad time or nu, or buffers of a wrong number or shape.
         """
         xp = self.namespace
-        orders = _whole_orders(nu)
+        orders = whole_orders(nu)
         time, inside = self._times(time)
         batch = broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
         shape = (*batch, time.shape[-1], self.dimension)
         if out is not None:
-            _check_buffers(out, len(orders), shape)
+            check_buffers(out, len(orders), shape)
         kept = [min(order, 2 * self.order - 1) for order in orders]
         results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
         return tuple(
@@ -156,15 +159,21 @@ class Trajectory:
                 int(time) - 1
             )
             return end * grid, None
-        _, (time, _) = as_floats(time=time, coefficients=self.coefficients[..., 0, 0, 0])
-        if time.dtype != end.dtype:
-            time = xp.astype(time, end.dtype)
+        (time,) = self._own_floats(time=time)
         if time.ndim < 1:
             raise ValueError(f"time must have shape (T,) or (..., T), got shape {tuple(time.shape)}")
         inside = (time >= 0) & (time <= end)
         if inside.all():
             return time, None
         return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
+
+    def _own_floats(self, **named: Any) -> list[Any]:
+        """Return the arguments as arrays of the trajectory's own library and dtype; None passes through."""
+        xp, (*arrays, _) = as_floats(**named, coefficients=self.coefficients[..., 0, 0, 0])
+        if xp is not self.namespace:
+            raise ValueError(f"{', '.join(named)} must be of the trajectory's own kind, not of {xp.__name__}")
+        dtype = self.coefficients.dtype
+        return [a if a is None or a.dtype == dtype else xp.astype(a, dtype) for a in arrays]
 
     def _held(self, value: Array, order: int, inside: Array | None, in_place: bool) -> Array:
         """Zero derivatives outside the movement and beyond the polynomial's degree."""
@@ -205,7 +214,7 @@ class Trajectory:
         return largest_norm(self._pieces(nu))
 
     def _pieces(self, nu: int) -> Pieces:
-        (nu,) = _whole_orders(nu)
+        (nu,) = whole_orders(nu)
         return pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, self.namespace)
 
     def stretched(self, duration: Array) -> Trajectory:
@@ -214,7 +223,8 @@ class Trajectory:
         Raises:
             ValueError: duration is not finite, not positive, or does not broadcast.
         """
-        xp, (duration, coefficients) = as_floats(duration=duration, coefficients=self.coefficients)
+        xp = self.namespace
+        (duration,) = self._own_floats(duration=duration)
         require(xp, duration > 0, "duration", duration, "must be positive")
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
         end = duration[..., None]
@@ -222,7 +232,7 @@ class Trajectory:
         empty = self.rates <= 0
         with error_state(xp):
             rates = xp.where(empty, 0.0 * factor, self.rates / factor)
-        coefficients = broadcast_to(xp, coefficients, (*batch, *coefficients.shape[-3:]))
+        coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
         return Trajectory(
             coefficients, self.durations * factor, self.order, self.starts * factor, rates, end, xp
         )
@@ -241,7 +251,8 @@ class Trajectory:
             ValueError: an argument is not finite or has a wrong shape.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
-        xp, (rotation, translation, scale, moved) = as_floats(**named, coefficients=self.coefficients)
+        xp, moved = self.namespace, self.coefficients
+        rotation, translation, scale = self._own_floats(**named)
         if rotation is not None:
             if rotation.ndim < 2 or rotation.shape[-1] != self.dimension:
                 raise ValueError(
@@ -261,16 +272,3 @@ class Trajectory:
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
         return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end, xp)
-
-
-def _whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
-    orders = tuple(nu) if isinstance(nu, Sequence | np.ndarray) else (nu,)
-    if not orders or any(not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 0 for n in orders):
-        raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
-    return tuple(int(order) for order in orders)
-
-
-def _check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...]) -> None:
-    shapes = [tuple(buffer.shape) for buffer in out]
-    if shapes != [shape] * count:
-        raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")

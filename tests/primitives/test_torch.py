@@ -79,3 +79,12 @@ def test_devices_other_kinds_and_mixtures():
     assert movement.duration.shape == (3,)
     with pytest.raises(ValueError, match="start"):
         point_to_point("somewhere", [1.0], 1.0)
+
+
+def test_a_trajectory_is_asked_in_its_own_kind():
+    movement = point_to_point([0.0], [1.0], 1.0)
+    for call in (lambda: movement(torch.ones(3)), lambda: movement.stretched(torch.tensor(2.0))):
+        with pytest.raises(ValueError, match="own kind"):
+            call()
+    tensors = point_to_point(torch.zeros(1), torch.ones(1), 1.0)
+    assert tensors(np.array([0.5])).dtype == torch.float32
