@@ -144,7 +144,7 @@ class SceneSampler:
         margin = self.arm.reach_margin(line).min(axis=-1)
         inside = ((goal >= low) & (goal <= high)).all(axis=-1)
         if ends is not None:
-            inside |= ~np.isnan(ends[1]).any(axis=-1)[:, None]
+            inside |= np.isfinite(ends[1][:, :1])
         good: Any = inside & (margin > self.distribution.reach_margin)
         first = good.argmax(axis=-1)
         rows = np.arange(len(first))

@@ -28,8 +28,8 @@ WITHOUT_OBSTACLES = 100
 ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0")
 DRAWN_AT_ONCE = 2048
 MOST_DRAWN = 64 * DRAWN_AT_ONCE
-SPARE = 1.2
-"""How many more scenes than needed are taken by the estimated share, as it errs."""
+SPARE, SAFE = 1.2, 1.25
+"""How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
 
 
 def make(env_id: str, name: str, size: int | None = None) -> FrozenScenes:
@@ -66,12 +66,21 @@ def _draw(trial: Trial, generator: np.random.Generator, size: int) -> Scenes:
     drawn, estimates = [], []
     for _ in range(MOST_DRAWN // DRAWN_AT_ONCE):
         drawn.append(sampler([generator] * DRAWN_AT_ONCE))
-        estimates.append(planned_share(trial, drawn[-1], draws=1024))
+        estimates.append(SAFE * _estimate(trial, drawn[-1]))
         count = np.bincount(bands(np.concatenate(estimates)), minlength=len(BANDS))
         if (count >= wanted / len(BANDS)).all():
             break
     together = Scenes(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
     return together.take(_balanced(np.concatenate(estimates), wanted))
+
+
+def _estimate(trial: Trial, scenes: Scenes) -> NDArray[np.float64]:
+    """Planned shares, more exact where they are small, shape (N,)."""
+    share = planned_share(trial, scenes, draws=256)
+    small = np.flatnonzero(share < 0.03)
+    if len(small):
+        share[small] = planned_share(trial, scenes.take(small), seed=1, draws=2048)
+    return share
 
 
 def _balanced(share: NDArray[np.float64], size: int) -> NDArray[np.int64]:
