@@ -64,6 +64,15 @@ def as_floats(**named: Any) -> tuple[Namespace, list[Any]]:
     return xp, arrays
 
 
+def namespace_of(array: Array) -> Namespace:
+    """Return the Array API functions that belong to an array."""
+    if isinstance(array, np.ndarray):
+        return np
+    from array_api_compat import array_namespace
+
+    return array_namespace(array)
+
+
 def _is_marker(value: Any) -> bool:
     return value is None or value is FREE
 

@@ -131,7 +131,8 @@ def _connect_without_empty(
         members.append(where)
     back = np.argsort(np.concatenate(members))
     joined = xp.concat(parts, axis=0)[back if xp is np else xp.asarray(back, device=waypoints.device)]
-    return Trajectory.from_segments(xp.reshape(joined, (*batch, *joined.shape[1:])), durations, xp)
+    joined = xp.reshape(joined, (*batch, *joined.shape[1:]))
+    return Trajectory.from_segments(joined, durations, xp, some_empty=True)
 
 
 def _take(state: list[Any], index: Any, batch: tuple[int, ...], xp: Namespace) -> list[Any]:

@@ -17,6 +17,7 @@ from ._arrays import (
     check_buffers,
     constant,
     error_state,
+    namespace_of,
     require,
     require_vectors,
     whole_orders,
@@ -41,7 +42,6 @@ class Trajectory:
         starts: (..., S) first instant of each segment [s].
         rates: (..., S) 1 / h [1/s].
         end: (..., 1) the last instant [s].
-        namespace: the Array API functions of the arrays.
     """
 
     coefficients: Array
@@ -50,25 +50,31 @@ class Trajectory:
     starts: Array
     rates: Array
     end: Array
-    namespace: Namespace
 
     @classmethod
-    def from_segments(cls, coefficients: Array, durations: Array, xp: Namespace) -> Trajectory:
-        """Join segments; a duration may be 0 where nothing moves (a via-point that equals its neighbour)."""
+    def from_segments(
+        cls, coefficients: Array, durations: Array, xp: Namespace, *, some_empty: bool = False
+    ) -> Trajectory:
+        """Join segments; with `some_empty` durations may be 0, where a via-point equals its neighbour."""
         order = coefficients.shape[-3] // 2
         if durations.shape[-1] == 1:
-            return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations, xp)
+            return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
         ends = xp.cumulative_sum(durations, axis=-1)
         end = ends[..., -1:]
         starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
-        empty = durations <= 0
-        if empty.any():
+        if some_empty:
+            empty = durations <= 0
             # An empty segment at the very end must not take over the last instant from the one before it.
             starts = xp.where(starts >= end, 2 * end, starts)
             rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
         else:
             rates = 1.0 / durations
-        return cls(coefficients, durations, order, starts, rates, end, xp)
+        return cls(coefficients, durations, order, starts, rates, end)
+
+    @property
+    def namespace(self) -> Namespace:
+        """The Array API functions that belong to the arrays."""
+        return namespace_of(self.coefficients)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -233,9 +239,7 @@ class Trajectory:
         with error_state(xp):
             rates = xp.where(empty, 0.0 * factor, self.rates / factor)
         coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
-        return Trajectory(
-            coefficients, self.durations * factor, self.order, self.starts * factor, rates, end, xp
-        )
+        return Trajectory(coefficients, self.durations * factor, self.order, self.starts * factor, rates, end)
 
     def transformed(
         self, rotation: Array | None = None, translation: Array | None = None, scale: Array | None = None
@@ -271,4 +275,4 @@ class Trajectory:
             moved = broadcast_to(xp, moved, (*batch, *moved.shape[-3:]))
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
-        return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end, xp)
+        return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end)

@@ -1,5 +1,7 @@
 """Bad input never passes and never surprises: one ValueError that names the argument and says what came."""
 
+import copy
+import pickle
 import subprocess
 import sys
 
@@ -165,8 +167,10 @@ def test_bad_times_orders_and_buffers_are_named():
             call()
 
 
-def test_a_trajectory_cannot_be_changed():
+def test_a_trajectory_cannot_be_changed_but_copied():
     trajectory = point_to_point([0.0], [1.0], 1.0)
+    for copied in (pickle.loads(pickle.dumps(trajectory)), copy.deepcopy(trajectory)):
+        np.testing.assert_array_equal(copied.sample(5), trajectory.sample(5))
     with pytest.raises(AttributeError):
         trajectory.order = 4
     assert isinstance(retarget(trajectory, 0.5, [2.0], 1.5), Trajectory)
