@@ -18,7 +18,7 @@ from viapoint.training.presets import PRESETS
 from viapoint.training.runs import Run
 from viapoint.training.vec_env import ViaVecEnv
 
-__all__ = ["TrainingStoppedError", "new_model", "one_thread", "train"]
+__all__ = ["TrainingStoppedError", "new_model", "one_thread", "resolved", "train"]
 
 
 def train(config: TrainConfig) -> Run:
@@ -31,7 +31,7 @@ def train(config: TrainConfig) -> Run:
         BadFileError: The folder cannot take the run, or does not hold the one to resume.
         TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
     """
-    run = _resumed(config) if config.resume else Run.create(config)
+    run = _resumed(config) if config.resume else Run.create(resolved(config))
     with run.locked(), one_thread():
         env = ViaVecEnv(run.config.env, run.config.copies, **run.config.env_kwargs)
         try:
@@ -43,11 +43,19 @@ def train(config: TrainConfig) -> Run:
     return run
 
 
+def resolved(config: TrainConfig) -> TrainConfig:
+    """A configuration with everything that it left to the preset written out, as a run keeps it."""
+    return dataclasses.replace(
+        config,
+        n_timesteps=config.total_timesteps,
+        n_envs=config.copies,
+        hyperparameters={**PRESETS[config.algo].arguments(), **config.hyperparameters},
+    )
+
+
 def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
-    """The untrained model that a configuration asks for."""
-    preset = PRESETS[config.algo]
-    hyperparameters = {**preset.arguments(), **config.hyperparameters}
-    return build(config.algo, preset.policy, env, hyperparameters, seed=config.seed)
+    """The untrained model that a resolved configuration asks for."""
+    return build(config.algo, PRESETS[config.algo].policy, env, config.hyperparameters, seed=config.seed)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from viapoint.training import monitor
 from viapoint.training.config import TrainConfig
 from viapoint.training.evaluate import evaluate
 from viapoint.training.files import BadFileError, read_arrays
+from viapoint.training.presets import PRESETS
 from viapoint.training.runs import Run, load_model
 from viapoint.training.train import TrainingStoppedError, train
 from viapoint.training.vec_env import ViaVecEnv
@@ -147,6 +148,13 @@ def test_a_finished_run_can_be_extended(tmp_path):
     assert Run(run.folder).config.n_timesteps == 128
     again = train(TrainConfig(out=run.folder, resume=True, progress=False))
     assert curve(again) == curve(longer)
+
+
+def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
+    run = train(config(tmp_path / "run", n_timesteps=64))
+    preset = dataclasses.replace(PRESETS["viatd3"], n_envs=3, hyperparameters=(("learning_rate", 0.5),))
+    monkeypatch.setitem(PRESETS, "viatd3", preset)
+    assert train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False)).decisions == 128
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path):
