@@ -24,6 +24,8 @@ PHASES = 24
 """At how many evenly spaced times a planned movement is looked at."""
 
 
+NEAR = 0.06
+"""Clearance at which an obstacle is no longer pushed away from, [m]."""
 GEOMETRY = PHASES + 3
 """Numbers that tell clearance and reach of a movement."""
 
@@ -37,6 +39,16 @@ class SceneView(NamedTuple):
     """Obstacles in the frame along, across and above the straight line, from its middle, shape (B, n, 2 D + 1)."""
     present: Tensor
     """Shape (B, n), bool."""
+
+
+class Look(NamedTuple):
+    """What an actor sees of B scenes before it thinks."""
+
+    scene: SceneView
+    anchors: Tensor
+    """Actions of the A anchors, shape (B, A, m)."""
+    fares: Tensor
+    """How each would fare: clearance and reach, and where the nearest obstacle is at each phase, shape (B, A, .)."""
 
 
 class Foresight(NamedTuple):
@@ -140,17 +152,24 @@ class Anchors:
         rest = vias.new_zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]))
         return torch.cat((vias, rest), dim=-1).clamp(-0.97, 0.97)
 
-    def view(self, observation: Observation) -> Tensor:
-        """How they would fare in each of B scenes, shape (B, A, GEOMETRY)."""
+    def look(self, observation: Observation) -> Look:
+        """See how they would fare in each of B scenes; nothing here is learnt."""
         start, goal = observation["hand"], observation["goal"]
-        axes = torch.stack(frame(goal - start), dim=-2) * (goal - start).norm(dim=-1)[:, None, None]
-        hand = start[:, None, None] + torch.einsum("apj,bji->bapi", self.paths, axes)
+        axes = torch.stack(frame(goal - start), dim=-2)
+        scaled = axes * (goal - start).norm(dim=-1)[:, None, None]
+        hand = start[:, None, None] + torch.einsum("apj,bji->bapi", self.paths, scaled)
         margin = self.task.arm.reach_margin(hand).amin(dim=-1)
-        return _sized(_clearance(observation, hand, self.task), margin)
+        parts = [_sized(_clearance(observation, hand, self.task), margin)]
+        if "obstacles" in observation:
+            away = _away(observation, hand, self.task)
+            parts.append(torch.einsum("bji,bapi->bapj", axes, away).flatten(-2))
+        else:
+            parts.append(hand.new_zeros((*hand.shape[:2], hand.shape[2] * hand.shape[3])))
+        return Look(scene_view(observation, self.task), self.actions(observation), torch.cat(parts, dim=-1))
 
 
-ALONG = (-0.25, 0.0, 0.25)
-HEIGHT = (0.12, 0.28, 0.45, 0.62)
+ALONG = (-0.3, -0.15, 0.0, 0.15, 0.3)
+HEIGHT = (0.10, 0.22, 0.35, 0.48, 0.62)
 """Where anchors' via-points lie from the middle of the straight line, relative to its length."""
 
 
@@ -163,6 +182,23 @@ def _sized(clearance: Tensor, reach_margin: Tensor) -> Tensor:
     least, margin = clearance.amin(dim=-1, keepdim=True), reach_margin.unsqueeze(-1)
     parts = (clearance * 20.0, least * 20.0, least * 150.0, margin * 20.0)
     return torch.cat(parts, dim=-1).clamp(-2.0, 2.0)
+
+
+def _away(observation: Observation, hand: Tensor, task: Task) -> Tensor:
+    """Unit vectors away from the nearest obstacle's axis, the shorter the farther it is, shape (B, A, PHASES, D)."""
+    rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
+    centre, axis = (part[:, None, :, None] for part in (rows.centre, rows.half_axis))
+    offset = hand.unsqueeze(2) - centre
+    along = (offset * axis).sum(dim=-1) / axis.square().sum(dim=-1).clamp(min=1e-12)
+    rest = offset - along.clamp(-1.0, 1.0).unsqueeze(-1) * axis
+    length = rest.norm(dim=-1)
+    clearance = length - rows.radius[:, None, :, None] - task.arm.hand_radius
+    clearance = torch.where((rows.present > 0.5)[:, None, :, None], clearance, torch.full_like(clearance, 1.0))
+    least, nearest = clearance.min(dim=2, keepdim=True)
+    unit = rest / length.clamp(min=1e-9).unsqueeze(-1)
+    unit = unit.gather(2, nearest.unsqueeze(-1).expand(-1, -1, -1, -1, unit.shape[-1])).squeeze(2)
+    nearness = (1.0 - least.squeeze(2) / NEAR).clamp(0.0, 1.5).unsqueeze(-1)
+    return torch.mul(unit, nearness)
 
 
 def _clearance(observation: Observation, hand: Tensor, task: Task) -> Any:

@@ -14,7 +14,16 @@ from torch import Tensor, nn
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.features import GEOMETRY, Anchors, Observation, SceneView, foresee, scene_view
+from viapoint.training.features import (
+    GEOMETRY,
+    PHASES,
+    Anchors,
+    Look,
+    Observation,
+    SceneView,
+    foresee,
+    scene_view,
+)
 
 
 def _layers(*sizes: int) -> nn.Sequential:
@@ -62,23 +71,27 @@ class ViaActor(BaseModel):
         self.task, self.anchors = task, Anchors(task)
         self.encoder = SetEncoder(task.arm.dimension, width // 4)
         self.size = get_action_dim(action_space)
-        self.each = _layers(self.encoder.size + GEOMETRY + self.size, width, width)
+        seen = self.encoder.size + GEOMETRY + PHASES * task.arm.dimension + self.size
+        self.each = _layers(seen, width, width)
         self.improve = nn.Linear(width, self.size)
         self.score = nn.Linear(width, 1)
         nn.init.zeros_(self.improve.weight)
         nn.init.zeros_(self.improve.bias)
 
-    def propose(self, observation: Observation) -> tuple[Tensor, Tensor]:
+    def look(self, observation: Observation) -> Look:
+        """What the actor sees, all of it fixed functions of the observation."""
+        with torch.no_grad():
+            return self.anchors.look(observation)
+
+    def propose(self, look: Look) -> tuple[Tensor, Tensor]:
         """Actions, shape (B, A, m), and the expected reward of each, shape (B, A)."""
-        anchors, view = self.anchors.actions(observation), self.anchors.view(observation)
-        scene = self.encoder(scene_view(observation, self.task))
-        scene = scene.unsqueeze(1).expand(-1, anchors.shape[1], -1)
-        hidden = self.each(torch.cat((scene, view, anchors), dim=-1))
-        return torch.tanh(torch.atanh(anchors) + self.improve(hidden)), self.score(hidden).squeeze(-1)
+        scene = self.encoder(look.scene).unsqueeze(1).expand(-1, look.anchors.shape[1], -1)
+        hidden = self.each(torch.cat((scene, look.fares, look.anchors), dim=-1))
+        return torch.tanh(torch.atanh(look.anchors) + self.improve(hidden)), self.score(hidden).squeeze(-1)
 
     def forward(self, observation: Observation) -> Tensor:
         """The most promising action, shape (B, m)."""
-        actions, scores = self.propose(observation)
+        actions, scores = self.propose(self.look(observation))
         return actions[torch.arange(len(actions)), scores.argmax(dim=-1)]
 
     def _predict(self, observation: Observation, deterministic: bool = False) -> Tensor:
@@ -137,7 +150,7 @@ class ViaPolicy(TD3Policy):
         lr_schedule: Any,
         *,
         task: dict[str, Any],
-        width: int = 128,
+        width: int = 192,
         candidates: int = 0,
         **kwargs: Any,
     ) -> None:
@@ -165,7 +178,7 @@ class ViaPolicy(TD3Policy):
 
         Neighbours lie on fixed offsets about the two most promising proposals, so that a decision is deterministic.
         """
-        proposals, scores = self.actor.propose(observation)
+        proposals, scores = self.actor.propose(self.actor.look(observation))
         rows = torch.arange(len(proposals)).unsqueeze(-1)
         promising = proposals[rows, scores.topk(4, dim=-1).indices]
         offsets = self._offsets(candidates // promising.shape[1])

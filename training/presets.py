@@ -49,7 +49,12 @@ _OFF_POLICY: dict[str, Any] = {
 }
 
 PRESETS: dict[str, Preset] = {
-    "viatd3": _preset(64, 12_032, "ViaPolicy"),  # its defaults are its settings
+    "viatd3": _preset(
+        64,
+        12_800,
+        "ViaPolicy",  # its defaults are its settings
+        learning_rate={"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0},
+    ),
     "sac": _preset(64, 40_000, **_OFF_POLICY),
     "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
     "tqc": _preset(64, 40_000, **_OFF_POLICY),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,8 +11,7 @@ from torch import Tensor
 
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.task import Task
-
-Observation = dict[str, Tensor]
+from viapoint.training.features import Look, Observation, SceneView
 
 
 class ScenePool:
@@ -22,6 +23,7 @@ class ScenePool:
 
     Args:
         task: Whose scenes are drawn.
+        look: What an actor sees of observations; it is asked once for each of them.
         seed: Of the draws.
         fresh: Scenes drawn in each round.
         rounds: For how many rounds they stay.
@@ -29,28 +31,50 @@ class ScenePool:
     """
 
     def __init__(
-        self, task: Task, seed: int, *, fresh: int = 64, rounds: int = 64, augment: bool = True
+        self,
+        task: Task,
+        look: Callable[[Observation], Look],
+        seed: int,
+        *,
+        fresh: int = 64,
+        rounds: int = 32,
+        augment: bool = True,
     ) -> None:
-        self._task, self._seed, self._fresh, self._rounds = task, seed, fresh, rounds
-        self._augment = augment
+        self._task, self._look, self._seed, self._augment = task, look, seed, augment
+        self._fresh, self._rounds = fresh, rounds
         self._sampler = task.sampler()
-        self._slots: list[tuple[int, dict[str, NDArray[np.float32]]]] = []
-        self._parts: dict[str, NDArray[np.float32]] = {}
+        self._held = [-1] * rounds
+        self._tensors: list[Tensor] = []
+        self._names: list[str] = []
         self._generator = np.random.default_rng(seed)
 
     def begin(self, number: int) -> None:
         """Be as in round `number`, 0 or more."""
-        wanted = range(number, number + self._rounds)
-        held = dict(self._slots)
-        self._slots = [(i, held[i] if i in held else self._draw(i)) for i in wanted]
-        parts = [part for _, part in self._slots]
-        self._parts = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        for each in range(number, number + self._rounds):
+            slot = each % self._rounds
+            if self._held[slot] != each:
+                self._fill(slot, each)
+                self._held[slot] = each
         self._generator = np.random.default_rng((self._seed, number, 1))
 
-    def sample(self, count: int) -> Observation:
-        """`count` observations, with repetition."""
-        rows = self._generator.integers(len(self._parts["hand"]), size=count)
-        return {name: torch.from_numpy(part[rows]) for name, part in self._parts.items()}
+    def sample(self, count: int) -> tuple[Observation, Look]:
+        """`count` observations, with repetition, and what an actor sees of them."""
+        rows = torch.from_numpy(self._generator.integers(len(self._tensors[0]), size=count))
+        parts = [tensor[rows] for tensor in self._tensors]
+        split = len(self._names)
+        scene = SceneView(*parts[split : split + 3])
+        return dict(zip(self._names, parts, strict=False)), Look(scene, *parts[split + 3 :])
+
+    def _fill(self, slot: int, number: int) -> None:
+        observation = {name: torch.from_numpy(part) for name, part in self._draw(number).items()}
+        look = self._look(observation)
+        parts = [*observation.values(), *look.scene, look.anchors, look.fares]
+        size = len(parts[0])
+        if not self._tensors:
+            self._names = list(observation)
+            self._tensors = [part.new_empty((self._rounds * size, *part.shape[1:])) for part in parts]
+        for tensor, part in zip(self._tensors, parts, strict=True):
+            tensor[slot * size : (slot + 1) * size] = part
 
     def _draw(self, number: int) -> dict[str, NDArray[np.float32]]:
         generator = np.random.default_rng((self._seed, number, 0))

@@ -61,8 +61,8 @@ class ViaTD3(TD3):
         explore_uniformly: float = 0.25,
         noise: float = 0.05,
         temperature: float = 0.1,
-        promising: int = 3,
-        others: int = 3,
+        promising: int = 4,
+        others: int = 2,
         fresh_scenes: int = 64,
         augment: bool = True,
         policy_kwargs: dict[str, Any] | None = None,
@@ -96,7 +96,8 @@ class ViaTD3(TD3):
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         if self.pool is None:
             task = Task.from_dict(self.policy_kwargs["task"], ARMS)
-            self.pool = ScenePool(task, self.seed or 0, fresh=self.fresh_scenes, augment=self.augment)
+            seed, fresh = self.seed or 0, self.fresh_scenes
+            self.pool = ScenePool(task, self.actor.look, seed, fresh=fresh, augment=self.augment)
         self.pool.begin(self._n_updates // gradient_steps)
         losses = []
         for _ in range(gradient_steps):
@@ -122,8 +123,8 @@ class ViaTD3(TD3):
     def _update_actor(self, batch_size: int) -> tuple[float, float]:
         """Improve proposals in the critic's judgement, and let their scores foretell it."""
         assert self.pool is not None
-        observation = self.pool.sample(batch_size)
-        proposals, scores = self.actor.propose(observation)
+        observation, look = self.pool.sample(batch_size)
+        proposals, scores = self.actor.propose(look)
         best = scores.topk(self.promising, dim=-1).indices
         others = torch.randint(0, scores.shape[1], (batch_size, self.others))
         looked_at = torch.arange(batch_size).unsqueeze(-1), torch.cat((best, others), dim=-1)
@@ -148,7 +149,7 @@ class ViaTD3(TD3):
         assert self._last_obs is not None
         with torch.no_grad():
             observation, _ = self.policy.obs_to_tensor(self._last_obs)
-            proposals, scores = self.actor.propose(observation)  # type: ignore[arg-type]
+            proposals, scores = self.actor.propose(self.actor.look(observation))  # type: ignore[arg-type]
             head = torch.multinomial(torch.softmax(scores / self.temperature, dim=-1), 1)[:, 0]
             chosen = proposals[torch.arange(n_envs), head]
             noisy = torch.clamp(chosen + self.noise * torch.randn_like(chosen), -1.0, 1.0)

@@ -1,0 +1,79 @@
+"""Arguments at the border: what is refused, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """A whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+    return int(value)
+
+
+def fewest_and_most(n_obstacles: Any) -> tuple[int, int]:
+    """An exact number or (fewest, most) as the pair."""
+    pair = (n_obstacles, n_obstacles) if isinstance(n_obstacles, int | np.integer) else n_obstacles
+    try:
+        fewest, most = pair
+        return whole_number("n_obstacles", fewest, 0), whole_number("n_obstacles", most, 0)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"n_obstacles must be a whole number or (fewest, most), got {n_obstacles!r}"
+        ) from None
+
+
+def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Refuse keyword arguments that there are not, with those that there are."""
+    if unknown:
+        allowed = [name for name in known if name not in ("unknown", "return")]
+        raise TypeError(
+            f"unknown keyword argument {', '.join(map(repr, sorted(unknown)))}; allowed are {', '.join(allowed)}"
+        )
+
+
+def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
+    """The environments that a reset mask names; without a mask, all."""
+    if mask is None:
+        return np.arange(num_envs)
+    mask = np.asarray(mask)
+    if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
+        raise ValueError(
+            f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}"
+        )
+    if not running and not mask.all():
+        raise ValueError("options['reset_mask'] must name every environment at the first reset")
+    return np.flatnonzero(mask)
+
+
+def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
+    """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
+    shape = (num_envs, len(names))
+    try:
+        array = np.asarray(actions, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"action must be numbers of shape {shape}, got {actions!r}") from None
+    if array.shape != shape:
+        raise ValueError(f"action must have shape {shape} ({', '.join(names)}), got {array.shape}")
+    if not np.isfinite(array).all():
+        env, component = np.argwhere(~np.isfinite(array))[0]
+        value = array[env, component]
+        raise ValueError(f"action must be finite, got {value} for {names[component]} of environment {env}")
+    return np.clip(array, -1.0, 1.0)
+
+
+def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """A seed for each environment: `seed + i`, `seed[i]`, or None."""
+    if seed is None or isinstance(seed, int | np.integer):
+        return [None if seed is None else int(seed) + i for i in range(num_envs)]
+    seeds = list(seed)
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed must be a whole number or {num_envs} of them, got {len(seeds)}")
+    return seeds

@@ -1,0 +1,295 @@
+"""The environment: one decision, one movement, many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import EzPickle, seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from viapoint.envs.action import ActionLayout, Plan, Timing
+from viapoint.envs.arguments import (
+    checked_actions,
+    fewest_and_most,
+    masked_rows,
+    refuse_unknown,
+    seeds_of,
+    whole_number,
+)
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.execution import Executor, Rollout
+from viapoint.envs.outcome import Outcome
+from viapoint.envs.rendering import MovementRenderer, check_render_mode
+from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
+from viapoint.envs.scene_sampling import SceneDistribution
+from viapoint.envs.scenes import Scenes, check_scenes, given_scenes
+from viapoint.envs.simulator import Simulator
+from viapoint.envs.task import Task
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+Weights = RewardWeights | Mapping[str, float] | None
+
+METADATA: dict[str, Any] = {
+    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_fps": 50,
+    "autoreset_mode": AutoresetMode.SAME_STEP,
+}
+
+
+class Decision(NamedTuple):
+    """What one decision of N environments led to."""
+
+    observation: Observation
+    reward: Float
+    info: dict[str, Any]
+
+
+class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
+    """Reaching around obstacles by via-points, `num_envs` times.
+
+    Every episode is one decision, so every step ends all episodes and starts the next ones (same-step autoreset): the
+    returned observations are the new episodes' first ones, the last ones of the old are in `info["final_obs"]`, their
+    info in `info["final_info"]` and, as all end together, at the top level of `info` too.
+
+    Args:
+        num_envs: Number of environments N.
+        arm: The arm that moves.
+        whole_arm: Whether the links must clear the obstacles, too, or the hand alone.
+        n_via: Number of via-points of an action.
+        n_obstacles: An exact number, or the fewest and the most.
+        timing: `optimal` passage times, or `learned` ones as part of the action.
+        duration_range: Shortest and longest movement, [s].
+        reward_weights: Some or all of the weights of :class:`~viapoint.envs.reward.RewardWeights`.
+        render_mode: `human`, `rgb_array` or `rgb_array_list`.
+        width: Of a rendered frame, [pixels].
+        height: Of a rendered frame, [pixels].
+        threads: Of the simulation; 0 is one for each core. Results do not depend on it.
+    """
+
+    metadata = METADATA
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        arm: Arm = ADULT,
+        whole_arm: bool = False,
+        n_via: int = 1,
+        n_obstacles: int | tuple[int, int] = (1, 5),
+        timing: Timing = "optimal",
+        duration_range: tuple[float, float] = (0.6, 1.2),
+        reward_weights: Weights = None,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        threads: int = 0,
+        **unknown: Any,
+    ) -> None:
+        refuse_unknown(unknown, type(self).__init__.__annotations__)
+        EzPickle.__init__(
+            self, num_envs, arm=arm, whole_arm=whole_arm, n_via=n_via, n_obstacles=n_obstacles, timing=timing,
+            duration_range=duration_range, reward_weights=reward_weights, render_mode=render_mode,
+            width=width, height=height, threads=threads,
+        )  # fmt: skip
+        self.num_envs = whole_number("num_envs", num_envs, 1)
+        threads = whole_number("threads", threads, 0)
+        self.task = Task(
+            arm=arm,
+            whole_arm=bool(whole_arm),
+            action=ActionLayout(
+                dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=duration_range
+            ),
+            weights=RewardWeights.of(reward_weights),
+            scenes=SceneDistribution(n_obstacles=fewest_and_most(n_obstacles)),
+        )
+        """What an agent may compute with before it has moved."""
+        self.arm, self.action_layout, self.observation_layout = arm, self.task.action, self.task.observation
+        self.single_action_space = spaces.Box(-1.0, 1.0, (self.action_layout.size,), np.float32)
+        self.single_observation_space = self.observation_layout.space()
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._sampler = self.task.sampler()
+        self._simulator = Simulator(
+            arm,
+            n_obstacles=self.observation_layout.n_rows,
+            whole_arm=self.task.whole_arm,
+            num_envs=self.num_envs,
+            threads=threads,
+        )
+        self._executor = Executor(self._simulator, whole_arm=self.task.whole_arm, threads=threads)
+        self._generators: list[np.random.Generator] = []
+        self.scenes: Scenes | None = None
+        """The scenes of the running episodes; None before the first reset."""
+        self._last: tuple[Scenes, Plan, Outcome] | None = None
+        self.render_mode = check_render_mode(render_mode, METADATA["render_modes"])
+        self._renderer = MovementRenderer(self._simulator, render_mode, width, height, METADATA["render_fps"])
+
+    @property
+    def model(self) -> Any:
+        """The MuJoCo model."""
+        return self._simulator.model
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far, all environments together."""
+        return self._simulator.physics_steps
+
+    @property
+    def last_rollout(self) -> tuple[Rollout, ...]:
+        """The last movements at every physics step, one for each environment; empty before the first."""
+        if self._last is None:
+            return ()
+        return tuple(self._executor.rollout(sim, self._last[0]) for sim in range(self.num_envs))
+
+    @property
+    def last_plan(self) -> Plan | None:
+        """The last decision as via-points [m] and durations [s]; None before the first."""
+        return None if self._last is None else self._last[1]
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
+            options: `start`, `goal` and `obstacles` set up a given scene, see
+                :func:`~viapoint.envs.scenes.given_scenes`; `reset_mask`, shape (num_envs,), names the
+                environments to reset, all others keep their scenes.
+
+        Raises:
+            ValueError: A given scene is impossible; nothing has changed then.
+        """
+        options = dict(options or {})
+        rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
+        self._seed(seed)
+        scenes = self._draw(rows, options)
+        self._start(rows, scenes)
+        return self._observe_start(), {}
+
+    def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
+        """Carry out one movement in each environment and start the next episodes.
+
+        Args:
+            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
+        """
+        observation, reward, info = self.decide(actions)
+        everyone = np.ones(self.num_envs, dtype=bool)
+        final = np.empty(self.num_envs, dtype=object)
+        for i in range(self.num_envs):
+            final[i] = {name: part[i] for name, part in observation.items()}
+        masked = {**info, **{f"_{name}": everyone.copy() for name in info}}
+        infos = {
+            **masked,
+            "final_obs": final,
+            "_final_obs": everyone.copy(),
+            "final_info": {name: value.copy() for name, value in masked.items()},
+            "_final_info": everyone.copy(),
+        }
+        rows = np.arange(self.num_envs)
+        self._start(rows, self._draw(rows, {}))
+        return self._observe_start(), reward, everyone, ~everyone, infos
+
+    def decide(self, actions: Any) -> Decision:
+        """Carry out one movement in each environment: the flow from action to reward, without a reset.
+
+        Args:
+            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
+        """
+        if self.scenes is None:
+            raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
+        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
+        plan = self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
+        outcome = self._executor(plan, self.scenes)
+        terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
+        joints = self._executor.final_joints(self.scenes)
+        observation = self.observation_layout.observe(joints, np.asarray(self.arm.hand(joints)), self.scenes)
+        self._last, self.scenes = (self.scenes, plan, outcome), None
+        if self.render_mode == "human":
+            self.render()
+        return Decision(observation, terms.total(), _info(outcome, terms))
+
+    def render(self) -> Any:
+        """The last movement of each environment as the render mode says; before the first, the scenes."""
+        frames = tuple(
+            self._render_one(sim) for sim in range(self.num_envs if self.render_mode != "human" else 1)
+        )
+        return None if self.render_mode in (None, "human") else frames
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Let threads and windows go."""
+        self._executor.close()
+        self._renderer.close()
+
+    def _render_one(self, sim: int) -> Any:
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() does nothing without a render_mode; choose one of "
+                + ", ".join(METADATA["render_modes"])
+            )
+            return None
+        if self._last is None or (self.scenes is not None and self.num_envs == 1):
+            assert self.scenes is not None
+            return self._renderer.still(sim, self.scenes.take([sim]))
+        scenes, plan, _ = self._last
+        return self._renderer.movement(
+            sim, scenes.take([sim]), plan.take([sim]), self._executor.rollout(sim, scenes)
+        )
+
+    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None and self._generators:
+            return
+        seeds = seeds_of(seed, self.num_envs)
+        if not self._generators:
+            self._generators = [seeding.np_random(s)[0] for s in seeds]
+        else:
+            pairs = zip(self._generators, seeds, strict=True)
+            self._generators = [old if s is None else seeding.np_random(s)[0] for old, s in pairs]
+        self._np_random, self._np_random_seed = self._generators[0], seeds[0] if seeds[0] is not None else -1
+
+    def _draw(self, rows: NDArray[np.int64], options: Mapping[str, Any]) -> Scenes:
+        """Scenes for some environments, sampled or given."""
+        generators = [self._generators[i] for i in rows]
+        if not options:
+            return self._sampler(generators)
+        blank = Scenes(*(np.full((len(rows), *shape), np.nan) for shape in self._scene_shapes()))
+        given = given_scenes(options, blank, self.arm)
+        if not {"start", "goal", "obstacles"} <= set(options):
+            sampled = self._sampler(generators, (given.start, given.goal))
+            given = given_scenes(options, sampled, self.arm)
+        check_scenes(given, self.arm, whole_arm=self.task.whole_arm)
+        return given
+
+    def _scene_shapes(self) -> tuple[tuple[int, ...], ...]:
+        d = self.arm.dimension
+        return (d,), (d,), (self.observation_layout.n_rows, 2 * d + 1)
+
+    def _start(self, rows: NDArray[np.int64], scenes: Scenes) -> None:
+        """Begin episodes: the arms at rest at the start, the obstacles in place."""
+        if self.scenes is None or len(rows) == self.num_envs:
+            self.scenes = scenes
+        else:
+            self.scenes.put(rows, scenes)
+        self._simulator.place(
+            rows, np.asarray(self.arm.posture(scenes.start)), scenes.obstacles, scenes.present
+        )
+
+    def _observe_start(self) -> Observation:
+        assert self.scenes is not None
+        joints = np.asarray(self.arm.posture(self.scenes.start))
+        return self.observation_layout.observe(joints, self.scenes.start, self.scenes)
+
+
+def _info(outcome: Outcome, terms: RewardTerms) -> dict[str, Any]:
+    return {**outcome._asdict(), **terms.as_info()}
