@@ -47,7 +47,9 @@ class References(NamedTuple):
     """Plans of one group at the physics rate, ready for the arm."""
 
     sims: NDArray[np.int64]
-    """The simulations, shape (n,)."""
+    """The simulations in increasing order, shape (n,)."""
+    rows: slice | NDArray[np.int64]
+    """The same as an index; all of them are a slice, which copies nothing."""
     steps: NDArray[np.int64]
     """Physics steps of each, shape (n,)."""
     planned: Float
@@ -83,8 +85,8 @@ class Executor:
         self._groups = self._map(lambda sims: self._refer(steps, plan, scenes, sims), groups)
         self._records = [self._simulate(group) for group in self._groups]
         outcomes = self._map(lambda i: self._measure(i, scenes), list(range(len(groups))))
-        together = blank(len(duration))
-        for group, outcome in zip(self._groups, outcomes, strict=True):
+        together = outcomes[0] if len(groups) == 1 else blank(len(duration))
+        for group, outcome in zip(self._groups, outcomes, strict=True) if len(groups) > 1 else ():
             for mine, theirs in zip(together, outcome, strict=True):
                 mine[group.sims] = theirs
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
@@ -137,28 +139,32 @@ class Executor:
         self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]
     ) -> References:
         """References at the physics rate, and the controls that follow them, for one group."""
-        trajectory = plan.take(sims).trajectory()
-        time = self.simulator.timestep * np.arange(steps[sims].max() + 1)
+        rows = slice(None) if len(sims) == len(steps) else sims
+        trajectory = plan.take(rows).trajectory()
+        time = self.simulator.timestep * np.arange(steps[rows].max() + 1)
         position, velocity, acceleration = trajectory.sample(time)
         seen = position[:, ::LOOK_EVERY]
         return References(
             sims=sims,
-            steps=steps[sims],
+            rows=rows,
+            steps=steps[rows],
             planned=position[:, 1:],
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
             reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1),
             jerk_cost=np.asarray(trajectory.cost()),
-            clearance=least_clearance(self.arm, seen, scenes.take(sims), whole_arm=self.whole_arm),
+            clearance=least_clearance(self.arm, seen, scenes.take(rows), whole_arm=self.whole_arm),
         )
 
     def _simulate(self, group: References) -> Record | None:
         run = group.reachable
+        if run.all():
+            return self.simulator.rollout(group.sims, group.controls)
         return self.simulator.rollout(group.sims[run], group.controls[run]) if run.any() else None
 
     def _measure(self, index: int, scenes: Scenes) -> Outcome:
         """The outcome of one group, but for duration and jerk ratio."""
         group, record = self._groups[index], self._records[index]
-        scene, run = scenes.take(group.sims), group.reachable
+        scene, run = scenes.take(group.rows), group.reachable
         if run.all():
             outcome = self._measured(group, record, scene)
         else:

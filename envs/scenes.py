@@ -52,7 +52,7 @@ class Scenes(NamedTuple):
 
     def take(self, rows: Any) -> Scenes:
         """The scenes at `rows`, an index, slice or mask."""
-        return Scenes(*(np.atleast_2d(field)[rows] for field in self))
+        return Scenes(self.start[rows], self.goal[rows], self.obstacles[rows])
 
     def put(self, rows: Any, scenes: Scenes) -> None:
         """Overwrite the scenes at `rows`."""
