@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
+from viapoint.envs.beside import Beside
 from viapoint.envs.outcome import Outcome, blank, least_clearance, measure, norm, refused
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record, Simulator
 
 Float = NDArray[np.float64]
-T = TypeVar("T")
-R = TypeVar("R")
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
@@ -67,12 +64,11 @@ class References(NamedTuple):
 class Executor:
     """Carries out plans in a simulator, in groups of similar length so that short movements cost less."""
 
-    def __init__(self, simulator: Simulator, *, whole_arm: bool, threads: int) -> None:
+    def __init__(self, simulator: Simulator, beside: Beside, *, whole_arm: bool) -> None:
         self.simulator = simulator
         self.arm = simulator.arm
         self.whole_arm = whole_arm
-        self._threads = threads
-        self._pool: ThreadPoolExecutor | None = None
+        self._beside = beside
         self._groups: list[References] = []
         self._records: list[Record | None] = []
 
@@ -82,9 +78,14 @@ class Executor:
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         order = np.argsort(steps, kind="stable")
         groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
-        self._groups = self._map(lambda sims: self._refer(steps, plan, scenes, sims), groups)
-        self._records = [self._simulate(group) for group in self._groups]
-        outcomes = self._map(lambda i: self._measure(i, scenes), list(range(len(groups))))
+        beside = self._beside.submit if len(groups) > 1 else Beside(threaded=False).submit
+        referred = [beside(self._refer, steps, plan, scenes, sims) for sims in groups]
+        self._groups, self._records, measured = [], [], []
+        for reference in referred:
+            self._groups.append(reference.result())
+            self._records.append(self._simulate(self._groups[-1]))
+            measured.append(beside(self._measure, len(self._groups) - 1, scenes))
+        outcomes = [outcome.result() for outcome in measured]
         together = outcomes[0] if len(groups) == 1 else blank(len(duration))
         for group, outcome in zip(self._groups, outcomes, strict=True) if len(groups) > 1 else ():
             for mine, theirs in zip(together, outcome, strict=True):
@@ -120,20 +121,6 @@ class Executor:
         )
         time = np.arange(1, steps + 1) * float(self.simulator.timestep)
         return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
-
-    def close(self) -> None:
-        """Let the threads go."""
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
-
-    def _map(self, function: Callable[[T], R], items: list[T]) -> list[R]:
-        """`function` of each item, on the threads where there is more than one of both."""
-        if len(items) < 2 or self._threads == 1:
-            return [function(item) for item in items]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._threads or None, thread_name_prefix="viapoint")
-        return list(self._pool.map(function, items))
 
     def _refer(
         self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]

@@ -24,6 +24,7 @@ from viapoint.envs.arguments import (
 )
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.beside import Beside
 from viapoint.envs.execution import Executor, Rollout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
@@ -124,7 +125,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             num_envs=self.num_envs,
             threads=threads,
         )
-        self._executor = Executor(self._simulator, whole_arm=self.task.whole_arm, threads=threads)
+        self._beside = Beside(threaded=threads != 1)
+        self._executor = Executor(self._simulator, self._beside, whole_arm=self.task.whole_arm)
         self._generators: list[np.random.Generator] = []
         self.scenes: Scenes | None = None
         """The scenes of the running episodes; None before the first reset."""
@@ -184,6 +186,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
+        self._check_running()
+        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
+        rows = np.arange(self.num_envs)
+        following = self._beside.submit(self._draw, rows, {})
         observation, reward, info = self.decide(actions)
         everyone = np.ones(self.num_envs, dtype=bool)
         final = np.empty(self.num_envs, dtype=object)
@@ -197,8 +203,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "final_info": {name: value.copy() for name, value in masked.items()},
             "_final_info": everyone.copy(),
         }
-        rows = np.arange(self.num_envs)
-        self._start(rows, self._draw(rows, {}))
+        self._start(rows, following.result())
         return self._observe_start(), reward, everyone, ~everyone, infos
 
     def decide(self, actions: Any) -> Decision:
@@ -207,8 +212,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        if self.scenes is None:
-            raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
+        self._check_running()
+        assert self.scenes is not None
         actions = checked_actions(actions, self.num_envs, self.action_layout.names)
         plan = self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
         outcome = self._executor(plan, self.scenes)
@@ -229,7 +234,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let threads and windows go."""
-        self._executor.close()
+        self._beside.close()
         self._renderer.close()
 
     def _render_one(self, sim: int) -> Any:
@@ -246,6 +251,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return self._renderer.movement(
             sim, scenes.take([sim]), plan.take([sim]), self._executor.rollout(sim, scenes)
         )
+
+    def _check_running(self) -> None:
+        if self.scenes is None:
+            raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
 
     def _seed(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None and self._generators:

@@ -44,7 +44,8 @@ def bench(config: BenchConfig) -> list[Ratio]:
     """Measure everything; takes about half a minute."""
     return [
         _simulation(config.env, config.num_envs, config.repeats),
-        _single(config.env, config.repeats),
+        _single(config.env, config.repeats, resets=False),
+        _single(config.env, config.repeats, resets=True),
         *(_sampling(shared, config.repeats) for shared in (True, False)),
     ]
 
@@ -82,13 +83,19 @@ def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
     env.step(actions)
     steps = (env.unwrapped.physics_steps - before) // num_envs
     engine = _engine(env.unwrapped.model, num_envs, steps, threads=0)
-    rates = _rates(env, lambda: env.step(actions), engine, num_envs * steps, repeats)
+
+    def step() -> float:
+        began = time.perf_counter()
+        env.step(actions)
+        return time.perf_counter() - began
+
+    rates = _rates(env, step, engine, num_envs * steps, repeats)
     env.close()
     return Ratio(f"make_vec, {num_envs} environments", *rates)
 
 
-def _single(env_id: str, repeats: int) -> Ratio:
-    """The same for one environment through `gym.make`."""
+def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
+    """The same for one environment through `gym.make`, with or without the time to draw its scenes."""
     env = gym.make(env_id)
     env.reset(seed=0)
     action = _actions(env.action_space, 1)[0]
@@ -97,10 +104,15 @@ def _single(env_id: str, repeats: int) -> Ratio:
     env.step(action)
     steps = inner.physics_steps - before
 
-    def episodes() -> None:
+    def episodes() -> float:
+        spent = 0.0
         for _ in range(20):
+            began = time.perf_counter()
             env.reset()
+            ready = time.perf_counter()
             env.step(action)
+            spent += time.perf_counter() - (began if resets else ready)
+        return spent
 
     alone = _engine(inner.model, 1, steps, threads=1)
 
@@ -110,20 +122,23 @@ def _single(env_id: str, repeats: int) -> Ratio:
 
     rates = _rates(env, episodes, engine, 20 * steps, repeats)
     env.close()
-    return Ratio("make, one environment, reset and step", *rates)
+    return Ratio(f"make, one environment, {'reset and step' if resets else 'step'}", *rates)
 
 
 def _rates(
-    env: Any, step: Callable[[], Any], engine: Callable[[], Any], raw_steps: int, repeats: int
+    env: Any, step: Callable[[], float], engine: Callable[[], Any], raw_steps: int, repeats: int
 ) -> tuple[float, float, str, float]:
-    """Steps per second of both sides; those of the environment are counted, as scenes and lengths differ."""
+    """Steps per second of both sides; those of the environment are counted, as scenes and lengths differ.
+
+    `step` returns the seconds that count.
+    """
     best = 0.0
 
     def counted() -> None:
         nonlocal best
-        before, began = env.unwrapped.physics_steps, time.perf_counter()
-        step()
-        best = max(best, (env.unwrapped.physics_steps - before) / (time.perf_counter() - began))
+        before = env.unwrapped.physics_steps
+        spent = step()
+        best = max(best, (env.unwrapped.physics_steps - before) / spent)
 
     _, raw = fastest(repeats, counted, engine)
     return best, raw_steps / raw, "physics steps/s", best / (raw_steps / raw)

@@ -28,7 +28,7 @@ WITHOUT_OBSTACLES = 100
 ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0")
 DRAWN_AT_ONCE = 2048
 MOST_DRAWN = 64 * DRAWN_AT_ONCE
-SPARE, SAFE = 1.2, 1.25
+SPARE, SAFE = 1.2, 1.1
 """How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
 
 
@@ -77,9 +77,9 @@ def _draw(trial: Trial, generator: np.random.Generator, size: int) -> Scenes:
 def _estimate(trial: Trial, scenes: Scenes) -> NDArray[np.float64]:
     """Planned shares, more exact where they are small, shape (N,)."""
     share = planned_share(trial, scenes, draws=256)
-    small = np.flatnonzero(share < 0.03)
-    if len(small):
-        share[small] = planned_share(trial, scenes.take(small), seed=1, draws=2048)
+    for below, draws in ((0.03, 2048), (0.013, 16384)):
+        for row in np.flatnonzero(share < below):
+            share[row] = planned_share(trial, scenes.take([row]), seed=draws, draws=draws)[0]
     return share
 
 
