@@ -113,7 +113,7 @@ def test_the_console_script_exists():
 
 def commands_in(text):
     """Command lines that begin with a name we own, as a reader would type them."""
-    blocks = re.findall(r"```(?:bash|sh|console|shell|text)?\n(.*?)```", text, flags=re.DOTALL)
+    blocks = [block for _, block in re.findall(r"```(\w*)\n(.*?)```", text, flags=re.DOTALL)]
     inline = re.findall(r"`((?:viapoint|make) [^`\n]+)`", text)
     lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines()] + inline
     return [line.partition("  #")[0].strip() for line in lines if re.match(r"(viapoint|make) ", line)]
