@@ -25,7 +25,7 @@ FIELDS = ("start", "goal", "obstacles", "share", "solution")
 
 def bands(share: Float) -> NDArray[np.int64]:
     """Index into BANDS of each solution share, shape (N,)."""
-    return np.searchsorted(-np.array(BAND_EDGES), -share, side="left").astype(np.int64)
+    return np.searchsorted(-np.array(BAND_EDGES), -share, side="right").astype(np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
