@@ -7,6 +7,15 @@ import pytest
 from viapoint.primitives import minimum_jerk_coefficients, passage_durations, point_to_point, through
 
 RNG = np.random.default_rng(50)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
+
+
 mpmath.mp.dps = 40
 
 

@@ -18,6 +18,15 @@ from viapoint.primitives import (
 )
 
 RNG = np.random.default_rng(90)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
+
+
 torch.set_num_threads(1)
 
 

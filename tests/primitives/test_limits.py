@@ -6,6 +6,13 @@ import pytest
 from viapoint.primitives import minimum_duration, passage_durations, point_to_point, through
 
 RNG = np.random.default_rng(60)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
 
 
 def movements(count=25, vias=2, order=3):

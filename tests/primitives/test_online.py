@@ -6,6 +6,13 @@ import pytest
 from viapoint.primitives import FREE, passage_durations, point_to_point, retarget, through
 
 RNG = np.random.default_rng(80)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
 
 
 def test_position_velocity_and_acceleration_go_on_without_a_jump():

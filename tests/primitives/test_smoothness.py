@@ -17,6 +17,15 @@ from viapoint.primitives import (
 )
 
 RNG = np.random.default_rng(70)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
+
+
 MEASURES = [dimensionless_jerk, log_dimensionless_jerk, spectral_arc_length]
 
 

@@ -7,6 +7,13 @@ import torch
 from viapoint.primitives import FREE, passage_durations, point_to_point, through
 
 RNG = np.random.default_rng(40)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
 
 
 def tensor(*shape, scale=1.0):

@@ -10,6 +10,13 @@ from scipy.interpolate import make_interp_spline
 from viapoint.primitives import FREE, passage_durations, point_to_point, through
 
 RNG = np.random.default_rng(30)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Every test begins with the same random numbers, whatever ran before it."""
+    RNG.bit_generator.state = START
 
 
 def random_movement(vias, order=3, batch=(), dimension=2, moving=True):
