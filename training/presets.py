@@ -51,7 +51,7 @@ _OFF_POLICY: dict[str, Any] = {
 PRESETS: dict[str, Preset] = {
     "viatd3": _preset(
         64,
-        12_800,
+        16_000,
         "ViaPolicy",  # its defaults are its settings
         learning_rate={"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0},
     ),

@@ -1,6 +1,9 @@
 """What every registered environment keeps to."""
 
+import os
 import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium as gym
@@ -197,3 +200,16 @@ def test_stepping_before_a_reset_is_refused(env_id):
     env = gym.make(env_id).unwrapped
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+
+
+def test_a_missing_opengl_library_is_named_where_mujoco_asks_for_it():
+    """Where the library is there, everything works; where not, one error says what to do."""
+    code = "import gymnasium, viapoint.envs; gymnasium.make('viapoint/PlanarReach-v0'); print('made')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "MUJOCO_GL": "osmesa"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "made" in done.stdout or "unset MUJOCO_GL, or install the library" in done.stderr.splitlines()[-1]
