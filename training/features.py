@@ -193,7 +193,9 @@ def _away(observation: Observation, hand: Tensor, task: Task) -> Tensor:
     rest = offset - along.clamp(-1.0, 1.0).unsqueeze(-1) * axis
     length = rest.norm(dim=-1)
     clearance = length - rows.radius[:, None, :, None] - task.arm.hand_radius
-    clearance = torch.where((rows.present > 0.5)[:, None, :, None], clearance, torch.full_like(clearance, 1.0))
+    clearance = torch.where(
+        (rows.present > 0.5)[:, None, :, None], clearance, torch.full_like(clearance, 1.0)
+    )
     least, nearest = clearance.min(dim=2, keepdim=True)
     unit = rest / length.clamp(min=1e-9).unsqueeze(-1)
     unit = unit.gather(2, nearest.unsqueeze(-1).expand(-1, -1, -1, -1, unit.shape[-1])).squeeze(2)

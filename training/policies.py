@@ -158,6 +158,17 @@ class ViaPolicy(TD3Policy):
         self.width, self.candidates = width, candidates
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
+    def _build(self, lr_schedule: Any) -> None:
+        """Actor and critic with their optimisers; nothing is bootstrapped, so each is its own target."""
+        self.actor, self.critic = self.make_actor(), self.make_critic()
+        for network in (self.actor, self.critic):
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
+        self.__dict__.update(actor_target=self.actor, critic_target=self.critic)  # not modules of their own
+
     def make_actor(self, features_extractor: Any = None) -> Any:
         """An actor for the task."""
         spaces_: Any = (self.observation_space, self.action_space)
