@@ -37,13 +37,14 @@ class Simulator:
         self.model = arm.compile(n_obstacles, whole_arm)
         self.physics_steps = 0
         """Physics steps simulated so far, all simulations together."""
-        self._batch = batch.Batch(self.model, num_envs, threads)
-        self._rest_state = self._batch.state[0].copy()
+        self.batch = batch.Batch(self.model, num_envs, threads)
+        """MuJoCo's engine, whose state rows are the simulations'."""
+        self._rest_state = self.batch.state[0].copy()
         self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
         if n_obstacles:
-            self._sizes = self._batch.expand("geom_size")
-            self._bounds = self._batch.expand("geom_rbound")
-            self._boxes = self._batch.expand("geom_aabb")
+            self._sizes = self.batch.expand("geom_size")
+            self._bounds = self.batch.expand("geom_rbound")
+            self._boxes = self.batch.expand("geom_aabb")
 
     @property
     def timestep(self) -> float:
@@ -61,8 +62,8 @@ class Simulator:
             obstacles: Rows (centre D, half-axis D, radius), shape (n, rows, 2 D + 1), [m].
             present: Whether a row is an obstacle, shape (n, rows).
         """
-        self._batch.state[sims] = self._rest_state
-        self._batch.bind("qpos")[sims] = joints
+        self.batch.state[sims] = self._rest_state
+        self.batch.bind("qpos")[sims] = joints
         if not self._geoms:
             return
         dimension = (obstacles.shape[-1] - 1) // 2
@@ -70,8 +71,8 @@ class Simulator:
         axis = _in_space(obstacles[..., dimension : 2 * dimension])
         half = np.sqrt((axis * axis).sum(axis=-1))
         radius = obstacles[..., -1]
-        self._batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
-        self._batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
+        self.batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
+        self.batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
         self._resize(sims, np.where(present, radius, 0.01), np.where(present, half, 0.0))
 
     def rollout(self, sims: NDArray[np.int64], controls: Float) -> Record:
@@ -83,19 +84,19 @@ class Simulator:
         """
         steps = controls.shape[1]
         warnings = self._warnings(sims)
-        out = self._batch.rollout(steps, controls, record=("qpos", "ncon"), ids=sims)
+        out = self.batch.rollout(steps, controls, record=("qpos", "ncon"), ids=sims)
         self.physics_steps += steps * len(sims)
         return Record(out["qpos"], out["ncon"] > 0, (self._warnings(sims) > warnings) | ~_finite(out["qpos"]))
 
     def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of one simulation with the arm at `joints`, to draw them."""
-        model, data = self._batch.get_model(sim), self._batch.get_data(sim)
+        model, data = self.batch.get_model(sim), self.batch.get_data(sim)
         data.qpos[:] = joints
         mujoco.mj_forward(model, data)
         return model, data
 
     def _warnings(self, sims: NDArray[np.int64]) -> Any:
-        return self._batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
+        return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
 
     def _resize(self, sims: NDArray[np.int64], radius: Float, half: Float) -> None:
         """Set the sizes of the capsules and everything that MuJoCo derived from them when it compiled the model."""

@@ -12,13 +12,15 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from mujoco import batch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 import viapoint.envs
 from viapoint import primitives
+from viapoint.envs.scenes import Scenes
+from viapoint.envs.simulator import Simulator
+from viapoint.envs.task import Task
 from viapoint.training.config import BenchConfig
 from viapoint.training.files import write_json
 
@@ -79,10 +81,10 @@ def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
     env: Any = gym.make_vec(env_id, num_envs=num_envs)
     env.reset(seed=0)
     actions = _actions(env.single_action_space, num_envs)
-    before = env.unwrapped.physics_steps
+    scenes, before = env.unwrapped.scenes, env.unwrapped.physics_steps
     env.step(actions)
     steps = (env.unwrapped.physics_steps - before) // num_envs
-    engine = _engine(env.unwrapped.model, num_envs, steps, threads=0)
+    engine = _engine(env.unwrapped.task, scenes, actions, steps, threads=0)
 
     def step() -> float:
         began = time.perf_counter()
@@ -100,7 +102,7 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
     env.reset(seed=0)
     action = _actions(env.action_space, 1)[0]
     inner: Any = env.unwrapped
-    before = inner.physics_steps
+    scenes, before = inner.batch.scenes, inner.physics_steps
     env.step(action)
     steps = inner.physics_steps - before
 
@@ -114,7 +116,7 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
             spent += time.perf_counter() - (began if resets else ready)
         return spent
 
-    alone = _engine(inner.model, 1, steps, threads=1)
+    alone = _engine(inner.task, scenes, action[None], steps, threads=1)
 
     def engine() -> None:
         for _ in range(20):
@@ -144,15 +146,29 @@ def _rates(
     return best, raw_steps / raw, "physics steps/s", best / (raw_steps / raw)
 
 
-def _engine(model: Any, num_envs: int, steps: int, threads: int) -> Callable[[], Any]:
-    """A rollout of the model alone, with the records that the environment needs."""
-    sims = batch.Batch(model, num_envs, threads)
-    state = sims.state.copy()
-    controls = np.zeros((num_envs, steps, model.nu))
+def _engine(
+    task: Task, scenes: Scenes, actions: NDArray[np.float32], steps: int, threads: int
+) -> Callable[[], Any]:
+    """A rollout of the engine alone: the same controls in the same scenes, with the records the environment needs."""
+    number = len(actions)
+    simulator = Simulator(
+        task.arm,
+        n_obstacles=task.observation.n_rows,
+        whole_arm=task.whole_arm,
+        num_envs=number,
+        threads=threads,
+    )
+    joints = np.asarray(task.arm.posture(scenes.start))
+    simulator.place(np.arange(number), joints, scenes.obstacles, scenes.present)
+    movement = task.action.decode(actions.astype(np.float64), scenes.start, scenes.goal).trajectory()
+    controls = np.ascontiguousarray(
+        task.arm.controls(*movement.sample(simulator.timestep * np.arange(steps)))
+    )
+    state = simulator.batch.state.copy()
 
     def rollout() -> None:
-        sims.state[:] = state
-        sims.rollout(steps, controls, record=("qpos", "ncon"))
+        simulator.batch.state[:] = state
+        simulator.batch.rollout(steps, controls, record=("qpos", "ncon"))
 
     return rollout
 
