@@ -50,6 +50,11 @@ class Look(NamedTuple):
     fares: Tensor
     """How each would fare: clearance and reach, and where the nearest obstacle is at each phase, shape (B, A, .)."""
 
+    def at(self, some: Tensor) -> Look:
+        """Only some of the anchors, `some` of shape (B, n) in each scene."""
+        rows = torch.arange(len(some)).unsqueeze(-1)
+        return Look(self.scene, self.anchors[rows, some], self.fares[rows, some])
+
 
 class Foresight(NamedTuple):
     """What is known of planned movements, shape (B, H, ...) for H actions in each of B scenes."""

@@ -36,7 +36,7 @@ class ViaTD3(TD3):
         explore_uniformly: Share of decisions taken at random later on.
         noise: Standard deviation of what is added to the others.
         temperature: Difference of score that makes one of them e times as likely as another.
-        promising: How many of the best-scored proposals of a scene an update of the actor looks at.
+        promising: How many of the best-scored proposals of a scene, among a random half of them, an update looks at.
         others: And how many besides, drawn at random.
         fresh_scenes: Scenes drawn for the actor after each step of all environments.
         augment: Whether their mirror images and exchanged ends join them.
@@ -124,14 +124,16 @@ class ViaTD3(TD3):
         """Improve proposals in the critic's judgement, and let their scores foretell it."""
         assert self.pool is not None
         observation, look = self.pool.sample(batch_size)
-        proposals, scores = self.actor.propose(look)
-        best = scores.topk(self.promising, dim=-1).indices
-        others = torch.randint(0, scores.shape[1], (batch_size, self.others))
-        looked_at = torch.arange(batch_size).unsqueeze(-1), torch.cat((best, others), dim=-1)
+        number = look.anchors.shape[1]
+        look = look.at(torch.randperm(number)[: max(number // 2, self.promising)].expand(batch_size, -1))
+        with torch.no_grad():
+            best = self.actor.propose(look)[1].topk(self.promising, dim=-1).indices
+        others = torch.randint(0, look.anchors.shape[1], (batch_size, self.others))
+        proposals, scores = self.actor.propose(look.at(torch.cat((best, others), dim=-1)))
         self.critic.requires_grad_(False)
-        judgement = torch.add(*self.critic.judge(observation, proposals[looked_at]))
+        judgement = torch.add(*self.critic.judge(observation, proposals))
         self.critic.requires_grad_(True)
-        score_loss = functional.smooth_l1_loss(scores[looked_at], judgement.detach(), beta=0.5)
+        score_loss = functional.smooth_l1_loss(scores, judgement.detach(), beta=0.5)
         loss = score_loss - judgement.mean()
         self.actor.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
