@@ -34,9 +34,9 @@ class RewardWeights:
     """+ clip(planned_clearance, -0.05 m, 0.01 m) / 0.05 m; the plan's, as a crash ends at the surface."""
     goal_error: float = 0.5
     """- min(goal_error / 0.1 m, 1)."""
-    smoothness: float = 0.05
+    smoothness: float = 0.1
     """- log(jerk cost / jerk cost of the zero action), never less than 0 for the same duration."""
-    duration: float = 0.25
+    duration: float = 0.5
     """- (duration / duration of the zero action - 1)."""
 
     def __post_init__(self) -> None:
