@@ -18,6 +18,10 @@ LOG_SPLIT = float(np.log(4.0))
 """What an action of 1 adds to the log ratio of two neighbouring segments' durations: a factor of four."""
 
 
+SHORTEST, LONGEST = 0.05, 60.0
+"""Bounds of the duration range, [s]."""
+
+
 class Plan(NamedTuple):
     """A movement as a person would write it down."""
 
@@ -64,6 +68,12 @@ class ActionLayout:
         if self.timing not in get_args(Timing):
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
         check_increasing_pair("duration_range", self.duration_range)
+        if not SHORTEST <= self.duration_range[0] < self.duration_range[1] <= LONGEST:
+            raise ValueError(
+                f"duration_range must lie within {SHORTEST} to {LONGEST} s, got {self.duration_range!r}"
+            )
+        if len(self.via_scale) < self.dimension or not all(scale > 0.0 for scale in self.via_scale):
+            raise ValueError(f"via_scale must be {self.dimension} positive numbers, got {self.via_scale!r}")
         low, high = self.duration_range
         object.__setattr__(self, "duration_range", (float(low), float(high)))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,9 +71,12 @@ def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
     """A seed for each environment: `seed + i`, `seed[i]`, or None."""
-    if seed is None or isinstance(seed, int | np.integer):
-        return [None if seed is None else int(seed) + i for i in range(num_envs)]
-    seeds = list(seed)
+    if seed is None:
+        return [None] * num_envs
+    if not isinstance(seed, Sequence | np.ndarray):
+        first = whole_number("seed", seed, 0)
+        return [first + i for i in range(num_envs)]
+    seeds = [None if s is None else whole_number("seed", s, 0) for s in cast("Sequence[Any]", seed)]
     if len(seeds) != num_envs:
         raise ValueError(f"seed must be a whole number or {num_envs} of them, got {len(seeds)}")
     return seeds

@@ -24,6 +24,8 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
     metadata = SINGLE_METADATA
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
+        if "num_envs" in kwargs:
+            raise TypeError("num_envs is an argument of gym.make_vec; gym.make makes one environment")
         EzPickle.__init__(self, threads=threads, **kwargs)
         self.batch = ReachVectorEnv(1, threads=threads, **kwargs)
         """The batch of one that this environment is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -29,8 +30,9 @@ from viapoint.envs.execution import Executor, Rollout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
 from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
+from viapoint.envs.scene_options import draw_given
 from viapoint.envs.scene_sampling import SceneDistribution
-from viapoint.envs.scenes import Scenes, check_scenes, given_scenes
+from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
@@ -100,6 +102,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             duration_range=duration_range, reward_weights=reward_weights, render_mode=render_mode,
             width=width, height=height, threads=threads,
         )  # fmt: skip
+        if not hasattr(arm, "reach_margin"):
+            raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
+        if not isinstance(whole_arm, bool | np.bool_):
+            raise TypeError(f"whole_arm must be True or False, got {whole_arm!r}")
         self.num_envs = whole_number("num_envs", num_envs, 1)
         threads = whole_number("threads", threads, 0)
         self.task = Task(
@@ -175,8 +181,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         options = dict(options or {})
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
-        self._seed(seed)
-        scenes = self._draw(rows, options)
+        seeded = self._seeded(seed, rows)
+        scenes = self._draw(seeded, rows, options)
+        self._generators = seeded
+        self._np_random = seeded[0]
+        if seed is not None:
+            self._np_random_seed = seeds_of(seed, self.num_envs)[0]
+        self._last = self._last if len(rows) < self.num_envs else None
         self._start(rows, scenes)
         return self._observe_start(), {}
 
@@ -189,7 +200,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._check_running()
         actions = checked_actions(actions, self.num_envs, self.action_layout.names)
         rows = np.arange(self.num_envs)
-        following = self._beside.submit(self._draw, rows, {})
+        following = self._beside.submit(self._draw, self._generators, rows, {})
         observation, reward, info = self.decide(actions)
         everyone = np.ones(self.num_envs, dtype=bool)
         final = np.empty(self.num_envs, dtype=object)
@@ -226,7 +237,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return Decision(observation, terms.total(), _info(outcome, terms))
 
     def render(self) -> Any:
-        """The last movement of each environment as the render mode says; before the first, the scenes."""
+        """The last movement of each environment as the render mode says; after a reset, the scenes."""
+        if self._last is None:
+            self._check_running()
         frames = tuple(
             self._render_one(sim) for sim in range(self.num_envs if self.render_mode != "human" else 1)
         )
@@ -256,39 +269,37 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         if self.scenes is None:
             raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
 
-    def _seed(self, seed: int | Sequence[int | None] | None) -> None:
-        if seed is None and self._generators:
-            return
+    def _seeded(
+        self, seed: int | Sequence[int | None] | None, rows: NDArray[np.int64]
+    ) -> list[np.random.Generator]:
+        """Generators for the next episodes: those in use, but new ones where a seed is given."""
         seeds = seeds_of(seed, self.num_envs)
         if not self._generators:
-            self._generators = [seeding.np_random(s)[0] for s in seeds]
-        else:
-            pairs = zip(self._generators, seeds, strict=True)
-            self._generators = [old if s is None else seeding.np_random(s)[0] for old, s in pairs]
-        self._np_random, self._np_random_seed = self._generators[0], seeds[0] if seeds[0] is not None else -1
+            return [seeding.np_random(s)[0] for s in seeds]
+        generators = list(self._generators)
+        for i in rows:
+            if seeds[i] is not None:
+                generators[i] = seeding.np_random(seeds[i])[0]
+        return generators
 
-    def _draw(self, rows: NDArray[np.int64], options: Mapping[str, Any]) -> Scenes:
-        """Scenes for some environments, sampled or given."""
-        generators = [self._generators[i] for i in rows]
+    def _draw(
+        self, generators: list[np.random.Generator], rows: NDArray[np.int64], options: Mapping[str, Any]
+    ) -> Scenes:
+        """Scenes for some environments, sampled or given; where one is refused, the generators are as they were."""
         if not options:
-            return self._sampler(generators)
-        blank = Scenes(*(np.full((len(rows), *shape), np.nan) for shape in self._scene_shapes()))
-        given = given_scenes(options, blank, self.arm)
-        if not {"start", "goal", "obstacles"} <= set(options):
-            sampled = self._sampler(generators, (given.start, given.goal))
-            given = given_scenes(options, sampled, self.arm)
-        check_scenes(given, self.arm, whole_arm=self.task.whole_arm)
-        return given
-
-    def _scene_shapes(self) -> tuple[tuple[int, ...], ...]:
-        d = self.arm.dimension
-        return (d,), (d,), (self.observation_layout.n_rows, 2 * d + 1)
+            return self._sampler([generators[i] for i in rows])
+        tried = [copy.deepcopy(generators[i]) for i in rows]
+        scenes = draw_given(options, self._sampler, tried, self.observation_layout.n_rows)
+        for i, generator in zip(rows, tried, strict=True):
+            generators[i] = generator
+        return scenes
 
     def _start(self, rows: NDArray[np.int64], scenes: Scenes) -> None:
         """Begin episodes: the arms at rest at the start, the obstacles in place."""
         if self.scenes is None or len(rows) == self.num_envs:
             self.scenes = scenes
         else:
+            self.scenes = Scenes(*(field.copy() for field in self.scenes))
             self.scenes.put(rows, scenes)
         self._simulator.place(
             rows, np.asarray(self.arm.posture(scenes.start)), scenes.obstacles, scenes.present

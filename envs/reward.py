@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ class RewardWeights:
         """Refuse a weight that turns its term round."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) < np.inf:
                 raise ValueError(
                     f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}"
                 )
@@ -53,6 +54,8 @@ class RewardWeights:
         """Weights from a record, from a mapping of some of them, or the defaults."""
         if isinstance(weights, RewardWeights):
             return weights
+        if weights is not None and not isinstance(weights, Mapping):
+            raise ValueError(f"reward_weights must be a mapping of names to numbers, got {weights!r}")
         given = dict(weights or {})
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(given) - set(known))
@@ -83,9 +86,9 @@ class RewardTerms(NamedTuple):
 def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeights) -> RewardTerms:
     """The weighted terms of movements.
 
-    Every term is bounded, so that no movement outweighs all others. With the default weights a crash is worth less
-    than a movement that the arm refuses, and that less than any success; and among straight movements the one of the
-    centre duration is best: there a longer one costs as much time as it saves jerk.
+    Every term is bounded, so that no movement outweighs all others. With the default weights any success is worth
+    more than any failure; and among movements of one shape the one of the centre duration is best: there a longer
+    one costs as much time as it saves jerk.
 
     Args:
         outcome: Of N movements.

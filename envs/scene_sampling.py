@@ -24,6 +24,8 @@ Float = NDArray[np.float64]
 ENDS, WITNESSES, CANDIDATES, PHASES, WAYS = 16, 6, 32, 40, 15
 """How many pairs of ends, witnesses and obstacles are drawn at once, at how many times a movement is looked at,
 and how many ways round are told apart."""
+MOST = 8
+"""Obstacles of a scene at most."""
 ATTEMPTS = 200
 INWARD = 0.85
 """Share of witnesses that pass between base and obstacles, where links count: few others leave room for them."""
@@ -61,9 +63,9 @@ class SceneDistribution:
     def __post_init__(self) -> None:
         """Refuse what cannot be sampled."""
         fewest, most = self.n_obstacles
-        if not 0 <= fewest <= most <= CANDIDATES // 2:
+        if not 0 <= fewest <= most <= MOST:
             raise ValueError(
-                f"n_obstacles must be (fewest, most), 0 <= fewest <= most <= {CANDIDATES // 2}, got {self.n_obstacles}"
+                f"n_obstacles must be (fewest, most), 0 <= fewest <= most <= {MOST}, got {self.n_obstacles}"
             )
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))

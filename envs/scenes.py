@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,41 +85,8 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
     return pairs, Scenes(start, goal, rows[:, None, :])
 
 
-def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scenes:
-    """Sampled scenes with what `options` gives in their place.
-
-    Args:
-        options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
-            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m].
-        sampled: The scenes to overwrite.
-        arm: Only names the dimension.
-
-    Raises:
-        ValueError: An array is not finite or has another shape, or a name is unknown.
-    """
-    unknown = set(options) - {"start", "goal", "obstacles", "reset_mask"}
-    if unknown:
-        raise ValueError(
-            f"reset options know start, goal, obstacles and reset_mask, not {', '.join(sorted(map(repr, unknown)))}"
-        )
-    number, rows = sampled.obstacles.shape[:2]
-    fields = {name: getattr(sampled, name).copy() for name in ("start", "goal", "obstacles")}
-    for name in ("start", "goal"):
-        if name in options:
-            fields[name][:] = _broadcast(name, options[name], (number, arm.dimension))
-    if "obstacles" in options:
-        given = np.asarray(options["obstacles"], dtype=np.float64)
-        count = given.shape[-2] if given.ndim >= 2 else -1
-        if not 0 <= count <= rows:
-            raise ValueError(
-                f"options['obstacles'] must have shape (n, {2 * arm.dimension + 1}) or "
-                f"({number}, n, {2 * arm.dimension + 1}) with n at most {rows}, got {given.shape}"
-            )
-        fields["obstacles"][:] = 0.0
-        fields["obstacles"][:, :count] = _broadcast(
-            "obstacles", given, (number, count, 2 * arm.dimension + 1)
-        )
-    return Scenes(**fields)
+Problem = tuple[NDArray[np.bool_], Callable[[int], str]]
+"""Which scenes have a fault, shape (N,), and the words for it in one of them."""
 
 
 def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
@@ -128,27 +95,62 @@ def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
     Raises:
         ValueError: With the scene, the offender and what is allowed.
     """
+    for wrong, reason in problems(scenes, arm, whole_arm=whole_arm):
+        if wrong.any():
+            first = int(wrong.argmax())
+            raise ValueError(f"scene {first}: {reason(first)}")
+
+
+def problems(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Iterator[Problem]:
+    """Everything that can be wrong with N scenes."""
+    yield from _problems_of_ends(scenes, arm)
+    yield from _problems_of_sizes(scenes)
+    for name, point in (("start", scenes.start), ("goal", scenes.goal)):
+        clearance = rest_clearance(scenes, point, arm, whole_arm=whole_arm)
+        touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
+        yield (
+            least <= 0.0,
+            lambda i, n=name, t=touched, c=least: (  # type: ignore[misc]
+                f"obstacle {t[i]} {_shown(scenes.obstacles[i, t[i]])} m touches the arm at the {n} "
+                f"(clearance {c[i]:.4f} m; more than 0 is needed)"
+            ),
+        )
+
+
+def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
     apart = np.sqrt(((scenes.goal - scenes.start) ** 2).sum(axis=-1))
-    _refuse(
+    yield (
         apart < SHORTEST,
         lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {SHORTEST} m is needed",
     )
-    _check_sizes(scenes)
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
         margin = np.asarray(arm.reach_margin(point))
-        _refuse(
+        yield (
             margin < 0.0,
-            lambda i, n=name, p=point, m=margin: (
+            lambda i, n=name, p=point, m=margin: (  # type: ignore[misc]
                 f"{n} {_shown(p[i])} m is {-m[i]:.4f} m out of the arm's reach"
             ),
         )
-        clearance = rest_clearance(scenes, point, arm, whole_arm=whole_arm)
-        touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
-        _refuse(
-            least <= 0.0,
-            lambda i, n=name, t=touched, c=least: (
-                f"obstacle {t[i]} {_shown(scenes.obstacles[i, t[i]])} m touches the arm at the {n} "
-                f"(clearance {c[i]:.4f} m; more than 0 is needed)"
+
+
+def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
+    dimension = scenes.start.shape[-1]
+    half = np.sqrt((scenes.obstacles[..., dimension : 2 * dimension] ** 2).sum(axis=-1))
+    radius = scenes.obstacles[..., -1]
+    named = (scenes.obstacles != 0.0).any(axis=-1)
+    for wrong, what in (
+        (named & (radius <= 0.0), "has no positive radius"),
+        (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
+        (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
+        (
+            (np.abs(scenes.obstacles[..., :dimension]) > 1.0).any(axis=-1),
+            "has its centre over 1 m from the origin",
+        ),
+    ):
+        yield (
+            wrong.any(axis=-1),
+            lambda i, w=wrong, x=what: (  # type: ignore[misc]
+                f"obstacle {w[i].argmax()} {_shown(scenes.obstacles[i, w[i].argmax()])} m {x}"
             ),
         )
 
@@ -162,46 +164,6 @@ def rest_clearance(scenes: Scenes, point: Float, arm: Arm, *, whole_arm: bool) -
     return np.concatenate(
         (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
     )
-
-
-def _check_sizes(scenes: Scenes) -> None:
-    dimension = scenes.start.shape[-1]
-    half = np.sqrt((scenes.obstacles[..., dimension : 2 * dimension] ** 2).sum(axis=-1))
-    radius = scenes.obstacles[..., -1]
-    for wrong, what in (
-        (radius < 0.0, "has a negative radius"),
-        (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
-        (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
-        (
-            (np.abs(scenes.obstacles[..., :dimension]) > 1.0).any(axis=-1),
-            "has its centre over 1 m from the origin",
-        ),
-    ):
-        _refuse(
-            wrong.any(axis=-1),
-            lambda i, w=wrong, x=what: (
-                f"obstacle {w[i].argmax()} {_shown(scenes.obstacles[i, w[i].argmax()])} m {x}"
-            ),
-        )
-
-
-def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> Float:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-        result = np.broadcast_to(array, shape)
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"options[{name!r}] must have shape {shape} or {shape[1:]}, got {np.shape(value)}"
-        ) from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"options[{name!r}] must be finite, got {array[~np.isfinite(array)][0]}")
-    return result
-
-
-def _refuse(wrong: Any, reason: Any) -> None:
-    if wrong.any():
-        first = int(wrong.argmax())
-        raise ValueError(f"scene {first}: {reason(first)}")
 
 
 def _shown(values: Float) -> str:

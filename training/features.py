@@ -126,6 +126,8 @@ class Anchors:
     """
 
     def __init__(self, task: Task) -> None:
+        if not task.action.n_via:
+            raise ValueError("a policy of via-points needs an environment with n_via of 1 or more")
         d = task.arm.dimension
         layout = ActionLayout(dimension=d, via_scale=(1.0,) * d)
         along, height, turn = np.meshgrid(ALONG, HEIGHT, _turns(d), indexing="ij")

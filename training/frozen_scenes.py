@@ -93,10 +93,13 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
     """
     path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
-    if not path.is_file():
+    if str(name_or_path) in SETS and not path.is_file():
+        there = [name for name in SETS if shipped_path(name, env_id).is_file()]
         raise ValueError(
-            f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s} ({path} is none)"
+            f"no {name_or_path} scenes are shipped for {env_id}; there are: {', '.join(there) or 'none'}"
         )
+    if not path.is_file():
+        raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
     try:
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256")}

@@ -25,7 +25,8 @@ SEEDS = {"validation": 1_000_003, "test": 2_000_003}
 SIZES = {"validation": 500, "test": 1000}
 WITHOUT_OBSTACLES = 100
 """Scenes of a set with nothing in the way."""
-ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0")
+ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0")
+"""Environments with shipped scenes."""
 DRAWN_AT_ONCE = 2048
 MOST_DRAWN = 64 * DRAWN_AT_ONCE
 SPARE, SAFE = 1.2, 1.1

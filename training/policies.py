@@ -187,12 +187,12 @@ class ViaPolicy(TD3Policy):
     def ranked(self, observation: Observation, candidates: int) -> Tensor:
         """The best of the proposals and their neighbours in the critic's judgement, shape (B, m).
 
-        Neighbours lie on fixed offsets about the two most promising proposals, so that a decision is deterministic.
+        Neighbours lie on fixed offsets about the most promising proposals, so that a decision is deterministic.
         """
         proposals, scores = self.actor.propose(self.actor.look(observation))
         rows = torch.arange(len(proposals)).unsqueeze(-1)
         promising = proposals[rows, scores.topk(4, dim=-1).indices]
-        offsets = self._offsets(candidates // promising.shape[1])
+        offsets = self._offsets(-(-candidates // promising.shape[1]))
         near = (promising.unsqueeze(2) + offsets).flatten(1, 2).clamp(-1.0, 1.0)
         actions = torch.cat((proposals, near), dim=1)
         learned, known = self.critic.judge(observation, actions)

@@ -176,3 +176,16 @@ def test_a_wrapped_batch_takes_scenes_in_a_batch():
     assert isinstance(env.unwrapped.scenes, Scenes)
     *_, info = env.step(np.zeros((3, 3)))
     assert info["is_success"].all()
+
+
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"])
+def test_any_success_is_worth_more_than_any_failure(env_id):
+    env = gym.make_vec(env_id, num_envs=256)
+    env.reset(seed=1)
+    rng, rewards, success = np.random.default_rng(1), [], []
+    for _ in range(3):
+        _, reward, *_, info = env.step(rng.uniform(-1.0, 1.0, (256, 3)))
+        rewards.append(reward)
+        success.append(info["is_success"])
+    reward, success = np.concatenate(rewards), np.concatenate(success)
+    assert reward[success].min() > reward[~success].max()

@@ -113,11 +113,16 @@ def test_what_is_not_given_is_sampled_to_fit():
         ),
         ({"obstacles": [[-0.1, 0.4, 0.0, 0.1]]}, "obstacles"),
         ({"obstacles": np.zeros((6, 5))}, "at most 5"),
-        ({"obstacles": [[-0.1, 0.4, 0.0, 0.1, -0.01]]}, "negative radius"),
+        ({"obstacles": [[-0.1, 0.4, 0.0, 0.1, -0.01]]}, "no positive radius"),
         ({"obstacles": [[-0.1, 0.4, 0.0, 0.9, 0.01]]}, "half-axis"),
         ({"start": [np.nan, 0.4]}, "finite"),
         ({"start": [0.1, 0.2, 0.3]}, "start.*shape"),
         ({"target": [0.1, 0.2]}, "'target'"),
+        ({"obstacles": [[-0.1, 0.4, 0.0, 0.1, 0.0]]}, "no positive radius"),
+        ({"goal": [2.0, 0.0], "obstacles": None}, "goal .* out of the arm's reach"),
+        ({"goal": [-0.3, 0.4], "obstacles": None}, "start and goal are 0.0000 m apart"),
+        ({"start": [0.0, 0.05], "goal": None, "obstacles": None}, "start .* out of the arm's reach"),
+        ({"start": [-0.3 + 0.1j, 0.4]}, "start.*real numbers"),
     ],
 )
 def test_an_impossible_scene_is_refused_with_the_reason_and_nothing_changes(changes, message):
@@ -128,6 +133,31 @@ def test_an_impossible_scene_is_refused_with_the_reason_and_nothing_changes(chan
         env.reset(options=scene(**changes))
     for now, then in zip(env.unwrapped.batch.scenes, before, strict=True):
         np.testing.assert_array_equal(now, then)
+
+
+def test_a_refused_scene_leaves_the_next_episodes_as_they_were():
+    options = scene(obstacles=[[-0.3, 0.41, 0.0, 0.0, 0.02]])
+    usual, refused = (gym.make("viapoint/PlanarObstacles-v0") for _ in range(2))
+    for env in (usual, refused):
+        env.reset(seed=0)
+    for seed, given in (
+        (9, options),
+        (None, options),
+        (None, {"obstacles": options["obstacles"], "start": options["start"]}),
+    ):
+        with pytest.raises(ValueError, match="touches"):
+            refused.reset(seed=seed, options=given)
+    expected, found = (env.reset()[0] for env in (usual, refused))
+    for name, part in expected.items():
+        np.testing.assert_array_equal(found[name], part)
+
+
+def test_given_obstacles_get_ends_clear_of_them_and_an_empty_list_is_none():
+    env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=64)
+    env.reset(seed=0, options={"obstacles": [[-0.1, 0.42, 0.0, 0.1, 0.01]]})
+    assert (env.unwrapped.scenes.present.sum(axis=-1) == 1).all()
+    env.reset(options={"obstacles": []})
+    assert not env.unwrapped.scenes.present.any()
 
 
 def test_rows_of_lights_stand_across_the_middle_between_targets():
