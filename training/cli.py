@@ -12,7 +12,14 @@ from typing import Annotated, Any, NamedTuple, Union
 
 import tyro
 
-from viapoint.training.config import BenchConfig, DemoConfig, EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.config import (
+    BenchConfig,
+    DemoConfig,
+    EvaluateConfig,
+    PaperConfig,
+    PlayConfig,
+    TrainConfig,
+)
 
 
 class UsageError(ValueError):
@@ -36,6 +43,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command(EvaluateConfig, "viapoint.training.commands", "evaluate"),
     "play": Command(PlayConfig, "viapoint.training.commands", "play"),
     "bench": Command(BenchConfig, "viapoint.training.bench", "run"),
+    "paper": Command(PaperConfig, "viapoint.training.paper.command", "run"),
     "demo": Command(DemoConfig, "viapoint.training.demo", "run"),
 }
 """Every subcommand by its name; one line adds one."""

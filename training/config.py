@@ -193,6 +193,21 @@ class BenchConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PaperConfig:
+    """Reproduce Flash & Hogan 1985: every claim as a number, every figure, on the model and on the simulated arm.
+
+    Example: viapoint paper --out paper
+    """
+
+    out: Path = Path("paper")
+    """Folder for the figures and the table."""
+    agent: Path | None = None
+    """Run folder of the agent that goes around the rows of lights; the shipped one, or the planner, if not given."""
+    guide: Path | None = None
+    """Folder for the small pictures of docs/flash-hogan.md."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DemoConfig:
     """Train, evaluate, draw and film an agent: everything in one folder.
 

@@ -54,7 +54,7 @@ def test_help_is_short_and_has_an_example(words, capsys):
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        ("", "train, evaluate, play, bench, demo"),
+        ("", "train, evaluate, play, bench, paper, demo"),
         ("fly", "fly"),
         ("train --env viapoint/Nothing-v0", "env must be one of viapoint/PlanarReach-v0"),
         ("train --algo dqn", "dqn"),

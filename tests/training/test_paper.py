@@ -1,0 +1,163 @@
+"""The paper reproduced: every number of the table against its promise, and the command from words to files."""
+
+import json
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from viapoint.training import cli
+from viapoint.training.paper import command, obstacles
+from viapoint.training.paper.claims import SUBJECTS, Claim, at_least, at_most, near
+from viapoint.training.paper.movements import construction, via_waypoints
+from viapoint.training.paper.passage import count_roots, passage_polynomial, root_of
+from viapoint.training.paper.profiles import Profile
+from viapoint.training.paper.reproduce import DRAWINGS, ROWS
+
+FEWER = 9
+"""Every ninth scene of the rows of lights, so that the search takes seconds."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder that the command wrote, with fewer scenes in row 12."""
+    out = tmp_path_factory.mktemp("paper")
+    every = obstacles.light_scenes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(obstacles, "light_scenes", lambda: every.take(slice(None, None, FEWER)))
+        cli.main(["paper", "--out", str(out), "--guide", str(out / "guide")])
+    return out
+
+
+def claims_of(folder):
+    return json.loads((folder / "table.json").read_text())["claims"]
+
+
+def kept(value, ends):
+    low, high = ends
+    return (low is None or value >= low) and (high is None or value <= high)
+
+
+def test_every_number_is_as_promised(made):
+    for claim in claims_of(made):
+        numbers = [name for name in ("model", "arm") if claim[name] is not None]
+        assert numbers, claim["claim"]
+        for name in numbers:
+            assert kept(claim[name], claim[f"{name}_promised"]), claim
+        assert claim["verdict"] == "holds"
+        assert (claim["arm"] is None) == (claim["deviation_mm"] is None)
+
+
+def test_all_twelve_rows_are_there_and_most_are_carried_out(made):
+    claims = claims_of(made)
+    assert {claim["row"] for claim in claims} == set(SUBJECTS) == {*ROWS, 12}
+    carried = [claim for claim in claims if claim["arm"] is not None]
+    assert len(carried) > 0.7 * len(claims)
+    usual = [claim["deviation_mm"] for claim in carried if "torque" not in claim["claim"]]
+    assert max(usual) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("row", "words", "value", "tolerance"),
+    [
+        (1, "Peak speed C", 1.875, 1e-9),
+        (4, "another count", 0.0, 0.0),
+        (5, "= 0.5 only if", 9 / 32, 1e-6),
+        (5, ".28125", 0.01073, 2e-5),
+        (7, "is .5 for every d3", 0.0, 1e-12),
+        (7, "only approximate", 0.109, 1e-3),
+        (8, "ratio of the peaks", 1.1 / 0.85, 1e-9),
+        (9, "Minimum acceleration: peak", 1.5, 1e-9),
+        (9, "Minimum snap: peak", 2.1875, 1e-9),
+        (10, "Repetitive", 1.5625, 1e-9),
+        (10, "Hitting", 2.5, 1e-9),
+    ],
+)
+def test_the_model_has_the_values_of_the_mathematics(made, row, words, value, tolerance):
+    """Independently of the promises that the table itself makes."""
+    (claim,) = [each for each in claims_of(made) if each["row"] == row and words in each["claim"]]
+    assert claim["model"] == pytest.approx(value, abs=tolerance)
+
+
+def test_the_files_are_complete(made):
+    for drawing in DRAWINGS:
+        for kind in ("png", "svg"):
+            assert (made / f"{drawing.name}.{kind}").stat().st_size > 5_000
+    page = (made / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == len(DRAWINGS)
+    assert not re.search(r'(?:src|href)="(?!data:)', page)
+    table = (made / "table.md").read_text()
+    assert table.count("| holds |") == len(claims_of(made))
+    small = list((made / "guide").glob("paper_*.png"))
+    assert {path.stem for path in small} == {f"paper_{name}" for name in command.IN_THE_GUIDE}
+    assert sum(path.stat().st_size for path in small) < 600_000
+
+
+def test_row_12_has_at_least_200_scenes():
+    scenes = obstacles.light_scenes()
+    assert len(scenes.start) >= 200
+    assert len(
+        np.unique(np.concatenate((scenes.start, scenes.goal, scenes.obstacles[:, 0]), axis=-1), axis=0)
+    ) == len(scenes.start)
+
+
+def test_a_claim_fails_where_a_number_is_not_as_promised():
+    holds = Claim(row=1, claim="x", model=1.0, promise=near(1.0, 0.1), arm=2.0, arm_promise=at_least(2.0))
+    assert holds.verdict == "holds"
+    for model, arm in ((1.2, 2.0), (1.0, 1.9), (np.nan, 2.0), (1.0, np.nan)):
+        claim = Claim(
+            row=1, claim="x", model=model, promise=near(1.0, 0.1), arm=arm, arm_promise=at_least(2.0)
+        )
+        assert claim.verdict == "FAILS"
+    with pytest.raises(ValueError, match="belong together"):
+        _ = Claim(row=1, claim="x", model=1.0).holds
+    with pytest.raises(ValueError, match="without a number"):
+        _ = Claim(row=1, claim="x", model=None).holds
+
+
+def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
+    claims = [Claim(row=1, claim="too much", model=2.0, promise=at_most(1.0))]
+    monkeypatch.setattr(command, "reproduce", lambda *_: command.Reproduction(claims, []))
+    with pytest.raises(SystemExit) as end:
+        cli.main(["paper", "--out", str(tmp_path)])
+    assert end.value.code == 1
+    assert "row 1, too much" in capsys.readouterr().err
+    assert json.loads((tmp_path / "table.json").read_text())["holds"] is False
+
+
+def test_sturm_counts_known_roots():
+    def product(*roots):
+        result = [Fraction(1)]
+        for root in roots:
+            result = [
+                a - root * b for a, b in zip([Fraction(0), *result], [*result, Fraction(0)], strict=True)
+            ]
+        return result
+
+    tenth = Fraction(1, 10)
+    assert count_roots(product(3 * tenth, 7 * tenth, Fraction(2))) == 2
+    assert count_roots(product(3 * tenth, 3 * tenth, -tenth)) == 1  # a double root is one root
+    assert count_roots(product(-tenth, Fraction(2))) == 0
+
+
+def test_the_passage_polynomial_knows_the_symmetric_movement():
+    polynomial = passage_polynomial((Fraction(1, 2), Fraction(1, 3)), (Fraction(1), Fraction(0)))
+    assert root_of(polynomial) == pytest.approx(0.5, abs=1e-15)
+
+
+def test_the_construction_is_undone():
+    along, height = np.array([0.2, 0.9]), np.array([0.4, -0.3])
+    found = construction(via_waypoints((0.1, -0.2), (0.4, 0.3), along, height))
+    np.testing.assert_allclose(found, (along, abs(height)), atol=1e-14)
+
+
+def test_a_profile_finds_peaks_and_valley():
+    time = np.linspace(0.0, 1.0, 501)
+    speed = 1.0 - np.cos(4 * np.pi * time) * 0.8 - 0.1 * time
+    velocity = np.stack((speed, np.zeros_like(speed)), axis=-1)
+    profile = Profile.of(time, np.zeros((501, 2)), velocity, np.zeros((501, 2)))
+    assert profile.valley == pytest.approx(0.5, abs=2e-3)
+    assert profile.peaks[:, 0] == pytest.approx([0.25, 0.75], abs=2e-3)
+    assert 0.0 < profile.valley_depth < 0.2
+    assert np.isnan(profile.bend[0])

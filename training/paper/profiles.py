@@ -1,0 +1,92 @@
+"""What can be read off a speed and a curvature profile, sampled from the model or from the simulated arm."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.primitives import Trajectory
+from viapoint.training.paper.performed import Performed
+
+Float = NDArray[np.float64]
+
+EDGE = 0.08
+"""Part of the duration left out at both ends: there the curvature of a movement from rest has no bound
+(it grows as t^-2), so its greatest value is a local maximum inside."""
+SAMPLES = 2001
+
+
+class Profile(NamedTuple):
+    """Speed and curvature of one movement at T instants."""
+
+    time: Float
+    """As parts of the duration, shape (T,)."""
+    speed: Float
+    """[m/s]"""
+    curvature: Float
+    """Unsigned, [1/m]."""
+    position: Float
+    """Shape (T, 2), [m]."""
+
+    @classmethod
+    def of(cls, time: Float, position: Float, velocity: Float, acceleration: Float) -> Profile:
+        """From hand position, velocity and acceleration, shape (T, 2), at parts of the duration."""
+        speed = np.linalg.norm(velocity, axis=-1)
+        turn = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
+        safe = np.maximum(speed, 1e-9)
+        return cls(time, speed, np.abs(turn) / (safe * safe * safe), position)
+
+    @property
+    def valley(self) -> float:
+        """When the speed is least between its peaks, as a part of the duration; NaN without a valley."""
+        places = _peaks(self.time, -self.speed)
+        return places[0][0] if places else np.nan
+
+    @property
+    def valley_depth(self) -> float:
+        """Speed in the valley relative to the mean of the two highest peaks; 1 without a valley."""
+        valleys, peaks = _peaks(self.time, -self.speed), self.peaks
+        return -valleys[0][1] / float(np.mean(peaks[:2, 1])) if valleys and len(peaks) > 1 else 1.0
+
+    @property
+    def peaks(self) -> Float:
+        """Time and height of the local maxima of the speed, the highest first, shape (n, 2)."""
+        return np.array(_peaks(self.time, self.speed)).reshape(-1, 2)
+
+    @property
+    def bend(self) -> tuple[float, float]:
+        """When the curvature has its greatest local maximum, and how great it is [1/m]; NaN without one."""
+        places = _peaks(self.time, self.curvature)
+        return places[0] if places else (np.nan, np.nan)
+
+    def place(self, time: float) -> Float:
+        """Hand position at a part of the duration, shape (2,), [m]."""
+        return np.array([np.interp(time, self.time, self.position[:, i]) for i in (0, 1)])
+
+
+def model_profile(movement: Trajectory) -> Profile:
+    """Of a single movement of the model."""
+    position, velocity, acceleration = movement.sample(SAMPLES)
+    return Profile.of(np.linspace(0.0, 1.0, SAMPLES), position, velocity, acceleration)
+
+
+def arm_profile(done: Performed, row: int = 0) -> Profile:
+    """Of one movement of the simulated arm."""
+    within = done.time <= done.duration[row] + 1e-9
+    fields = (part[row, within] for part in (done.hand, done.velocity(), done.acceleration()))
+    return Profile.of(done.time[within] / done.duration[row], *fields)
+
+
+def _peaks(time: Float, value: Float) -> list[tuple[float, float]]:
+    """Local maxima away from the ends, the highest first; a parabola through three samples places them."""
+    inner = (time > EDGE) & (time < 1.0 - EDGE)
+    index = np.flatnonzero(inner[1:-1] & (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])) + 1
+    found = []
+    for i in index:
+        before, here, after = value[i - 1], value[i], value[i + 1]
+        shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+        step = time[i + 1] - time[i]
+        found.append((float(time[i] + shift * step), float(here - 0.25 * (before - after) * shift)))
+    return sorted(found, key=lambda each: -each[1])
