@@ -3,6 +3,7 @@
 import json
 import re
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from viapoint.training.paper.passage import count_roots, passage_polynomial, roo
 from viapoint.training.paper.profiles import Profile
 from viapoint.training.paper.reproduce import DRAWINGS, ROWS
 
+GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"
 FEWER = 9
 """Every ninth scene of the rows of lights, so that the search takes seconds."""
 
@@ -92,6 +94,26 @@ def test_the_files_are_complete(made):
     small = list((made / "guide").glob("paper_*.png"))
     assert {path.stem for path in small} == {f"paper_{name}" for name in command.IN_THE_GUIDE}
     assert sum(path.stat().st_size for path in small) < 600_000
+
+
+def test_the_guide_says_what_the_command_computes(made):
+    lines = [
+        line.strip("| ").split(" | ") for line in GUIDE.read_text().splitlines() if re.match(r"\| \d", line)
+    ]
+    assert len(lines) >= 10
+    claims = {(claim["row"], claim["claim"]): claim for claim in claims_of(made)}
+    for row, text, model, arm in lines:
+        claim = claims[int(row), text]
+        assert float(model) == pytest.approx(claim["model"], rel=1e-3)
+        assert (arm == "-") == (claim["arm"] is None)
+        if arm != "-":
+            assert float(arm) == pytest.approx(claim["arm"], rel=5e-3)
+
+
+def test_the_pictures_of_the_guide_are_there_and_small():
+    shown = re.findall(r"!\[.+?\]\((images/paper_\w+\.png)\)", GUIDE.read_text())
+    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in command.IN_THE_GUIDE}
+    assert sum((GUIDE.parent / path).stat().st_size for path in shown) < 600_000
 
 
 def test_row_12_has_at_least_200_scenes():

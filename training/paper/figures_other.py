@@ -43,6 +43,9 @@ FAINT = {
     "markeredgewidth": 0.0,
 }
 
+SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))
+"""Mean and standard deviation of the residuals in the paper's Figs. 10B and 10D."""
+
 
 def isochrony(decided: Decided) -> Figure:
     """Fig. 10: passage times and how far the simulated arm is off them."""
@@ -77,7 +80,8 @@ def _label_isochrony(axes: Float) -> None:
             xlabel=text, ylabel="$t_1/(t_1+t_2)$", xlim=(0, 1), ylim=(0.2, 0.8) if row == 0 else (0.2, 0.55)
         )
         axes[row, 1].set(xlabel=text, ylabel="residual", xlim=(0, 1), ylim=(-0.04, 0.04))
-        axes[row, 1].axhspan(-0.024, 0.016, color="0.92", zorder=0)
+        mean, deviation = SUBJECTS[row]
+        axes[row, 1].axhspan(mean - deviation, mean + deviation, color="0.92", zorder=0)
         axes[row, 1].axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
     axes[1, 1].annotate("grey band:\nsubjects, mean ± s.d.", (0.02, -0.037), fontsize=5.8)
     axes[0, 0].legend(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
 from viapoint.envs.scenes import Scenes, check_scenes, rows_of_lights
+from viapoint.primitives import speed_valleys
 from viapoint.training.baselines import Method, PlannerMethod
 from viapoint.training.commands import find_agent, pretrained_folder
 from viapoint.training.config import DEFAULT_ENV
@@ -117,6 +118,8 @@ class Features(NamedTuple):
     """Where that is, d1 / (d1 + d2) and d3 / (d1 + d2), shape (n, 2)."""
     residual: Float
     """t1 / (t1 + t2) minus the model's through the point of greatest curvature, as in Fig. 10B."""
+    agrees: NDArray[np.bool_]
+    """Whether the movement has a speed valley exactly if the model through that point has one."""
     apart: Float
     """Greatest distance from the model through that point / distance of the targets, as in Fig. 8."""
 
@@ -125,6 +128,7 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
     """The paper's analysis: the via-point is where the curvature is greatest."""
     valley = np.array([each.valley for each in profiles])
     bend = np.array([each.bend[0] for each in profiles])
+    agrees = np.zeros(len(bend), dtype=bool)
     via, residual, apart = (
         np.full((len(bend), 2), np.nan),
         np.full(len(bend), np.nan),
@@ -135,9 +139,10 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
         model = smoothest(points)
         via[row] = construction(points)
         residual[row] = bend[row] - passage_share(model)
+        agrees[row] = bool(speed_valleys(model).time.size) == bool(np.isfinite(valley[row]))
         distance = np.linalg.norm(np.asarray(model(profiles[row].time)) - profiles[row].position, axis=-1)
         apart[row] = distance.max() / np.linalg.norm(points[2] - points[0])
-    return Features(valley, bend, via, residual, apart)
+    return Features(valley, bend, via, residual, agrees, apart)
 
 
 def obstacle_claims(decided: Decided) -> list[Claim]:
@@ -162,6 +167,8 @@ def obstacle_claims(decided: Decided) -> list[Claim]:
         ),
         claim("Movements with a curvature peak inside", "all", lambda f: 100 * _share(f.bend), at_least(50.0), "%"),
         claim("Movements with a speed valley: not all", "all", lambda f: 100 * _share(f.valley), at_least(10.0), "%"),
+        claim("A valley exactly where the model through the point of greatest curvature has one", "-",
+              lambda f: 100 * float(f.agrees.mean()), at_least(90.0), "%"),
         claim("Valley and curvature peak: median distance in time / t_f, where there are both", "at the same time",
               lambda f: float(np.nanmedian(np.abs(f.valley - f.bend))), at_most(0.05)),
         claim("Isochrony: median of |t1/(t1+t2) - .5| at the curvature peak", "roughly .5",
