@@ -201,6 +201,18 @@ def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias):
                 np.testing.assert_array_equal(a[i], c[0])
 
 
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+@pytest.mark.parametrize("vias", [0, 1, 3])
+def test_a_few_times_are_sampled_bit_for_bit_alike_in_every_batch(vias, dimension):
+    waypoints, durations, _ = random_movement(vias, batch=(7,), dimension=dimension, moving=False)
+    batch = through(waypoints, durations)
+    for count in range(13):
+        times = RNG.uniform(0, 0.2, (7, count))
+        alone = [through(waypoints[i], durations[i]).sample(times[i], (0, 1, 2)) for i in range(7)]
+        for nu, together in enumerate(batch.sample(times)):
+            np.testing.assert_array_equal(together, [each[nu] for each in alone])
+
+
 def test_shared_and_own_durations_agree_bit_for_bit():
     waypoints, _, _ = random_movement(2, batch=(20,))
     shared = np.array([0.3, 0.5, 0.4])
