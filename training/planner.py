@@ -20,7 +20,7 @@ from viapoint.training.trial import Trial
 Float = NDArray[np.float64]
 
 HOPELESS = -3.0
-"""Reward put down for an action that fails for certain and is not simulated: with the default weights, less than any."""
+"""Reward put down for an action that fails for certain and is not simulated: by default weights, less than any."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,8 @@ Float = NDArray[np.float64]
 CERTAIN = 0.002
 """How deep a plan must cut into an obstacle, or leave the reach, to fail for certain, [m].
 
-With the default durations plans are tracked within a fifth of a millimetre (much shorter ones are not); where they are looked at, less often than the physics does, their
-clearance can only be overestimated.
+With the default durations plans are tracked within a fifth of a millimetre; much shorter ones are not. Where plans are
+looked at, less often than the physics does, their clearance can only be overestimated.
 """
 CHUNK = 4096
 
