@@ -1,0 +1,164 @@
+"""Whether memory and speed stay as they are: a million decisions, and ten thousand environments made and closed.
+
+    python benchmarks/reliability_long.py decisions --json decisions.json   # about fifteen minutes of one core
+    python benchmarks/reliability_long.py cycles    --json cycles.json      # likewise
+    python benchmarks/reliability_long.py picture decisions.json cycles.json --out docs/images/reliability_memory.png
+
+Memory is the resident set of this process. Speed is decisions per second of processor time, so that other work on the
+machine does not count. Linux only, as both are read from /proc.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import viapoint.envs
+from viapoint.envs import rendering
+
+MEGABYTE = 1 << 20
+SAMPLES = 200
+"""Points of a curve."""
+WARM = 0.1
+"""Part of a run in which caches fill, left out of the slope."""
+ALLOWED = 8.0
+"""Growth after it that counts as flat, [MB]."""
+RENDERED = 5
+"""One in so many environments is rendered: a software context takes half a second."""
+SLOWER = 0.1
+"""Loss of speed from the first fifth to the last that counts as none."""
+
+
+def state() -> dict[str, float]:
+    """Memory [MB], open files and threads of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return {
+        "memory": pages * os.sysconf("SC_PAGE_SIZE") / MEGABYTE,
+        "files": len(os.listdir("/proc/self/fd")),
+        "threads": len(os.listdir("/proc/self/task")),
+    }
+
+
+def decisions(env_id: str, number: int, num_envs: int = 500) -> dict[str, Any]:
+    """Random decisions in the vector environment."""
+    env = gym.make_vec(env_id, num_envs=num_envs, threads=1)
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    every = max(1, number // num_envs // SAMPLES)
+    curve, began = [], time.process_time()
+    for step in range(number // num_envs + 1):
+        if step % every == 0:
+            curve.append({"count": step * num_envs, "seconds": time.process_time() - began, **state()})
+        _, reward, *_ = env.step(generator.uniform(-1.0, 1.0, env.action_space.shape))
+        assert np.isfinite(reward).all()
+    env.close()
+    seconds = np.diff([point["seconds"] for point in curve])
+    fifth = len(seconds) // 5
+    speed = every * num_envs / np.array([np.median(seconds[:fifth]), np.median(seconds[-fifth:])])
+    return {
+        "what": f"decisions in {env_id}, {num_envs} at a time",
+        "curve": curve,
+        "first_speed": speed[0],
+        "last_speed": speed[1],
+        **growth(curve),
+    }
+
+
+def cycles(number: int, size: int = 64) -> dict[str, Any]:
+    """Environments of every id made, used and closed: single ones, every fifth rendered, every fifth a vector."""
+    rendering.STILL_PASSES = 1  # it is contexts that could leak, not the passes of one picture
+    ids, curve, began = sorted(viapoint.envs.TASKS), [], time.process_time()
+    every = max(1, number // SAMPLES)
+    for cycle in range(number + 1):
+        if cycle % every == 0:
+            curve.append({"count": cycle, "seconds": time.process_time() - began, **state()})
+        env_id, turn = ids[cycle % len(ids)], cycle // len(ids) % RENDERED
+        kwargs = {"render_mode": "rgb_array", "width": size, "height": size, "threads": 2}
+        env = gym.make_vec(env_id, num_envs=3, **kwargs) if turn == 1 else gym.make(env_id, **kwargs)
+        env.reset(seed=cycle)
+        env.step(env.action_space.sample())
+        if turn == 0:
+            assert np.ptp(env.render()) > 0
+        env.close()
+    what = f"environments made, used and closed, one in {RENDERED} rendered"
+    return {"what": what, "curve": curve, **growth(curve)}
+
+
+def growth(curve: list[dict[str, float]]) -> dict[str, float]:
+    """What grew from the end of the warm-up to the end, by a straight line through all points between."""
+    kept = curve[int(WARM * len(curve)) :]
+    count = [point["count"] for point in kept]
+    slope = np.polyfit(count, [point["memory"] for point in kept], 1)[0]
+    return {
+        "memory_growth": slope * (count[-1] - count[0]),
+        "files_growth": kept[-1]["files"] - kept[0]["files"],
+        "threads_growth": kept[-1]["threads"] - kept[0]["threads"],
+    }
+
+
+def verdict(result: dict[str, Any]) -> bool:
+    """Print the figures; whether they are as they should be."""
+    count, growth = result["curve"][-1]["count"], result["memory_growth"]
+    print(f"{count:,} {result['what']}")
+    print(f"  memory {result['curve'][0]['memory']:.1f} MB at the start, {growth:+.2f} MB after the warm-up")
+    print(f"  open files {result['files_growth']:+.0f}, threads {result['threads_growth']:+.0f}")
+    flat = growth < ALLOWED and not result["files_growth"] > 0 and not result["threads_growth"] > 0
+    if "first_speed" not in result:
+        return bool(flat)
+    ratio = result["last_speed"] / result["first_speed"]
+    print(
+        f"  {result['first_speed']:.0f} a second of processor time at first, {result['last_speed']:.0f} at last"
+    )
+    return bool(flat and ratio > 1.0 - SLOWER)
+
+
+def picture(results: list[dict[str, Any]], path: Path) -> None:
+    """Memory over what was done."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2 * len(results), 2.6), dpi=80, layout="constrained")
+    for axes, result in zip(np.atleast_1d(figure.subplots(1, len(results))), results, strict=True):
+        count = np.array([point["count"] for point in result["curve"]])
+        axes.plot(count, [point["memory"] for point in result["curve"]], color="#2a6f97", linewidth=1.4)
+        axes.set(ylim=(0, None), ylabel="resident memory [MB]", xlabel=result["what"].partition(",")[0])
+        axes.set_title(f"{result['memory_growth']:+.1f} MB after the first tenth", fontsize=9)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("part", choices=("decisions", "cycles", "picture"))
+    parser.add_argument("results", nargs="*", type=Path, help="JSON files for the picture")
+    parser.add_argument("--env", default="viapoint/PlanarObstacles-v0")
+    parser.add_argument(
+        "--number", type=int, help="decisions or cycles; a million and ten thousand by default"
+    )
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("docs/images/reliability_memory.png"))
+    arguments = parser.parse_args()
+    if arguments.part == "picture":
+        picture([json.loads(path.read_text()) for path in arguments.results], arguments.out)
+        return
+    if arguments.part == "decisions":
+        result = decisions(arguments.env, arguments.number or 1_000_000)
+    else:
+        result = cycles(arguments.number or 10_000)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(result, indent=1))
+    raise SystemExit(0 if verdict(result) else 1)
+
+
+if __name__ == "__main__":
+    main()
