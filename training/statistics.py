@@ -170,6 +170,96 @@ def stratified_bootstrap(
     return _percentile(statistic(table), np.array(draws), confidence)
 
 
+def across_seeds(
+    scores: ArrayLike,
+    strata: ArrayLike,
+    generator: np.random.Generator,
+    *,
+    statistic: Callable[[Float], float] = interquartile_mean,
+    confidence: float = 0.95,
+    samples: int = 2_000,
+) -> Interval:
+    """An aggregate over seeds of each seed's mean over scenes, for other seeds in other scenes of the same make.
+
+    All agents meet the same scenes. So a draw takes seeds as whole rows and scenes as whole columns, scenes within
+    their strata. Were the entries drawn one by one, an agent that fails in many scenes would pass for many agents,
+    and the interval would be far too narrow. Scores of 0 and 1 that nowhere differ show no spread to a bootstrap;
+    then the interval is Wilson's over the scenes.
+
+    Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; strata and aggregate from Agarwal et al.
+        2021, arXiv 2108.13264. Intervals of a few seeds may be a little too narrow: those of five simulated agents
+        covered the truth in 88 to 99 % of trials, least where agents differed most.
+
+    Args:
+        scores: Shape (seeds, scenes).
+        strata: Stratum of each scene, such as its band, shape (scenes,).
+        generator: Of the draws.
+        statistic: Of the seeds' means, shape (seeds,).
+        confidence: Of the interval.
+        samples: Number of draws.
+
+    Raises:
+        ValueError: The scores or the strata have another shape.
+    """
+    table, groups = np.asarray(scores, dtype=np.float64), np.asarray(strata)
+    if table.ndim != 2 or not table.size:
+        raise ValueError(f"scores must have shape (seeds, scenes), got {table.shape}")
+    if groups.shape != table.shape[1:]:
+        raise ValueError(f"strata must have shape {table.shape[1:]}, one for each scene, got {groups.shape}")
+    seeds, scenes = table.shape
+    if (table == table[0, 0]).all() and table[0, 0] in (0.0, 1.0):
+        return wilson(int(table[0].sum()), scenes, confidence)
+    times_drawn = np.zeros((scenes, samples))
+    for group in np.unique(groups):
+        rows = np.flatnonzero(groups == group)
+        times_drawn[rows] = generator.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), samples).T
+    means = table @ times_drawn / scenes
+    chosen = generator.integers(seeds, size=(seeds, samples))
+    draws = [statistic(each) for each in np.take_along_axis(means, chosen, axis=0).T]
+    return _percentile(statistic(table.mean(axis=1)), np.array(draws), confidence)
+
+
+def probability_of_improvement(
+    first: ArrayLike,
+    second: ArrayLike,
+    generator: np.random.Generator,
+    *,
+    confidence: float = 0.95,
+    samples: int = 2_000,
+) -> Interval:
+    """How likely a run of the first method is to beat one of the second, on a task drawn at random.
+
+        P(X > Y) = mean over tasks of 1/(N M) sum_ij (1[x_i > y_j] + 1/2 1[x_i = y_j])
+
+    With a percentile interval, each task's runs drawn separately. Source: Agarwal et al. 2021, arXiv 2108.13264,
+    section 4.3; for one task it is Mann and Whitney's U / (N M).
+
+    Args:
+        first: Scores, shape (N, tasks).
+        second: Scores, shape (M, tasks).
+        generator: Of the draws.
+        confidence: Of the interval.
+        samples: Number of draws.
+
+    Raises:
+        ValueError: The scores have other shapes.
+    """
+    x, y = (np.asarray(each, dtype=np.float64) for each in (first, second))
+    if x.ndim != 2 or y.ndim != 2 or x.shape[1] != y.shape[1] or not x.size or not y.size:
+        raise ValueError(f"both must have shape (seeds, tasks) with equal tasks, got {x.shape} and {y.shape}")
+    tasks = np.arange(x.shape[1])
+    wins = (x[:, None] > y[None]) + 0.5 * (x[:, None] == y[None])
+    draws = [
+        wins[
+            generator.integers(len(x), size=(len(x), 1, len(tasks))),
+            generator.integers(len(y), size=(1, len(y), len(tasks))),
+            tasks,
+        ].mean()
+        for _ in range(samples)
+    ]
+    return _percentile(float(wins.mean()), np.array(draws), confidence)
+
+
 def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:
     """SPL: how often a method succeeds, each success weighed by how short its path was.
 

@@ -1,6 +1,8 @@
 """Closed forms and published values."""
 
+import itertools
 import math
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -93,6 +95,66 @@ def test_stratified_bootstrap_keeps_tasks_apart():
     assert interval.low < interval.estimate < interval.high
 
 
+def test_across_seeds_draws_whole_agents():
+    """Three agents, each the same in all scenes: all 27 draws of three of them can be written down."""
+    rates = np.array([0.2, 0.5, 0.6])
+    scores = np.repeat(rates[:, None], 40, axis=1)
+    interval = statistics.across_seeds(
+        scores, np.zeros(40), np.random.default_rng(0), statistic=np.mean, samples=20_000
+    )
+    draws = sorted(np.mean(each) for each in itertools.product(rates, repeat=3))
+    assert interval.estimate == pytest.approx(rates.mean())
+    assert interval.low == pytest.approx(draws[0])  # one draw of 27 is more than 2.5 %
+    assert interval.high == pytest.approx(draws[-1])
+    trimmed = statistics.across_seeds(
+        np.array([[0.0], [0.5], [0.6], [0.7], [1.0]]), [0], np.random.default_rng(0)
+    )
+    assert trimmed.estimate == pytest.approx(0.6)
+
+
+def test_across_seeds_draws_scenes_within_their_strata():
+    success = np.random.default_rng(0).random(400) < 0.7
+    one = statistics.across_seeds(success[None], np.zeros(400), np.random.default_rng(1), samples=4000)
+    half = 1.96 * math.sqrt(success.mean() * (1 - success.mean()) / 400)
+    assert one.high - one.low == pytest.approx(2 * half, rel=0.1)
+    known = statistics.across_seeds(success[None], success, np.random.default_rng(1))
+    assert known == pytest.approx((success.mean(),) * 3)  # within a stratum all are alike
+
+
+def test_across_seeds_covers_the_truth():
+    """Agents of different worth in scenes of different difficulty: other agents and scenes are foreseen."""
+    generator = np.random.default_rng(5)
+    covered = 0
+    for _ in range(100):
+        worth, ease = generator.normal(1.0, 0.5, (8, 1)), generator.normal(0.0, 1.0, (1, 100))
+        scores = generator.normal(size=(8, 100)) < worth + ease
+        interval = statistics.across_seeds(scores, np.zeros(100), generator, statistic=np.mean, samples=200)
+        truth = NormalDist().cdf(1.0 / math.sqrt(1.0 + 0.25 + 1.0))
+        covered += interval.low <= truth <= interval.high
+    assert covered >= 85
+
+
+def test_across_seeds_without_any_spread_is_wilsons():
+    for value in (0.0, 1.0):
+        interval = statistics.across_seeds(np.full((5, 20), value), np.zeros(20), np.random.default_rng(0))
+        assert interval == statistics.wilson(int(20 * value), 20)
+
+
+def test_probability_of_improvement_is_mann_and_whitneys():
+    from scipy.stats import mannwhitneyu
+
+    generator = np.random.default_rng(6)
+    first, second = generator.integers(0, 6, (5, 3)), generator.integers(0, 5, (4, 3))
+    expected = np.mean([mannwhitneyu(first[:, i], second[:, i]).statistic / 20 for i in range(3)])
+    result = statistics.probability_of_improvement(first, second, np.random.default_rng(0), samples=500)
+    assert result.estimate == pytest.approx(expected)
+    assert result.low < result.estimate < result.high
+    other = statistics.probability_of_improvement(second, first, np.random.default_rng(0), samples=10)
+    assert other.estimate == pytest.approx(1.0 - expected)
+    better = statistics.probability_of_improvement(second + 9, second, np.random.default_rng(0), samples=10)
+    assert better == (1.0, 1.0, 1.0)
+
+
 def test_spl_by_its_formula():
     assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
         2.5 / 4
@@ -107,6 +169,9 @@ def test_spl_by_its_formula():
         lambda: statistics.paired_bootstrap([1.0], [1.0, 2.0], np.random.default_rng(0)),
         lambda: statistics.interquartile_mean([]),
         lambda: statistics.stratified_bootstrap([1.0], np.random.default_rng(0)),
+        lambda: statistics.across_seeds([1.0], [0], np.random.default_rng(0)),
+        lambda: statistics.across_seeds([[1.0, 0.0]], [0], np.random.default_rng(0)),
+        lambda: statistics.probability_of_improvement([[1.0]], [[1.0, 2.0]], np.random.default_rng(0)),
         lambda: statistics.success_weighted_path_length([1], [0.0], [1.0]),
         lambda: statistics.success_weighted_path_length([1], [1.0, 2.0], [1.0]),
     ],
