@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from viapoint.training.baselines import AgentMethod
 from viapoint.training.evaluate import MethodResult, evaluate
-from viapoint.training.frozen_scenes import FrozenScenes, load, shipped_path
+from viapoint.training.frozen_scenes import BANDS, FrozenScenes, load, shipped_path
 from viapoint.training.runs import Run
 from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
@@ -26,7 +26,35 @@ RECENT = 20
 """Steps of all environments over which outcomes are averaged for log and progress bar."""
 DRAWN_SEED = 1_000_003
 """Of validation scenes that are drawn where none are shipped; far from the seeds people train with."""
-LOGGED = ("collision", "min_clearance", "jerk_ratio", "duration", "reachable")
+TIMED_DECISIONS = 11
+"""Single decisions that are timed at each validation."""
+OUTCOMES = {
+    "rollout/collision_rate": "collision",
+    "rollout/reachable_rate": "reachable",
+    "rollout/min_clearance": "min_clearance",
+    "rollout/jerk_ratio": "jerk_ratio",
+    "rollout/duration": "duration",
+}
+"""Tags of the TensorBoard log besides SB3's own, and what of the outcomes of training they average."""
+VALIDATED = {
+    "validation/success_rate": "success",
+    "validation/collision_rate": "collision",
+    "validation/min_clearance": "min_clearance",
+    "validation/goal_error": "goal_error",
+    "validation/jerk_ratio": "jerk_ratio",
+    "validation/duration": "duration",
+    "validation/decision_time": "decision_time",
+}
+"""Tags, and what of a record of the learning curve they show; medians in m and s."""
+BAND_TAGS = {
+    band: f"validation/success_rate_share_{words}"
+    for band, words in zip(BANDS, ("above_20", "5_to_20", "1_to_5", "below_1"), strict=True)
+}
+"""Tags of the success by band."""
+ACTION_ARGUMENTS = frozenset(
+    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
+)
+"""Arguments of an environment that leave its scenes as they are."""
 
 
 class TrainingStoppedError(Exception):
@@ -133,9 +161,10 @@ class Monitor(BaseCallback):
         self._between(final=True)
 
     def _between(self, *, final: bool) -> None:
-        if self._validation is not None and (self._due("evaluation") or final):
+        validates = self._validation is not None and (self._due("evaluation") or final)
+        if self._validation is not None and validates:
             self._validate(self._validation)
-        if self._due("log") or final:
+        if self._due("log") or validates or final:
             self._log()
         if self._due("checkpoint") or final:
             self._keep()
@@ -175,31 +204,45 @@ class Monitor(BaseCallback):
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
         env, summary = self.training_env, result.summary()
-        names = (
-            "success",
-            "success_by_band",
-            "collision",
-            "min_clearance",
-            "goal_error",
-            "jerk_ratio",
-            "duration",
-        )
-        for name in ("success", "collision"):
-            self.logger.record(f"validation/{name}", summary[name]["rate"])
-        for band, rate in summary["success_by_band"].items():
-            self.logger.record(f"validation/success, share {band}", rate["rate"])
-        return {
+        steps = env.physics_steps if isinstance(env, ViaVecEnv) else 0
+        record = {
             "decisions": self.num_timesteps,
-            "physics_steps": env.physics_steps if isinstance(env, ViaVecEnv) else 0,
+            "physics_steps": steps,
+            "simulated_seconds": round(steps * _timestep(env), 6) if steps else 0.0,
             "seconds": round(seconds, 3),
-            **{name: summary[name] for name in names},
+            "decision_time": self._decision_time(),
+            "success_by_band": summary["success_by_band"],
+            **{name: summary[name] for name in VALIDATED.values() if name != "decision_time"},
         }
+        for tag, name in VALIDATED.items():
+            self._note(tag, record[name])
+        for band, rate in record["success_by_band"].items():
+            self._note(BAND_TAGS[band], rate)
+        return record
+
+    def _decision_time(self) -> float:
+        """Median time of single decisions, of which the first does not count, [s]."""
+        observation: Any = self.model._last_obs
+        one = {name: part[:1] for name, part in observation.items()}
+        times = []
+        for _ in range(TIMED_DECISIONS):
+            began = time.perf_counter()
+            self.model.predict(one, deterministic=True)
+            times.append(time.perf_counter() - began)
+        return float(np.median(times[1:]))
+
+    def _note(self, tag: str, value: Any) -> None:
+        """Log a number, or a rate; a median of successes is None where there is none."""
+        number = value["rate"] if isinstance(value, dict) else value
+        if number is not None:
+            self.logger.record(tag, number)
 
     def _log(self) -> None:
-        if self._recent:
-            self.logger.record("rollout/success", self._average("is_success"))
-            for name in LOGGED:
-                self.logger.record(f"rollout/{name}", self._average(name))
+        for tag, name in OUTCOMES.items() if self._recent else ():
+            self.logger.record(tag, self._average(name))
+        env = self.training_env
+        if isinstance(env, ViaVecEnv) and env.physics_steps:
+            self.logger.record("time/simulated_seconds", env.physics_steps * _timestep(env))
         self.model.dump_logs()
 
     def _average(self, name: str) -> float:
@@ -214,10 +257,15 @@ class Monitor(BaseCallback):
             self._bar.set_postfix(shown, refresh=False)
 
 
+def _timestep(env: Any) -> float:
+    """Of the physics, [s]."""
+    return float(env.get_attr("model", [0])[0].opt.timestep)
+
+
 def validation_scenes(run: Run) -> FrozenScenes:
     """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
     config = run.config
-    if shipped_path("validation", config.env).is_file() and not config.env_kwargs:
+    if shipped_path("validation", config.env).is_file() and set(config.env_kwargs) <= ACTION_ARGUMENTS:
         return load("validation", config.env).take(slice(0, config.eval_scenes))
     trial = Trial(config.env, 1, **config.env_kwargs)
     scenes = trial.task.sampler()([np.random.default_rng(DRAWN_SEED)] * config.eval_scenes)

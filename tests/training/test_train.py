@@ -44,7 +44,8 @@ def config(folder, algo="viatd3", **changes):
 
 
 def curve(run):
-    return [{name: value for name, value in record.items() if name != "seconds"} for record in run.curve]
+    measured = ("seconds", "decision_time")
+    return [{name: value for name, value in record.items() if name not in measured} for record in run.curve]
 
 
 def same_result(one, other):

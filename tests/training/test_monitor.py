@@ -1,0 +1,79 @@
+"""What a training tells about itself: the tags of its TensorBoard log, the axes of its learning curve."""
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from viapoint.training import monitor
+from viapoint.training.config import TrainConfig
+from viapoint.training.frozen_scenes import BANDS
+from viapoint.training.runs import Run
+from viapoint.training.train import train
+
+STANDARD = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "time/fps")
+"""Stable-Baselines3's own."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return train(
+        TrainConfig(
+            out=tmp_path_factory.mktemp("runs") / "run",
+            n_timesteps=128,
+            n_envs=64,
+            eval_every=64,
+            eval_scenes=40,
+            env_kwargs={"threads": 1},
+            hyperparameters={"learning_starts": 64, "gradient_steps": 1, "fresh_scenes": 4},
+            progress=False,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def log(run):
+    events = EventAccumulator(str(run.folder / "tensorboard"))
+    events.Reload()
+    return {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
+
+
+def test_every_tag_is_in_the_event_file(log):
+    tags = (*STANDARD, *monitor.OUTCOMES, *monitor.VALIDATED, *monitor.BAND_TAGS.values())
+    assert [tag for tag in tags if tag not in log] == []
+    assert {"train/critic_loss", "time/simulated_seconds"} <= set(log)
+
+
+def test_the_log_says_what_the_learning_curve_says(run, log):
+    assert [event.step for event in log["validation/success_rate"]] == [0, 64, 128]
+    for tag, name in monitor.VALIDATED.items():
+        for event, record in zip(log[tag], run.curve, strict=True):
+            value = record[name]["rate"] if isinstance(record[name], dict) else record[name]
+            assert event.value == pytest.approx(value, rel=1e-6)
+    for band in BANDS:
+        shown = [event.value for event in log[monitor.BAND_TAGS[band]]]
+        assert shown == pytest.approx([record["success_by_band"][band]["rate"] for record in run.curve])
+
+
+def test_rates_are_rates_and_times_are_times(log):
+    for tag, events in log.items():
+        values = np.array([event.value for event in events])
+        if tag.endswith("_rate") or "_rate_" in tag:
+            assert ((values >= 0.0) & (values <= 1.0)).all(), tag
+        if tag.endswith("duration"):
+            assert ((values > 0.5) & (values < 1.3)).all(), tag
+    assert all(event.value > 0.0 for event in log["validation/decision_time"])
+
+
+def test_a_curve_has_decisions_simulated_seconds_and_wall_time(run):
+    for record in run.curve:
+        assert record["simulated_seconds"] == pytest.approx(0.002 * record["physics_steps"])
+    last = run.curve[-1]
+    assert 0.6 < last["simulated_seconds"] / last["decisions"] < 1.3  # a movement and its settling
+    assert last["seconds"] > 0.0
+
+
+def test_arguments_of_the_action_leave_the_validation_scenes_as_they_are(shipped, tmp_path):
+    for kwargs, same in (({"n_via": 2, "timing": "learned"}, True), ({"n_obstacles": 2}, False)):
+        run = Run.create(TrainConfig(out=tmp_path / str(same), env_kwargs=kwargs, eval_scenes=8))
+        scenes = monitor.validation_scenes(run)
+        assert (scenes.sha256 == shipped.take(slice(0, 8)).sha256) == same
