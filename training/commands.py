@@ -18,6 +18,7 @@ from viapoint.training import train as training
 from viapoint.training.baselines import AgentMethod, Method, make_method
 from viapoint.training.config import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluate import evaluate as measure
+from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import load
 from viapoint.training.runs import Run, find_model, load_model
@@ -104,6 +105,12 @@ def evaluate(config: EvaluateConfig) -> None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
+    if config.failures is not None and agent is not None:
+        last = [each for each in result.results if each.name.startswith("agent")][-1]
+        done = frozen.take(slice(0, len(last.success)))
+        failures = sort_out(last, done, agent.model, env_id, **env_kwargs)
+        write(failures, config.failures, env_id, **env_kwargs)
+        print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
 
 def play(config: PlayConfig) -> None:

@@ -127,6 +127,8 @@ class EvaluateConfig:
     """Only the first so many."""
     json: Path | None = None
     """File for all results, scene by scene."""
+    failures: Path | None = None
+    """Folder for the agent's failures, sorted by kind: counts and pictures; of its last row in the table."""
     env: str | None = None
     """Id of the environment where no agent says it."""
 

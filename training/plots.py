@@ -16,16 +16,16 @@ BLUE = "#1f5fa8"
 DOTS_PER_INCH = 130
 AXES = (
     ("decisions", "decisions", 1.0),
-    ("physics_steps", "million physics steps", 1e-6),
-    ("seconds", "seconds", 1.0),
+    ("simulated_seconds", "simulated minutes", 1 / 60),
+    ("seconds", "minutes of training", 1 / 60),
 )
-"""What the learning curve is drawn against: key of the record, label, scale."""
+"""What the learning curve is drawn against: key of the record, label, scale; a key that a record lacks is left out."""
 
 
 def learning_curve(
     path: Path, curves: Mapping[str, Sequence[Mapping[str, Any]]], *, ceiling: float | None = None
 ) -> Path:
-    """Draw success on the validation scenes against decisions, physics steps, seconds, with its Wilson band.
+    """Draw success on the validation scenes against decisions, simulated and training time, with its Wilson band.
 
     Args:
         path: Of the picture, PNG.
@@ -37,9 +37,11 @@ def learning_curve(
     """
     if not any(curves.values()):
         raise ValueError("there is no learning curve to draw: the run was never evaluated")
+    every = [record for records in curves.values() for record in records]
+    shown = [axis for axis in AXES if all(axis[0] in record for record in every)]
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(AXES), sharey=True)
-    for ax, (key, label, scale) in zip(axes, AXES, strict=True):
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for ax, (key, label, scale) in zip(axes, shown, strict=True):
         for name, records in curves.items():
             x = scale * np.array([record[key] for record in records])
             rate, low, high = (

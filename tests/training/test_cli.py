@@ -115,7 +115,9 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     record = json.loads(results.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == ENV
-    run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4)
+    run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
+    counts = json.loads((tmp_path / "failures" / "failures.json").read_text())
+    assert counts["method"] == "agent, ranks 8"
     kept = json.loads((trained / "evaluations" / "test.json").read_text())
     assert list(kept["methods"]) == ["agent", "agent, ranks 8"]
 

@@ -68,7 +68,7 @@ def pixels(path):
 def test_pictures_are_drawn(record, tmp_path):
     rates = ({"rate": r, "low": r - 0.1, "high": r + 0.1} for r in (0.2, 0.5, 0.9))
     curve = [
-        {"decisions": 10 * i, "physics_steps": 10**6 * i, "seconds": float(i), "success": rate}
+        {"decisions": 10 * i, "simulated_seconds": 9.0 * i, "seconds": float(i), "success": rate}
         for i, rate in enumerate(rates)
     ]
     one = plots.learning_curve(tmp_path / "a" / "curve.png", {"one": curve})

@@ -1,0 +1,114 @@
+"""Every failure is of one kind, and the kinds are what they say."""
+
+import json
+
+import numpy as np
+import pytest
+
+from viapoint.training import failures as module
+from viapoint.training.config import TrainConfig
+from viapoint.training.evaluate import evaluate
+from viapoint.training.failures import KINDS, kinds, markdown, sort_out, write
+from viapoint.training.train import new_model, resolved
+from viapoint.training.trial import Trial
+from viapoint.training.vec_env import ViaVecEnv
+
+ENV = "viapoint/PlanarObstacles-v0"
+NAMES = [kind.name for kind in KINDS]
+
+
+def outcomes(reachable=True, collision=True, planned_clearance=-0.02):
+    return {
+        "reachable": np.array([reachable]),
+        "collision": np.array([collision]),
+        "planned_clearance": np.array([planned_clearance]),
+    }
+
+
+@pytest.mark.parametrize(
+    ("outcome", "another", "kind"),
+    [
+        (outcomes(reachable=False, collision=False, planned_clearance=0.1), True, "out_of_reach"),
+        (outcomes(collision=False, planned_clearance=0.1), True, "off_goal"),
+        (outcomes(planned_clearance=0.001), True, "tracking"),
+        (outcomes(planned_clearance=0.0), True, "graze"),
+        (outcomes(planned_clearance=-0.005), True, "graze"),
+        (outcomes(planned_clearance=-0.0051), True, "wrong_way"),
+        (outcomes(planned_clearance=-0.0051), False, "collision"),
+    ],
+)
+def test_each_kind_is_what_it_says(outcome, another, kind):
+    assert NAMES[kinds(outcome, np.array([another]))[0]] == kind
+
+
+class Chosen:
+    """The worst of the agent's proposals wherever another one succeeds, otherwise what it would do."""
+
+    name = "agent"
+
+    def __init__(self, model, trial):
+        self.model, self.trial = model, trial
+
+    def proposals(self, scenes):
+        observation, _ = self.model.policy.obs_to_tensor(self.trial.observe(scenes))
+        return self.model.policy.actor.propose(observation)[0].detach().numpy().astype(np.float64)
+
+    def decide(self, observation, scenes):
+        proposals = self.proposals(scenes)
+        number, count, size = proposals.shape
+        every = scenes.take(np.repeat(np.arange(number), count))
+        reward = self.trial(every, proposals.reshape(-1, size)).reward.reshape(number, count)
+        return proposals[np.arange(number), reward.argmin(axis=-1)]
+
+
+@pytest.fixture(scope="module")
+def sorted_out(small_scenes):
+    env = ViaVecEnv(ENV, 1, threads=1)
+    model = new_model(resolved(TrainConfig(env=ENV)), env)  # untrained: it proposes its anchors
+    trial = Trial(ENV, 64, threads=1)
+    result = evaluate(
+        [Chosen(model, trial)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
+    ).results[0]
+    return result, sort_out(result, small_scenes, model, ENV, threads=1)
+
+
+def test_every_failure_is_counted_once(sorted_out):
+    result, failures = sorted_out
+    np.testing.assert_array_equal(failures.rows, np.flatnonzero(~result.success))
+    counts = failures.counts()
+    assert sum(each["count"] for each in counts.values()) == len(failures.rows) > 5
+    for each in counts.values():
+        assert sum(each["by_band"].values()) == each["count"]
+
+
+def test_the_other_way_was_there(sorted_out, small_scenes):
+    """An agent made to take its worst proposal often had a better one."""
+    _, failures = sorted_out
+    assert 0.1 < failures.another.mean() < 1.0
+    wrong = failures.kind == NAMES.index("wrong_way")
+    assert wrong.any()
+    assert failures.another[wrong].all()
+    assert not failures.another[failures.kind == NAMES.index("collision")].any()
+    assert (failures.depth[wrong] > module.GRAZE).all()
+
+
+def test_tables_and_pictures_are_written(sorted_out, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "PICTURES", 2)
+    _, failures = sorted_out
+    paths = write(failures, tmp_path / "new", ENV, threads=1)
+    names = {path.name for path in paths}
+    assert {"failures.md", "failures.json"} <= names
+    counts = json.loads((tmp_path / "new" / "failures.json").read_text())["kinds"]
+    assert {f"{name}.png" for name, each in counts.items() if each["count"]} == names - {
+        "failures.md",
+        "failures.json",
+    }
+    table = (tmp_path / "new" / "failures.md").read_text()
+    assert f"| all | {len(failures.rows)} |" in table
+
+
+def test_a_table_of_no_failures_can_be_written():
+    nothing = {
+        kind.name: {"count": 0, "by_band": dict.fromkeys(module.BANDS, 0), "another": None} for kind in KINDS
+    }
+    assert "| all | 0 | 0.0 % | 0 | 0 | 0 | 0 | - |" in markdown(nothing, 0, 10)
