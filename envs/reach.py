@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -22,12 +22,14 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
     """A batch of one of :class:`ReachVectorEnv`, with the same keyword arguments."""
 
     metadata = SINGLE_METADATA
+    batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
+    """What it is a batch of one of."""
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
         if "num_envs" in kwargs:
             raise TypeError("num_envs is an argument of gym.make_vec; gym.make makes one environment")
         EzPickle.__init__(self, threads=threads, **kwargs)
-        self.batch = ReachVectorEnv(1, threads=threads, **kwargs)
+        self.batch = self.batch_kind(1, threads=threads, **kwargs)
         """The batch of one that this environment is."""
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space

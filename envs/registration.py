@@ -13,14 +13,30 @@ TASKS: dict[str, dict[str, Any]] = {
 }
 """Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.reach.ReachVectorEnv`."""
 
+STEP_TASKS: dict[str, str] = {
+    "viapoint/PlanarObstaclesStep-v0": "viapoint/PlanarObstacles-v0",
+    "viapoint/PlanarWholeArmStep-v0": "viapoint/PlanarWholeArm-v0",
+}
+"""Every id of a task with an action in every control step, and its twin, whose keyword arguments it sets.
+
+They are :class:`~viapoint.envs.reach_step.StepReachVectorEnv`.
+"""
+
 
 def register_all() -> None:
     """Make every id known to Gymnasium; a second call changes nothing."""
     for name, kwargs in TASKS.items():
-        if name not in gym.registry:
-            gym.register(
-                name,
-                entry_point="viapoint.envs.reach:ReachEnv",
-                vector_entry_point="viapoint.envs.reach:ReachVectorEnv",
-                kwargs=kwargs,
-            )
+        _register(name, "viapoint.envs.reach:ReachEnv", "viapoint.envs.reach:ReachVectorEnv", kwargs)
+    for name, twin in STEP_TASKS.items():
+        module = "viapoint.envs.reach_step"
+        _register(name, f"{module}:StepReachEnv", f"{module}:StepReachVectorEnv", TASKS[twin])
+
+
+def twin_of(env_id: str) -> str:
+    """The id of the task in which one action is a whole movement; of most ids themselves."""
+    return STEP_TASKS.get(env_id, env_id)
+
+
+def _register(name: str, entry_point: str, vector_entry_point: str, kwargs: dict[str, Any]) -> None:
+    if name not in gym.registry:
+        gym.register(name, entry_point=entry_point, vector_entry_point=vector_entry_point, kwargs=kwargs)

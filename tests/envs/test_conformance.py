@@ -15,9 +15,10 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs import TASKS
+from viapoint.envs.registration import STEP_TASKS
 from viapoint.envs.reward import RewardTerms
 
-IDS = sorted(TASKS)
+IDS = sorted({*TASKS, *STEP_TASKS})
 INFO = {
     "is_success", "collision", "first_contact_time", "min_clearance", "goal_error", "duration", "path_length",
     "jerk_cost", "jerk_ratio", "peak_speed", "tracking_error", "reachable", "unstable",
@@ -29,14 +30,21 @@ def env_id(request):
     return request.param
 
 
+def play(env, action):
+    """The same action until the episode ends: its last step."""
+    while True:
+        last, reward, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return last, reward, info
+
+
 def episodes(env_id, seeds, actions, **kwargs):
-    """One step from each seed, environment by environment."""
+    """One episode from each seed, environment by environment: first and last observation, last reward and info."""
     env = gym.make(env_id, **kwargs)
     result = []
     for seed, action in zip(seeds, actions, strict=True):
         first, _ = env.reset(seed=int(seed))
-        last, reward, *_, info = env.step(action)
-        result.append((first, last, reward, info))
+        result.append((first, *play(env, action)))
     env.close()
     return result
 
@@ -80,26 +88,43 @@ def test_single_equals_batch_bit_for_bit(env_id, threads):
     actions = actions_for(env_id, number)
     env = gym.make_vec(env_id, num_envs=number, threads=threads)
     first, _ = env.reset(seed=5)
-    _, reward, terminated, truncated, info = env.step(actions)
+    alone = episodes(env_id, 5 + np.arange(number), actions)
+    running = np.ones(number, dtype=bool)
+    while running.any():
+        _, reward, terminated, truncated, info = env.step(actions)
+        ended = terminated | truncated
+        assert (ended == info.get("_final_info", np.zeros(number, dtype=bool))).all()
+        for i in np.flatnonzero(ended & running):
+            start, last, r, single = alone[i]
+            assert r == reward[i]
+            for name in start:
+                np.testing.assert_array_equal(start[name], first[name][i])
+                np.testing.assert_array_equal(last[name], info["final_obs"][i][name])
+            assert single == {k: info["final_info"][k][i].item() for k in single}
+            assert single == {k: info[k][i].item() for k in single}
+        running &= ~ended
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", sorted(TASKS))
+def test_one_decision_ends_the_episode(env_id):
+    env = gym.make_vec(env_id, num_envs=4)
+    env.reset(seed=0)
+    _, _, terminated, truncated, _ = env.step(env.action_space.sample())
     assert terminated.all()
     assert not truncated.any()
-    for i, (alone, last, r, single) in enumerate(episodes(env_id, 5 + np.arange(number), actions)):
-        assert r == reward[i]
-        for name in alone:
-            np.testing.assert_array_equal(alone[name], first[name][i])
-            np.testing.assert_array_equal(last[name], info["final_obs"][i][name])
-        assert single == {k: info["final_info"][k][i].item() for k in single}
-        assert single == {k: info[k][i].item() for k in single}
-    env.close()
 
 
 def test_the_next_episodes_are_those_of_a_reset(env_id):
     """Autoreset draws what reset would have drawn."""
     env, single = gym.make_vec(env_id, num_envs=3), gym.make(env_id)
     env.reset(seed=8)
-    following, *_ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    ended = False
+    while not ended:
+        following, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+        ended = (terminated | truncated)[2]
     single.reset(seed=10)
-    single.step(np.zeros(single.action_space.shape, dtype=np.float32))
+    play(single, np.zeros(single.action_space.shape, dtype=np.float32))
     again, _ = single.reset()
     for name, part in again.items():
         np.testing.assert_array_equal(part, following[name][2])
@@ -119,17 +144,22 @@ def test_observations_share_no_memory_and_stay_in_their_space(env_id):
     for action in actions_for(env_id, 8):
         after, *_, info = env.step(np.tile(action, (16, 1)))
         assert env.observation_space.contains(after)
-        assert all(env.single_observation_space.contains(last) for last in info["final_obs"])
+        last = [each for each in info.get("final_obs", ()) if each is not None]
+        assert all(env.single_observation_space.contains(each) for each in last)
         assert not any(np.shares_memory(before[name], after[name]) for name in before)
     for name, part in kept.items():
         np.testing.assert_array_equal(part, before[name])
 
 
 def test_no_element_of_the_observation_is_constant(env_id):
-    observation, _ = gym.make_vec(env_id, num_envs=64).reset(seed=0)
-    for name, part in observation.items():
+    env = gym.make_vec(env_id, num_envs=64)
+    seen = [
+        env.reset(seed=0)[0],
+        *(env.step(np.tile(action, (64, 1)))[0] for action in actions_for(env_id, 2)),
+    ]
+    for name, part in seen[0].items():
         assert part.dtype == np.float32
-        assert (np.ptp(part, axis=0) > 0.0).all(), name
+        assert (np.ptp(np.concatenate([each[name] for each in seen]), axis=0) > 0.0).all(), name
 
 
 def test_everything_in_the_model_has_a_name(env_id):
@@ -188,10 +218,11 @@ def test_wrong_shapes_and_unknown_arguments_are_refused(env_id):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="shape"):
         env.step(np.zeros(env.action_space.shape[0] + 1, dtype=np.float32))
-    with pytest.raises(TypeError, match=r"'speed'; allowed are .*n_via"):
+    with pytest.raises(TypeError, match=r"'speed'; allowed are .*n_obstacles"):
         gym.make(env_id, speed=3)
-    with pytest.raises(ValueError, match="timing must be one of optimal, learned"):
-        gym.make(env_id, timing="fast")
+    if env_id in TASKS:
+        with pytest.raises(ValueError, match="timing must be one of optimal, learned"):
+            gym.make(env_id, timing="fast")
     with pytest.raises(ValueError, match="render_mode must be"):
         gym.make(env_id, render_mode="rgb")
 
