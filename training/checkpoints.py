@@ -8,6 +8,7 @@ model it holds no code.
 from __future__ import annotations
 
 import hashlib
+import json
 import random
 from collections import deque
 from collections.abc import Mapping
@@ -31,7 +32,9 @@ from viapoint.training.files import (
 from viapoint.training.model_files import describe
 from viapoint.training.vec_env import ViaVecEnv
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats that can be read; the first did not vouch for the numbers in `state.json`."""
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -64,7 +67,8 @@ def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any
 
     def fill(temporary: Path) -> None:
         write_arrays(temporary / "tensors.safetensors", tensors)
-        state["sha256"] = hashlib.sha256((temporary / "tensors.safetensors").read_bytes()).hexdigest()
+        state["sha256"] = _file_digest(temporary / "tensors.safetensors")
+        state["digest"] = _digest(state)
         write_json(temporary / "state.json", state)
 
     write_folder(folder, fill)
@@ -79,26 +83,49 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     Raises:
         BadFileError: The checkpoint is torn, foreign, or of another model.
     """
-    path = folder / "tensors.safetensors"
-    state = read_json(folder / "state.json")
-    if state.get("format") != FORMAT:
-        raise BadFileError(folder / "state.json", f"must have format {FORMAT}, got {state.get('format')!r}")
-    try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
-    if digest != state.get("sha256"):
-        raise BadFileError(path, "is torn: its hash is not the one that state.json states")
-    tensors = read_arrays(path)
-    difference = _difference(state.get("model"), describe(model))
+    state = _whole(folder)
+    written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
+    difference = _difference(state["model"], describe(model))
     if difference:
-        raise BadFileError(folder / "state.json", f"is of another model: {difference}")
+        raise BadFileError(folder / "state.json", f"{written_by} is of another model: {difference}")
+    tensors = read_arrays(folder / "tensors.safetensors")
     try:
         _restore(model, state, tensors)
-    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
-        raise BadFileError(folder, f"does not fit the model ({type(error).__name__}: {error})") from None
-    extra: dict[str, Any] = state["extra"]
+        extra: dict[str, Any] = dict(state["extra"])
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
+        raise BadFileError(folder, reason) from None
     return extra
+
+
+def _whole(folder: Path) -> dict[str, Any]:
+    """What `state.json` says, after both files were found to be as they were written."""
+    path, tensors = folder / "state.json", folder / "tensors.safetensors"
+    state = read_json(path)
+    if state.get("format") not in READABLE or not isinstance(state.get("model"), dict):
+        known = " or ".join(map(str, READABLE))
+        raise BadFileError(path, f"must have format {known}, got {state.get('format')!r}")
+    if state["format"] != 1 and state.get("digest") != _digest(state):
+        raise BadFileError(path, "is damaged: it does not have the hash that it states")
+    if _file_digest(tensors) != state.get("sha256"):
+        raise BadFileError(tensors, "is torn: its hash is not the one that state.json states")
+    return state
+
+
+def _digest(state: Mapping[str, Any]) -> str:
+    """Hash of everything else in a state."""
+    rest = {name: value for name, value in state.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _file_digest(path: Path) -> str:
+    if not path.is_file():
+        raise BadFileError(path, "is no regular file" if path.exists() else "is missing")
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
 
 
 def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:

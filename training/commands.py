@@ -24,6 +24,13 @@ from viapoint.training.frozen_scenes import load
 from viapoint.training.runs import Run, find_model, load_model
 
 
+class EvaluationStoppedError(Exception):
+    """An evaluation was stopped by Ctrl-C; what it had finished is written and marked as partial."""
+
+    exit_code = 130
+    """As shells count an end by Ctrl-C."""
+
+
 class Agent(NamedTuple):
     """A trained agent and the environment that it was trained on."""
 
@@ -97,14 +104,15 @@ def evaluate(config: EvaluateConfig) -> None:
         result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()
     report.show(record)
-    if result.partial:
-        print("interrupted: the results are partial", file=sys.stderr)
     if config.run is not None and (config.run / "config.json").is_file():
-        print(f"kept as {Run(config.run).write_evaluation(Path(config.scenes).stem, record)}")
+        name = Path(config.scenes).stem + (".partial" if result.partial else "")  # replaces no whole one
+        print(f"kept as {Run(config.run).write_evaluation(name, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
+    if result.partial:
+        raise EvaluationStoppedError("stopped: the results are partial")
     if config.failures is not None and agent is not None:
         last = [each for each in result.results if each.name.startswith("agent")][-1]
         done = frozen.take(slice(0, len(last.success)))

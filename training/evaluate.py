@@ -46,6 +46,8 @@ class MethodResult:
     """From start to goal, shape (n,), [m]."""
     partial: bool
     """Whether it was interrupted before the last scene."""
+    interrupted: bool = False
+    """Whether it was interrupted at all, so that no method follows."""
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -90,11 +92,13 @@ class Evaluation:
     sha256: str
     """Of the set."""
     results: tuple[MethodResult, ...]
+    missing: bool = False
+    """Whether it was interrupted before the last method."""
 
     @property
     def partial(self) -> bool:
-        """Whether it was interrupted."""
-        return any(result.partial for result in self.results)
+        """Whether it was interrupted before the end."""
+        return self.missing or any(result.partial for result in self.results)
 
     def as_json(self) -> dict[str, Any]:
         """Metrics, comparisons with the first method, and every outcome, as JSON can hold them."""
@@ -145,9 +149,12 @@ def evaluate(
         for method in methods:
             result = _evaluate_one(method, frozen, trial, batch, time_decisions, progress)
             results.append(result)
-            if result.partial:
+            if result.interrupted:
                 break
-    return Evaluation(env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results))
+    missing = len(results) < len(methods)
+    return Evaluation(
+        env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), missing=missing
+    )
 
 
 def _evaluate_one(
@@ -160,9 +167,8 @@ def _evaluate_one(
 ) -> MethodResult:
     number = len(frozen.share)
     pieces: list[Mapping[str, NDArray[Any]]] = []
-    actions: list[Float] = []
     times: Float = np.zeros(0)
-    seconds, partial = 0.0, False
+    seconds, interrupted = 0.0, False
     try:
         for first in range(0, number, batch):
             scenes = frozen.scenes.take(slice(first, first + batch))
@@ -170,16 +176,17 @@ def _evaluate_one(
             decided = method.decide(trial.observe(scenes), scenes)
             seconds += time.perf_counter() - began
             outcome = trial(scenes, decided)
-            pieces.append({**outcome.info, "reward": outcome.reward})
-            actions.append(np.asarray(decided, dtype=np.float64))
+            action = np.asarray(decided, dtype=np.float64)
+            pieces.append({**outcome.info, "reward": outcome.reward, "": action})
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
         if time_decisions and getattr(method, "timed", True):
             times = _decision_times(method, frozen.scenes, trial, seconds / number)
     except KeyboardInterrupt:
-        partial = True
+        interrupted = True
+    actions = [piece[""] for piece in pieces]  # kept with their outcomes, so that Ctrl-C parts none of them
     done = sum(len(piece) for piece in actions)
-    names = pieces[0] if pieces else ()
+    names = [name for name in pieces[0] if name] if pieces else ()
     return MethodResult(
         name=method.name,
         outcomes={name: np.concatenate([piece[name] for piece in pieces]) for name in names} or _nothing(),
@@ -187,7 +194,8 @@ def _evaluate_one(
         decision_times=times,
         band=np.where(np.isnan(frozen.share), -1, frozen.band)[:done],
         distance=np.linalg.norm(frozen.scenes.goal - frozen.scenes.start, axis=-1)[:done],
-        partial=partial and done < number,
+        partial=interrupted and done < number,
+        interrupted=interrupted,
     )
 
 

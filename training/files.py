@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Mapping
@@ -17,6 +19,11 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 Arrays = dict[str, NDArray[Any]]
+
+LARGEST_JSON = 64 << 20
+"""Size that a JSON file may have, [bytes]."""
+UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
+"""Names of what :func:`write_bytes` and :func:`write_folder` are at work on; a crash leaves them behind."""
 
 
 class BadFileError(ValueError):
@@ -41,8 +48,10 @@ def write_bytes(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
         _sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)  # a full disk does not say which file it has no room for
         raise
 
 
@@ -71,21 +80,43 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
+def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
+    """Read a JSON object of finite numbers.
 
     Raises:
-        BadFileError: It is missing, not JSON, or not an object.
+        BadFileError: It is missing, larger than `largest` bytes, not JSON, or not an object.
     """
+    content = read_bytes(path, largest)
     try:
-        value = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise BadFileError(path, "is missing") from None
-    except (ValueError, OSError, RecursionError) as error:
+        value = json.loads(
+            content, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_without_repetition
+        )
+    except (ValueError, RecursionError) as error:
         raise BadFileError(path, f"cannot be read as JSON ({error})") from None
     if not isinstance(value, dict):
         raise BadFileError(path, f"must hold a JSON object, not a {type(value).__name__}")
     return value
+
+
+def read_bytes(path: Path, largest: int | None = None) -> bytes:
+    """The content of a regular file.
+
+    Raises:
+        BadFileError: It is missing, no regular file, larger than `largest` bytes, or cannot be read.
+    """
+    try:
+        if not path.exists():
+            raise BadFileError(path, "is missing")
+        if not path.is_file():  # reading a pipe or a device may never end
+            raise BadFileError(path, "is no regular file")
+        size = path.stat().st_size
+        if largest is not None and size > largest:
+            raise BadFileError(path, f"must have at most {largest} bytes, has {size}")
+        return path.read_bytes()
+    except OSError as error:
+        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
+    except MemoryError:
+        raise BadFileError(path, "does not fit into memory") from None
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -93,18 +124,37 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     write_bytes(path, save_arrays({name: np.asarray(array, order="C") for name, array in arrays.items()}))
 
 
-def read_arrays(path: Path) -> Arrays:
+def read_arrays(path: Path, largest: int | None = None) -> Arrays:
     """Read named arrays.
 
     Raises:
-        BadFileError: It is missing, truncated or no safetensors file.
+        BadFileError: It is missing, larger than `largest` bytes, truncated or no safetensors file.
     """
+    content = read_bytes(path, largest)
     try:
-        return load_arrays(path.read_bytes())
-    except FileNotFoundError:
-        raise BadFileError(path, "is missing") from None
-    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+        return load_arrays(content)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise BadFileError(path, f"is no whole safetensors file ({error})") from None
+
+
+def _refused(constant: str) -> Any:
+    raise ValueError(f"{constant} is no JSON number")
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(f"{digits[:40]} is too large a number")
+    return number
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Readers differ in which of two equal names they take."""
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is there twice")
+    return result
 
 
 def _sync_folder(folder: Path) -> None:
@@ -120,11 +170,13 @@ def _sync_folder(folder: Path) -> None:
 
 def tidy(folder: Path) -> None:
     """Undo what a crash amid :func:`write_folder` or :func:`write_bytes` left behind in a folder."""
-    for old in sorted(folder.glob(".*.old")):
-        target = folder / old.name.split(".")[1]
-        if target.exists():
-            shutil.rmtree(old, ignore_errors=True)
+    for left in sorted(folder.glob(".*")):
+        found = UNFINISHED.fullmatch(left.name)
+        if found is None:
+            continue
+        if found["kind"] == "old" and not (folder / found["name"]).exists():
+            left.rename(folder / found["name"])
+        elif left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
         else:
-            old.rename(target)
-    for part in folder.glob(".*.part"):
-        shutil.rmtree(part) if part.is_dir() else part.unlink()
+            left.unlink()

@@ -6,6 +6,7 @@ tables here, and the weights must have the names, shapes and types of the model 
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import inspect
 import warnings
@@ -23,6 +24,12 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from viapoint.training.files import BadFileError, read_arrays, read_json, write_arrays, write_json
+from viapoint.training.limits import (
+    LARGEST_MODEL_JSON,
+    LARGEST_WEIGHTS,
+    check_env_arguments,
+    parameter_budget,
+)
 from viapoint.training.vec_env import ViaVecEnv
 from viapoint.training.via_td3 import ViaTD3
 
@@ -63,8 +70,9 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
         ValueError: It is of a class that is not in ALGORITHMS, or was not trained on a :class:`ViaVecEnv`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "model.json", describe(model))
-    write_arrays(folder / "weights.safetensors", weights(model))
+    path = folder / "weights.safetensors"
+    write_arrays(path, weights(model))
+    write_json(folder / "model.json", {**describe(model), "weights_sha256": _digest(path)})
 
 
 def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
@@ -78,15 +86,19 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
     Raises:
         BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
     """
-    path = folder / "model.json"
-    record = read_json(path)
+    path, tensors = folder / "model.json", folder / "weights.safetensors"
+    record = read_json(path, LARGEST_MODEL_JSON)
     if record.get("format") != FORMAT:
-        raise BadFileError(path, f"must have format {FORMAT}, got {record.get('format')!r}")
+        found, mine = record.get("format"), importlib.metadata.version("viapoint")
+        writer = f"was written by viapoint {record.get('viapoint')} and this is {mine}"
+        raise BadFileError(path, f"must have format {FORMAT}, got {found!r}; it {writer}")
+    arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         hyperparameters = dict(record["hyperparameters"])
-        if env is None and "buffer_size" in hyperparameters:
-            hyperparameters["buffer_size"] = 1
-        with warnings.catch_warnings():
+        if env is None:  # to decide, hardly any room is needed for experience
+            buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
+            hyperparameters[buffer] = 2
+        with warnings.catch_warnings(), parameter_budget(arrays):
             warnings.simplefilter(
                 "ignore", UserWarning
             )  # PPO finds that its batches do not fill one environment
@@ -98,7 +110,9 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
     except Exception as error:
         reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
         raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
-    put_weights(model, read_arrays(folder / "weights.safetensors"), folder / "weights.safetensors")
+    put_weights(model, arrays, tensors)
+    if record.get("weights_sha256", "") not in ("", _digest(tensors)):
+        raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
     return model
 
 
@@ -190,9 +204,14 @@ def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> 
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
     if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
         raise ValueError(f"environment {record['id']!r} is not known")
+    check_env_arguments(record["kwargs"])
     return ViaVecEnv(record["id"], 1, **record["kwargs"])
 
 

@@ -25,7 +25,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.config import TrainConfig, as_json, from_json
-from viapoint.training.files import BadFileError, read_json, tidy, write_bytes, write_folder, write_json
+from viapoint.training.files import (
+    UNFINISHED,
+    BadFileError,
+    read_json,
+    tidy,
+    write_bytes,
+    write_folder,
+    write_json,
+)
 from viapoint.training.model_files import load_model, save_model
 
 __all__ = ["BadFileError", "Run", "find_model", "load_model", "save_model", "versions"]
@@ -55,8 +63,10 @@ class Run:
         except (TypeError, ValueError) as error:
             if isinstance(error, BadFileError):
                 raise
+            reason = f"is no configuration of a training by viapoint {versions()['viapoint']} ({error})"
+            writer = self.versions.get("viapoint")
             raise BadFileError(
-                folder / "config.json", f"is no configuration of a training ({error})"
+                folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
             ) from None
 
     @classmethod
@@ -67,17 +77,21 @@ class Run:
             BadFileError: There is a run in it already, or something else.
         """
         folder = config.folder
-        if (folder / "config.json").exists():
-            raise BadFileError(
-                folder, "holds a run already; continue it with --resume or name another folder"
-            )
-        left = {"versions.json", "lock", "lock.pid"}  # by a start that got no further
-        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - left):
-            raise BadFileError(folder, "is not empty and is no run folder")
+        _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "versions.json", versions())
-        _write_config(folder, config)
+        with _held(folder):
+            _check_free(folder)  # another process may have been faster
+            write_json(folder / "versions.json", versions())
+            _write_config(folder, config)
         return cls(folder)
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """Versions that the run began with; empty where they cannot be read."""
+        try:
+            return read_json(self.folder / "versions.json")
+        except BadFileError:
+            return {}
 
     def write_config(self) -> None:
         """Write the configuration as it is now."""
@@ -114,8 +128,10 @@ class Run:
             BadFileError: There is none yet.
         """
         for name in ("best", "final"):
-            if (self.folder / name / "model.json").is_file():
-                return self.folder / name
+            replaced = sorted(self.folder.glob(f".{name}.*.old"))  # there is one amid a replacement only
+            for folder in (self.folder / name, *replaced):
+                if (folder / "model.json").is_file():
+                    return folder
         raise BadFileError(self.folder, "holds no model yet")
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
@@ -166,25 +182,43 @@ class Run:
         Raises:
             BadFileError: Another process trains in the folder.
         """
-        lock = FileLock(self.folder / "lock")
-        owner = self.folder / "lock.pid"
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            pid = owner.read_text() if owner.exists() else "unknown"
-            raise BadFileError(self.folder, f"is in use by the process with number {pid}") from None
-        try:
-            owner.write_text(str(os.getpid()))
+        with _held(self.folder):
             for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
                 tidy(folder)
             yield
-        finally:
-            owner.unlink(missing_ok=True)
-            lock.release()
 
     @property
     def _checkpoints(self) -> Path:
         return self.folder / "checkpoints"
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold a folder for this process; see :meth:`Run.locked`."""
+    lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        pid = owner.read_text() if owner.exists() else "unknown"
+        raise BadFileError(folder, f"is in use by the process with number {pid}") from None
+    try:
+        owner.write_text(str(os.getpid()))
+        yield
+    finally:
+        owner.unlink(missing_ok=True)
+        lock.release()
+
+
+def _check_free(folder: Path) -> None:
+    """Refuse a folder that holds more than a start left that got no further."""
+    if (folder / "config.json").exists():
+        raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
+    if not folder.exists():
+        return
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
+    begun = {name for name in names if UNFINISHED.fullmatch(name)}
+    if names - begun - {"versions.json", "lock", "lock.pid"}:
+        raise BadFileError(folder, "is not empty and is no run folder")
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:

@@ -15,10 +15,14 @@ from viapoint.training.config import TrainConfig
 from viapoint.training.model_files import build
 from viapoint.training.monitor import Monitor, TrainingStoppedError
 from viapoint.training.presets import PRESETS
-from viapoint.training.runs import Run
+from viapoint.training.runs import Run, versions
 from viapoint.training.vec_env import ViaVecEnv
 
-__all__ = ["TrainingStoppedError", "new_model", "one_thread", "resolved", "train"]
+__all__ = ["TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train"]
+
+
+class TrainingFailedError(Exception):
+    """Training could not go on, for example for want of disk space; what was saved before is whole."""
 
 
 def train(config: TrainConfig) -> Run:
@@ -30,14 +34,22 @@ def train(config: TrainConfig) -> Run:
     Raises:
         BadFileError: The folder cannot take the run, or does not hold the one to resume.
         TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
+        TrainingFailedError: A file could not be written.
     """
-    run = _resumed(config) if config.resume else Run.create(resolved(config))
+    run = Run(config.folder) if config.resume else Run.create(resolved(config))
     with run.locked(), one_thread():
+        if config.resume:
+            _take_up(run, config)
         env = ViaVecEnv(run.config.env, run.config.copies, **run.config.env_kwargs)
         try:
             model = new_model(run.config, env)
             with _logging(model, run), Monitor(run) as monitor:
                 _learn(model, run, monitor)
+        except OSError as error:
+            raise TrainingFailedError(
+                f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
+                f"{run.decisions}, and viapoint train --resume goes on from there"
+            ) from error
         finally:
             env.close()
     return run
@@ -69,14 +81,21 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _resumed(config: TrainConfig) -> Run:
-    """The run in the folder, with its own configuration but for what this call may change."""
-    run = Run(config.folder)
+def _take_up(run: Run, config: TrainConfig) -> None:
+    """Go on with a run's own configuration but for what this call may change."""
     if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         run.write_config()
     run.config = dataclasses.replace(run.config, progress=config.progress)
-    return run
+    began, now = run.versions, versions()
+    others = [
+        f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]
+    ]
+    if others:
+        print(
+            f"the run began with {', '.join(others)}: it may end otherwise than it would have",
+            file=sys.stderr,
+        )
 
 
 def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:

@@ -61,7 +61,9 @@ def test_a_model_decides_the_same_after_a_round_trip(algo, env, tmp_path):
             model.predict(observation, deterministic=True)[0],
         )
     again = describe(load_model(tmp_path, env))
-    assert again == json.loads((tmp_path / "model.json").read_text())
+    written = json.loads((tmp_path / "model.json").read_text())
+    assert written.pop("weights_sha256")
+    assert again == written
 
 
 def test_loading_does_not_touch_random_states(saved):
@@ -195,12 +197,15 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
 
 
 def test_a_crash_amid_a_replacement_is_undone(tmp_path):
-    (tmp_path / ".best.abc.old").mkdir()
-    (tmp_path / ".best.abc.old" / "model.json").write_text("{}")
-    (tmp_path / ".best.def.part").mkdir()
-    (tmp_path / ".config.json.abc.part").write_text("{")
+    one, other = 32 * "a", 32 * "b"
+    (tmp_path / f".best.{one}.old").mkdir()
+    (tmp_path / f".best.{one}.old" / "model.json").write_text("{}")
+    (tmp_path / f".best.{other}.part").mkdir()
+    (tmp_path / f".config.json.{one}.part").write_text("{")
+    (tmp_path / ".film.mp4.part").write_text("of another program")
     files.tidy(tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["best"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".film.mp4.part", "best"]
+    assert (tmp_path / "best" / "model.json").read_text() == "{}"
 
 
 @pytest.fixture
