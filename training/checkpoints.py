@@ -175,7 +175,12 @@ def _restore_buffer(model: BaseAlgorithm, state: dict[str, Any]) -> None:
         saved = state["arrays"][name]
         pairs = [(kept[key], saved[key]) for key in kept] if isinstance(kept, dict) else [(kept, saved)]
         for mine, theirs in pairs:
+            if mine.shape[1:] != theirs.shape[1:] or mine.dtype != theirs.dtype or len(theirs) > len(mine):
+                must, got = (f"{array.dtype} {array.shape}" for array in (mine, theirs))
+                raise ValueError(f"{name} of the replay buffer must fit into {must}, is {got}")
             mine[: len(theirs)] = theirs
+    if not 0 <= state["pos"] < buffer.buffer_size:
+        raise ValueError(f"the replay buffer has {buffer.buffer_size} rows, no row {state['pos']}")
     buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
 
 
