@@ -190,11 +190,7 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
             load_model(model)
     for name in ("weights.safetensors", "model.json"):
         with (model / name).open("r+b") as file:
-<<<<<<< Updated upstream
-            file.truncate(1 << 44)  # takes no room on the disk
-=======
             file.truncate(1 << 40)  # takes no room on the disk
->>>>>>> Stashed changes
         with pytest.raises(BadFileError, match=f"{name}: must have at most"):
             load_model(model)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
