@@ -1,0 +1,221 @@
+"""What is trained and how often: tables of variants, and the configuration of the study."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from viapoint.envs.registration import TASKS
+from viapoint.training.config import DEFAULT_ENV, TrainConfig
+from viapoint.training.frozen_scenes import SETS, shipped_path
+from viapoint.training.policies import ViaPolicy
+from viapoint.training.presets import PRESETS, Algorithm
+from viapoint.training.via_td3 import ViaTD3
+
+Table = Literal["results", "ablations", "freedom"]
+Step = Literal["train", "evaluate", "baselines", "time", "page"]
+MEASURED = tuple(name for name in SETS if name != "validation")
+"""Sets that are measured once training is over; models are chosen on `validation` alone."""
+BASELINES = ("straight", "constant", "random", "random16", "random80", "stored")
+"""Of the results: names of viapoint.training.baselines, and the planner's solutions that are stored with the scenes."""
+VALIDATIONS, CHECKPOINTS = 16, 8
+"""Of each training, however long it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One way to learn."""
+
+    name: str
+    """Of its folder."""
+    label: str
+    """In the tables."""
+    algo: Algorithm = "viatd3"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Of ViaTD3 or of its policy, instead of the preset's."""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Of the environment."""
+
+
+METHODS = tuple(Variant(name=algo, label=algo, algo=algo) for algo in get_args(Algorithm))
+"""Each algorithm as its preset says."""
+WHOLE = METHODS[0]
+ABLATIONS = (
+    WHOLE,
+    Variant(
+        name="viatd3-no-features",
+        label="no features of the planned movement in the critic",
+        settings={"trajectory_features": False},
+    ),
+    Variant(name="viatd3-one-head", label="one proposal instead of many", settings={"heads": 1}),
+    Variant(
+        name="viatd3-no-augmentation", label="no mirrored and exchanged scenes", settings={"augment": False}
+    ),
+    Variant(
+        name="viatd3-no-smoothness", label="no smoothness in the objective", settings={"smoothness": False}
+    ),
+    Variant(
+        name="viatd3-log-success",
+        label="log-probability of success as the objective",
+        settings={"objective": "log_success"},
+    ),
+)
+"""The whole agent, and what becomes of it without each of its parts; without candidates it is measured anyway."""
+FREEDOM = tuple(
+    WHOLE
+    if (n_via, timing) == (1, "optimal")
+    else Variant(
+        name=f"viatd3-k{n_via}-{timing}",
+        label=f"K = {n_via}, {timing} timing",
+        env_kwargs={"n_via": n_via, "timing": timing},
+    )
+    for n_via in (1, 2, 3)
+    for timing in ("optimal", "learned")
+)
+"""More via-points, and their timing left to the agent."""
+FREEDOM_LABELS = {each.name: each.label for each in FREEDOM} | {WHOLE.name: "K = 1, optimal timing"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Train, evaluate, and write docs/results.md with its figures; a second call goes on where the first stopped.
+
+    Example: python benchmarks/learning.py --jobs 2
+    """
+
+    out: Path = Path("runs/study")
+    """Folder of the run folders and of everything measured."""
+    docs: Path = Path("docs")
+    """Folder for results.md, results.json and images/results_*.png."""
+    envs: tuple[str, ...] = ()
+    """Environments of the results; all that have frozen test scenes if not given."""
+    methods: tuple[str, ...] = tuple(get_args(Algorithm))
+    """Learning algorithms of the results."""
+    studied: tuple[str, ...] = (DEFAULT_ENV,)
+    """Environments of ablations and freedom."""
+    tables: tuple[Table, ...] = get_args(Table)
+    """Which tables are worked on; the page shows whatever is there."""
+    only: tuple[Step, ...] = get_args(Step)
+    """Which steps are taken."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Of the trainings."""
+    jobs: int = 1
+    """Processes that train and measure at once, each on its share of the cores; 0 works in this process."""
+    baselines: tuple[str, ...] = BASELINES
+    """Of the results; `stored` is the planner's solutions from the files of scenes, `planner` searches anew."""
+    candidates: int = 80
+    """Actions that the critic ranks in the second row of an agent."""
+    n_timesteps: int | None = None
+    """Decisions of each training; as the preset says if not given. For trials."""
+    n_scenes: int | None = None
+    """Scenes of each set, at most. For trials."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        for name, known in (
+            ("envs", [env for env in TASKS if sets_of(env)]),
+            ("studied", [env for env in TASKS if sets_of(env)]),
+            ("methods", list(PRESETS)),
+            ("baselines", [*BASELINES, "planner"]),
+        ):
+            unknown = [each for each in getattr(self, name) if each not in known]
+            if unknown:
+                raise ValueError(f"{name} must be among {', '.join(known)}, got {unknown[0]!r}")
+        for name, least in (("jobs", 0), ("candidates", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError(f"seeds must name numbers that are 0 or more, got {self.seeds}")
+
+    @property
+    def environments(self) -> tuple[str, ...]:
+        """Of the results."""
+        return self.envs or tuple(env for env in TASKS if sets_of(env))
+
+    def variants(self, table: Table) -> tuple[Variant, ...]:
+        """The rows of a table."""
+        if table == "results":
+            return tuple(each for each in METHODS if each.algo in self.methods)
+        return ABLATIONS if table == "ablations" else FREEDOM
+
+    def cells(self) -> list[Cell]:
+        """All trainings, seed after seed, so that every table has its first seed early."""
+        found: dict[Cell, None] = {}
+        for seed in self.seeds:
+            for table in self.tables:
+                for env in self.environments if table == "results" else self.studied:
+                    for variant in self.variants(table):
+                        found[Cell(env=env, variant=variant, seed=seed)] = None
+        return list(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One training of the study."""
+
+    env: str
+    variant: Variant
+    seed: int
+
+    def __hash__(self) -> int:
+        """Variants are known by their names."""
+        return hash((self.env, self.variant.name, self.seed))
+
+    def __str__(self) -> str:
+        """In a line."""
+        return f"{short(self.env)} {self.variant.name} seed {self.seed}"
+
+    def folder(self, study: Study) -> Path:
+        """Of the run."""
+        return study.out / short(self.env) / self.variant.name / f"seed-{self.seed}"
+
+    def training(self, study: Study) -> TrainConfig:
+        """The configuration of the run."""
+        config = TrainConfig(
+            env=self.env,
+            algo=self.variant.algo,
+            seed=self.seed,
+            n_timesteps=study.n_timesteps,
+            out=self.folder(study),
+            eval_scenes=min(study.n_scenes or 500, 500),
+            env_kwargs=dict(self.variant.env_kwargs),
+            hyperparameters=placed(self.variant.settings),
+            progress=False,
+        )
+        total = config.total_timesteps
+        return dataclasses.replace(
+            config,
+            eval_every=max(total // VALIDATIONS, 1),
+            checkpoint_every=max(total // CHECKPOINTS, 1),
+        )
+
+
+def placed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as hyperparameters: ViaTD3's own ones, and those of its policy in `policy_kwargs`.
+
+    Raises:
+        ValueError: Neither knows one of them.
+    """
+    own, policy = (set(inspect.signature(kind.__init__).parameters) for kind in (ViaTD3, ViaPolicy))
+    unknown = sorted(set(settings) - own - policy)
+    if unknown:
+        raise ValueError(f"cannot be trained: neither ViaTD3 nor its policy has a setting {unknown[0]!r}")
+    result = {name: value for name, value in settings.items() if name in own}
+    others = {name: value for name, value in settings.items() if name not in own}
+    if others:
+        result["policy_kwargs"] = {**PRESETS["viatd3"].arguments().get("policy_kwargs", {}), **others}
+    return result
+
+
+def sets_of(env: str) -> list[str]:
+    """Names of the measured sets that an environment has."""
+    return [name for name in MEASURED if shipped_path(name, env).is_file()]
+
+
+def short(env: str) -> str:
+    """An environment's id without its namespace."""
+    return env.rpartition("/")[2]

@@ -1,0 +1,66 @@
+"""What docs/results.md says in words; its numbers are filled in by page.py."""
+
+INTRODUCTION = """# Results
+
+This page is made by one command from files that the trainings left; no number in it is typed by hand.
+
+    python benchmarks/learning.py --jobs 2
+
+It trains every method with every seed, measures each agent on the frozen `test` and `hard` scenes, measures the
+baselines on the same scenes, and writes this page, its figures and [results.json](results.json), which holds every
+number shown here. Called again it goes on where it stopped. Models are chosen on `validation` scenes alone; `test`
+and `hard` are looked at once training is over.
+
+{seeds}
+
+**How to read the tables.** Success: at rest within 1 cm of the goal, no contact at any physics step, joint limits
+kept. Of several seeds the number is the interquartile mean (of five seeds: the mean of the middle three), with the
+95 % interval of a bootstrap that draws seeds and scenes anew (2,000 draws; whole agents, and scenes within their
+bands). A method without seeds has the interval over scenes. The bands are those of the *solution share*, the
+fraction of uniformly random actions that solve a scene: easy scenes prove little. Jerk and duration are those of
+successes as multiples of the planner's in the same scene: the median over scenes, then over seeds. Jerk is taken at
+equal duration. Decision: the median time of one decision on one thread; of the planner, of a search. Minutes: wall
+time of a training without validation, median over seeds{cores}.
+"""
+
+KNOWLEDGE = """## What the critic knows, and what it must learn
+
+By construction it knows the *plan*. An action expands into a minimum-jerk movement by formulas, so the features it
+is given are exact: how near the planned path comes to each obstacle in each stretch, whether it stays within reach,
+how jerky it is. The terms of the reward that the plan alone decides (smoothness, duration, clearance of the plan)
+are added as formulas and never learnt.
+
+It must learn what no formula says: what the physics makes of the plan (the arm lags and overshoots, torque is
+limited, a contact anywhere ends all hope of success), so how much clearance is enough; and the actor must learn
+which way round pays, and to find a good movement at once instead of searching for it. Ranking candidates with such
+a critic is close to planning with a model. What was learnt shows in the policy alone, in the rare bands, and in the
+distance to the best of equally many random actions that were tried out in the simulation itself.
+"""
+
+FREEDOM = """## When does more freedom pay?
+
+K via-points, passage times of least jerk (*optimal*) or chosen by the agent (*learned*). The scenes are the same;
+bands are those of one via-point with optimal timing. The planner searches anew with the same budget in the first
+{planned} test scenes: with K = 1 it solves every scene, as it certified them so, and the question there is what
+more freedom does to its jerk.
+"""
+
+TAGS = {
+    "rollout/ep_rew_mean": "mean reward of the last 100 decisions (Stable-Baselines3)",
+    "rollout/success_rate": "successes among the last 100 decisions (Stable-Baselines3)",
+    "rollout/collision_rate": "of the last 20 steps of all environments",
+    "rollout/reachable_rate": "plans within the arm's reach",
+    "rollout/min_clearance": "mean clearance, m",
+    "rollout/jerk_ratio": "mean jerk relative to the straight movement",
+    "rollout/duration": "mean duration, s",
+    "validation/success_rate": "of the policy alone on the validation scenes",
+    "validation/success_rate_share_above_20": "the same by band; also `5_to_20`, `1_to_5`, `below_1`",
+    "validation/collision_rate": "of the policy alone on the validation scenes",
+    "validation/min_clearance": "median of all scenes, m",
+    "validation/goal_error": "median of all scenes, m",
+    "validation/jerk_ratio": "median of successes",
+    "validation/duration": "median of successes, s",
+    "validation/decision_time": "median of single decisions, s",
+    "time/simulated_seconds": "simulated so far; `time/fps` is decisions per second",
+}
+"""What the tags of the log mean."""

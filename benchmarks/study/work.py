@@ -1,0 +1,256 @@
+"""The work: trainings, evaluations, baselines and timings, each kept in a file and done once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from study.plan import FREEDOM, METHODS, Cell, Study, Variant, sets_of, short
+from viapoint.training.baselines import AgentMethod, Method, make_method
+from viapoint.training.config import TrainConfig, as_json
+from viapoint.training.demo import Certified
+from viapoint.training.evaluate import MethodResult, evaluate
+from viapoint.training.failures import sort_out
+from viapoint.training.files import read_json, write_json
+from viapoint.training.frozen_scenes import FrozenScenes, load
+from viapoint.training.runs import Run, load_model
+from viapoint.training.train import one_thread, resolved, train
+
+KEPT = ("is_success", "collision", "jerk_ratio", "duration")
+"""Outcomes that are kept scene by scene."""
+SAME = ("env", "algo", "seed", "n_timesteps", "n_envs", "env_kwargs", "hyperparameters")
+"""What must be the same in two configurations for their runs to be the same."""
+PLANNED = 200
+"""Scenes that the planner solves anew for each degree of freedom."""
+TIMED = 100
+"""Scenes of the timing."""
+ALONE, RANKED = "alone", "ranked"
+"""How an agent decides: by one forward pass, or by the critic's ranking."""
+
+
+class Job(NamedTuple):
+    """Something to do, in this process or in another one."""
+
+    label: str
+    work: Callable[..., str]
+    arguments: tuple[Any, ...]
+
+
+def jobs(study: Study) -> list[Job]:
+    """What there is to do, but for timing; the work itself sees what is done already."""
+    found = []
+    if {"train", "evaluate"} & set(study.only):
+        found += [Job(str(cell), complete, (cell, study)) for cell in study.cells()]
+    if "baselines" in study.only:
+        if "results" in study.tables:
+            found += [
+                Job(f"{short(env)} {name}", baseline, (env, name, study))
+                for env in study.environments
+                for name in study.baselines
+            ]
+        if "freedom" in study.tables:
+            found += [
+                Job(f"{short(env)} planner {variant.name}", planned, (env, variant, study))
+                for env in study.studied
+                for variant in FREEDOM
+            ]
+    return found
+
+
+def complete(cell: Cell, study: Study) -> str:
+    """Train and measure, as far as it is asked for and not done; says how it went."""
+    done = state(cell, study)
+    if done not in ("absent", "unfinished", "trained"):
+        raise ValueError(f"{cell.folder(study)} {done}")
+    if "train" in study.only and done != "trained":
+        again = TrainConfig(out=cell.folder(study), resume=True, progress=False)
+        run = train(cell.training(study) if done == "absent" else again)
+        write_json(run.folder / "cores.json", {"cores": cores(), "of": os.cpu_count()})
+        done = "trained"
+    if "evaluate" in study.only and done == "trained":
+        rates = [f"{name} {_rates(measured(cell, name, study))}" for name in sets_of(cell.env)]
+        return "; ".join(rates)
+    return done
+
+
+def state(cell: Cell, study: Study) -> str:
+    """`absent`, `unfinished`, `trained`, or in words what is in the way."""
+    try:
+        config = cell.training(study)
+    except ValueError as error:
+        return str(error)
+    if not (config.folder / "config.json").is_file():
+        return "absent"
+    run = Run(config.folder)
+    asked, found = (json.loads(json.dumps(as_json(each))) for each in (resolved(config), run.config))
+    other = [name for name in SAME if asked[name] != found[name]]
+    if other:
+        return f"was trained with other settings ({', '.join(other)}): move it away or name another --out"
+    finished = run.decisions >= run.config.total_timesteps and (run.folder / "final").is_dir()
+    return "trained" if finished else "unfinished"
+
+
+def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
+    """The evaluation of a trained agent on a set, from its file where it is of this agent and these scenes."""
+    run, frozen = Run(cell.folder(study)), scenes(name, cell.env, study)
+    identity = identity_of(frozen, run.model_folder, study)
+    path = run.folder / "evaluations" / f"study-{name}.json"
+    found = kept(path, identity)
+    if found is not None:
+        return found
+    model: Any = load_model(run.model_folder)
+    methods: list[Method] = [AgentMethod(ALONE, model)]
+    if hasattr(model.policy, "ranked"):
+        methods.append(AgentMethod(RANKED, model, study.candidates))
+    kwargs = dict(cell.variant.env_kwargs)
+    with one_thread():
+        results = evaluate(methods, frozen, cell.env, env_kwargs=kwargs, time_decisions=False).results
+        failures = {
+            each.name: sort_out(each, frozen, model, cell.env, **kwargs).counts()
+            for each in results
+            if hasattr(model.policy, "ranked")
+        }
+    record = {**identity, "methods": {each.name: compact(each) for each in results}, "failures": failures}
+    run.write_evaluation(path.stem, record)
+    return record
+
+
+def identity_of(frozen: FrozenScenes, model: Path, study: Study) -> dict[str, Any]:
+    """What an evaluation must say to be of this agent and these scenes."""
+    return {
+        "scenes": frozen.sha256,
+        "weights": hashlib.sha256((model / "weights.safetensors").read_bytes()).hexdigest(),
+        "candidates": study.candidates,
+    }
+
+
+def baseline(env: str, name: str, study: Study) -> str:
+    """Measure a baseline on every set of an environment."""
+    method: Method | None = None
+    rates = []
+    for each in sets_of(env):
+        frozen, path = scenes(each, env, study), baseline_path(env, each, name, study)
+        record = kept(path, {"scenes": frozen.sha256})
+        if record is None:
+            if name == "stored":
+                method = Certified(frozen)
+            elif method is None:
+                method = make_method(name, env)
+            record = _measure_baseline(method, frozen, env, path, {})
+        rates.append(f"{each} {_rates(record)}")
+    return "; ".join(rates)
+
+
+def planned(env: str, variant: Variant, study: Study) -> str:
+    """Let the planner search with a degree of freedom, in the first test scenes."""
+    frozen = scenes("test", env, study).take(slice(0, PLANNED))
+    path, kwargs = planned_path(env, variant, study), dict(variant.env_kwargs)
+    record = kept(path, {"scenes": frozen.sha256})
+    if record is None:
+        record = _measure_baseline(make_method("planner", env, **kwargs), frozen, env, path, kwargs)
+    return _rates(record)
+
+
+def _measure_baseline(
+    method: Method, frozen: FrozenScenes, env: str, path: Path, kwargs: dict[str, Any]
+) -> dict[str, Any]:
+    with one_thread():
+        result = evaluate([method], frozen, env, env_kwargs=kwargs, time_decisions=False).results[0]
+    record = {"scenes": frozen.sha256, "methods": {method.name: compact(result)}}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, record)
+    return record
+
+
+def time_decisions(study: Study) -> str:
+    """Time single decisions of one agent of each algorithm, on one thread, with nothing else at work here."""
+    for env in study.environments:
+        frozen = scenes("test", env, study).take(slice(0, TIMED))
+        path = timings_path(env, study)
+        times: dict[str, Any] = read_json(path) if path.is_file() else {}
+        for name, source, method in _to_time(env, study):
+            if times.get(name, {}).get("source") == source:
+                continue
+            with one_thread():
+                result = evaluate([method()], frozen, env, env_kwargs={"threads": 1}).results[0]
+            times[name] = {"source": source, "median": float(np.median(result.decision_times))}
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, times)
+    return "decisions timed"
+
+
+def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method]]]:
+    """Name, what it depends on, and the method."""
+    found: list[tuple[str, str, Callable[[], Method]]] = [
+        (name, name, lambda name=name: make_method(name, env, threads=1))  # type: ignore[misc]
+        for name in ("random16", "random80", "planner")
+        if name in study.baselines or (name == "planner" and "stored" in study.baselines)
+    ]
+    for variant in METHODS:
+        cells = [Cell(env=env, variant=variant, seed=seed) for seed in study.seeds]
+        first = next((cell for cell in cells if state(cell, study) == "trained"), None)
+        if first is None:
+            continue
+        folder = Run(first.folder(study)).model_folder
+        model: Any = load_model(folder)
+        source = identity_of(scenes("test", env, study), folder, study)["weights"]
+        ways = {ALONE: 0} | ({RANKED: study.candidates} if hasattr(model.policy, "ranked") else {})
+        for way, count in ways.items():
+            method = lambda way=way, model=model, count=count: AgentMethod(way, model, count)  # noqa: E731
+            found.append((f"{variant.name} {way}", f"{source} {count}", method))
+    return found
+
+
+def scenes(name: str, env: str, study: Study) -> FrozenScenes:
+    """A set of scenes, or its first ones."""
+    return load(name, env).take(slice(0, study.n_scenes))
+
+
+def baseline_path(env: str, set_name: str, name: str, study: Study) -> Path:
+    """Of a baseline's evaluation."""
+    return study.out / short(env) / "baselines" / f"{set_name}-{name}.json"
+
+
+def planned_path(env: str, variant: Variant, study: Study) -> Path:
+    """Of the planner's evaluation with a degree of freedom."""
+    return study.out / short(env) / "planner" / f"{variant.name}.json"
+
+
+def timings_path(env: str, study: Study) -> Path:
+    """Of the times of single decisions."""
+    return study.out / short(env) / "timings.json"
+
+
+def compact(result: MethodResult) -> dict[str, Any]:
+    """The metrics, and the outcomes that the tables are made of."""
+    outcomes = {name: np.round(np.asarray(result.outcomes[name], float), 6).tolist() for name in KEPT}
+    return {"summary": result.summary(), "outcomes": outcomes}
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """The record in a file, None where there is none of this identity."""
+    if not path.is_file():
+        return None
+    record = read_json(path)
+    return record if {name: record.get(name) for name in identity} == identity else None
+
+
+def _rates(record: dict[str, Any]) -> str:
+    each = record["methods"].items()
+    return ", ".join(f"{name} {100 * one['summary']['success']['rate']:.1f} %" for name, one in each)
+
+
+def rate_table(records: Sequence[dict[str, Any]], method: str, outcome: str) -> np.ndarray:
+    """An outcome scene by scene, shape (records, scenes)."""
+    return np.array([record["methods"][method]["outcomes"][outcome] for record in records], dtype=float)
