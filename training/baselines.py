@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from viapoint.envs.scenes import Scenes
 from viapoint.training.planner import Planner, PlannerBudget
-from viapoint.training.trial import Trial
+from viapoint.training.step_agent import StepAgentMethod, is_step_wise
+from viapoint.training.trial import Trial, Trials
 
 Float = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -25,6 +26,13 @@ class Method(Protocol):
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Actions, shape (N, m), from the first observations and, for those that may search, the scenes."""
+
+
+class OwnMethod(Method, Protocol):
+    """Decides on movements that no action of the environment stands for, and carries them out itself."""
+
+    def carry_out(self, scenes: Scenes, decided: Float) -> Trials:
+        """What came of what was decided in N scenes, in the same simulation."""
 
 
 class Straight:
@@ -108,6 +116,14 @@ class AgentMethod:
             if self._candidates:
                 policy.candidates = before
         return np.asarray(actions, dtype=np.float64)
+
+
+def agent_method(name: str, model: Any, candidates: int = 0) -> Method:
+    """A trained agent as a method, whether one action of it is a whole movement or lasts a control step."""
+    env = model.get_env()
+    if is_step_wise(env.env_id):
+        return StepAgentMethod(name, model, env.env_id, env.env_kwargs)
+    return AgentMethod(name, model, candidates)
 
 
 METHODS: dict[str, Callable[[Trial], Method]] = {

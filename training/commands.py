@@ -15,13 +15,14 @@ from tqdm import tqdm
 
 from viapoint.training import report
 from viapoint.training import train as training
-from viapoint.training.baselines import AgentMethod, Method, make_method
+from viapoint.training.baselines import Method, agent_method, make_method
 from viapoint.training.config import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import load
 from viapoint.training.runs import Run, find_model, load_model
+from viapoint.training.step_agent import is_step_wise, whole_task
 
 
 class EvaluationStoppedError(Exception):
@@ -39,13 +40,13 @@ class Agent(NamedTuple):
     env_kwargs: dict[str, Any]
     folder: Path
 
-    def method(self, candidates: int = 0) -> AgentMethod:
+    def method(self, candidates: int = 0) -> Method:
         """The agent as a method; with candidates, its critic ranks that many at each decision."""
         if candidates and not hasattr(self.model.policy, "ranked"):
             kind = type(self.model).__name__
             raise ValueError(f"candidates are ranked by ViaTD3 only; this agent is a {kind}")
         name = f"agent, ranks {candidates}" if candidates else "agent"
-        return AgentMethod(name, self.model, candidates)
+        return agent_method(name, self.model, candidates)
 
 
 def find_agent(run: Path | None, pretrained: str | None) -> Agent:
@@ -92,7 +93,9 @@ def evaluate(config: EvaluateConfig) -> None:
     env_id = agent.env_id if agent else config.env
     if env_id is None:
         raise ValueError("without an agent, --env must say which environment is meant")
-    env_kwargs = agent.env_kwargs if agent else {}
+    if config.failures is not None and is_step_wise(env_id):
+        raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
+    env_id, env_kwargs = whole_task(env_id, agent.env_kwargs if agent else {})
     frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))
     methods: list[Method] = []
     for name in config.methods:
@@ -126,7 +129,7 @@ def play(config: PlayConfig) -> None:
     from viapoint.training.video import film
 
     agent = find_agent(config.run, config.pretrained)
-    scenes = load(config.scenes, agent.env_id).scenes
+    scenes = load(config.scenes, whole_task(agent.env_id, {})[0]).scenes
     rows = spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     method = agent.method(config.candidates)

@@ -13,7 +13,8 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.training.presets import PRESETS, Algorithm
+from viapoint.envs.registration import STEP_TASKS
+from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm, Preset
 
 C = TypeVar("C")
 
@@ -66,12 +67,12 @@ class TrainConfig:
     """Run folder; runs/<environment>-<algorithm>-<seed> if not given."""
     resume: bool = False
     """Go on with the run in the folder from its last checkpoint."""
-    eval_every: int = 1_000
-    """Decisions between two evaluations on the validation scenes; 0 for none."""
+    eval_every: int | None = None
+    """Decisions between two evaluations on the validation scenes, 0 for none; as the preset says if not given."""
     eval_scenes: int = 500
     """Validation scenes used by each, at most."""
-    checkpoint_every: int = 5_000
-    """Decisions between two checkpoints."""
+    checkpoint_every: int | None = None
+    """Decisions between two checkpoints; as the preset says if not given."""
     env_kwargs: NamedValues = field(default_factory=dict)
     """Of the environment, for example n_via=2 timing=learned."""
     hyperparameters: NamedValues = field(default_factory=dict)
@@ -84,21 +85,41 @@ class TrainConfig:
         _check_env(self.env)
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        for name, least in (("seed", 0), ("eval_every", 0), ("eval_scenes", 1), ("checkpoint_every", 1)):
+        if self.env in STEP_TASKS and self.algo not in STEP_PRESETS:
+            raise ValueError(
+                f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
+                f"{', '.join(STEP_PRESETS)}"
+            )
+        for name, least in (("seed", 0), ("eval_scenes", 1)):
             _check_whole(name, getattr(self, name), least)
-        for name in ("n_timesteps", "n_envs"):
+        for name, least in (("n_timesteps", 1), ("n_envs", 1), ("eval_every", 0), ("checkpoint_every", 1)):
             if getattr(self, name) is not None:
-                _check_whole(name, getattr(self, name), 1)
+                _check_whole(name, getattr(self, name), least)
+
+    @property
+    def preset(self) -> Preset:
+        """What holds for everything that is not given."""
+        return (STEP_PRESETS if self.env in STEP_TASKS else PRESETS)[self.algo]
 
     @property
     def total_timesteps(self) -> int:
         """Decisions in all."""
-        return self.n_timesteps or PRESETS[self.algo].n_timesteps
+        return self.n_timesteps or self.preset.n_timesteps
 
     @property
     def copies(self) -> int:
         """Environments stepped together."""
-        return self.n_envs or PRESETS[self.algo].n_envs
+        return self.n_envs or self.preset.n_envs
+
+    @property
+    def evaluation_interval(self) -> int:
+        """Decisions between two evaluations, 0 for none."""
+        return self.preset.eval_every if self.eval_every is None else self.eval_every
+
+    @property
+    def checkpoint_interval(self) -> int:
+        """Decisions between two checkpoints."""
+        return self.checkpoint_every or self.preset.checkpoint_every
 
     @property
     def folder(self) -> Path:
@@ -270,7 +291,7 @@ def _plain(value: Any) -> Any:
 
 def _check_env(env: str) -> None:
     if env not in gym.registry:
-        raise ValueError(f"env must be one of {', '.join(viapoint.envs.TASKS)}, got {env!r}")
+        raise ValueError(f"env must be one of {', '.join((*viapoint.envs.TASKS, *STEP_TASKS))}, got {env!r}")
 
 
 def _check_whole(name: str, value: Any, least: int) -> None:

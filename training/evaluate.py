@@ -129,7 +129,7 @@ def evaluate(
     time_decisions: bool = True,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Let each method decide in each scene, and simulate its decisions.
+    """Let each method decide in each scene, and simulate its decisions, or let it do so itself where it can.
 
     Ctrl-C ends it: what is done is returned, and marked as partial.
 
@@ -175,7 +175,7 @@ def _evaluate_one(
             began = time.perf_counter()
             decided = method.decide(trial.observe(scenes), scenes)
             seconds += time.perf_counter() - began
-            outcome = trial(scenes, decided)
+            outcome = getattr(method, "carry_out", trial)(scenes, decided)
             action = np.asarray(decided, dtype=np.float64)
             pieces.append({**outcome.info, "reward": outcome.reward, "": action})
             if progress is not None:

@@ -23,6 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from viapoint.training.extractors import EXTRACTORS
 from viapoint.training.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.limits import (
     LARGEST_MODEL_JSON,
@@ -240,6 +241,8 @@ def _encode(value: Any) -> Any:
         return {"kind": "normal", "sigma": float(np.max(value._sigma))}
     if isinstance(value, type) and value in ACTIVATIONS.values():
         return {"kind": "activation", "name": value.__name__}
+    if isinstance(value, type) and value in EXTRACTORS.values():
+        return {"kind": "extractor", "name": value.__name__}
     if isinstance(value, Mapping):
         return {str(name): _encode(each) for name, each in value.items()}
     if hasattr(value, "frequency"):  # SB3's TrainFreq
@@ -263,8 +266,10 @@ def _decode(value: Any, size: int) -> Any:
             return NormalActionNoise(np.zeros(size), np.full(size, float(value["sigma"])))
         if kind == "activation":
             return ACTIVATIONS[value["name"]]
+        if kind == "extractor":
+            return EXTRACTORS[value["name"]]
         if kind is not None:
-            raise ValueError(f"kind must be linear, normal or activation, got {kind!r}")
+            raise ValueError(f"kind must be linear, normal, activation or extractor, got {kind!r}")
         return {name: _decode(each, size) for name, each in value.items()}
     if isinstance(value, list) and len(value) == 2 and isinstance(value[1], str):
         return tuple(value)

@@ -13,10 +13,11 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
-from viapoint.training.baselines import AgentMethod
+from viapoint.training.baselines import agent_method
 from viapoint.training.evaluate import MethodResult, evaluate
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, load, shipped_path
 from viapoint.training.runs import Run
+from viapoint.training.step_agent import whole_task
 from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
 
@@ -79,13 +80,13 @@ class Monitor(BaseCallback):
         """One record for each evaluation so far."""
         self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
-        self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_every, "evaluation": 0}
+        self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_interval, "evaluation": 0}
         self._every = {
             "log": LOG_EVERY,
-            "checkpoint": self.config.checkpoint_every,
-            "evaluation": self.config.eval_every,
+            "checkpoint": self.config.checkpoint_interval,
+            "evaluation": self.config.evaluation_interval,
         }
-        self._validation = validation_scenes(run) if self.config.eval_every else None
+        self._validation = validation_scenes(run) if self.config.evaluation_interval else None
         self._recent: list[dict[str, float]] = []
         self._stop = False
 
@@ -185,10 +186,10 @@ class Monitor(BaseCallback):
             return
         seconds, began = self.seconds, time.monotonic()
         result = evaluate(
-            [AgentMethod("agent", self.model)],
+            [agent_method("agent", self.model)],
             frozen,
-            self.config.env,
-            env_kwargs=self.config.env_kwargs,
+            frozen.env_id,
+            env_kwargs=whole_task(self.config.env, self.config.env_kwargs)[1],
             time_decisions=False,
         ).results[0]
         if result.partial:
@@ -265,14 +266,15 @@ def _timestep(env: Any) -> float:
 def validation_scenes(run: Run) -> FrozenScenes:
     """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
     config = run.config
-    if shipped_path("validation", config.env).is_file() and set(config.env_kwargs) <= ACTION_ARGUMENTS:
-        return load("validation", config.env).take(slice(0, config.eval_scenes))
-    trial = Trial(config.env, 1, **config.env_kwargs)
+    env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
+    if shipped_path("validation", env_id).is_file() and set(env_kwargs) <= ACTION_ARGUMENTS:
+        return load("validation", env_id).take(slice(0, config.eval_scenes))
+    trial = Trial(env_id, 1, **env_kwargs)
     scenes = trial.task.sampler()([np.random.default_rng(DRAWN_SEED)] * config.eval_scenes)
     trial.close()
     return FrozenScenes(
         name="drawn",
-        env_id=config.env,
+        env_id=env_id,
         scenes=scenes,
         share=np.full(config.eval_scenes, np.nan),
         solution=np.zeros((config.eval_scenes, trial.task.action.size)),

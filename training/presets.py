@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,25 +19,42 @@ class Preset:
     """Environments that are stepped together."""
     n_timesteps: int
     """Decisions in all."""
+    eval_every: int = 1_000
+    """Decisions between two evaluations on the validation scenes."""
+    checkpoint_every: int = 5_000
+    """Decisions between two checkpoints."""
     hyperparameters: tuple[tuple[str, Any], ...]
     """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.model_files` writes them."""
 
     def arguments(self) -> dict[str, Any]:
         """The hyperparameters as a fresh dictionary."""
-        return {
-            name: dict(value) if isinstance(value, dict) else value for name, value in self.hyperparameters
-        }
+        return copy.deepcopy(dict(self.hyperparameters))
 
 
 def _preset(
-    n_envs: int, n_timesteps: int, policy: str = "MultiInputPolicy", **hyperparameters: Any
+    n_envs: int,
+    n_timesteps: int,
+    policy: str = "MultiInputPolicy",
+    *,
+    eval_every: int = 1_000,
+    checkpoint_every: int = 5_000,
+    **hyperparameters: Any,
 ) -> Preset:
     return Preset(
-        policy=policy, n_envs=n_envs, n_timesteps=n_timesteps, hyperparameters=tuple(hyperparameters.items())
+        policy=policy,
+        n_envs=n_envs,
+        n_timesteps=n_timesteps,
+        eval_every=eval_every,
+        checkpoint_every=checkpoint_every,
+        hyperparameters=tuple(hyperparameters.items()),
     )
 
 
-_NETWORK: dict[str, Any] = {"net_arch": [256, 256]}
+_NETWORK: dict[str, Any] = {
+    "features_extractor_class": {"kind": "extractor", "name": "SceneExtractor"},
+    "net_arch": [256, 256],
+}
+_FALLING: dict[str, Any] = {"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0}
 _OFF_POLICY: dict[str, Any] = {
     "learning_rate": 1e-3,
     "buffer_size": 200_000,
@@ -47,6 +65,8 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 16,
     "policy_kwargs": _NETWORK,
 }
+_STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
+_SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
 PRESETS: dict[str, Preset] = {
     "viatd3": _preset(
@@ -61,6 +81,7 @@ PRESETS: dict[str, Preset] = {
     "ppo": _preset(
         64,
         400_000,
+        **_SELDOM,
         learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
         n_steps=16,
         batch_size=256,
@@ -70,3 +91,23 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 """By the name the command line knows them by; the comments and units are those of Stable-Baselines3."""
+
+STEP_PRESETS: dict[str, Preset] = {
+    "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE),
+    "td3": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(64, 200_000, **_SELDOM, **_STEP_WISE),
+    "ppo": _preset(
+        64,
+        2_000_000,
+        eval_every=50_000,
+        checkpoint_every=200_000,
+        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
+        n_steps=64,
+        batch_size=512,
+        n_epochs=5,
+        gamma=0.98,
+        ent_coef=0.0,
+        policy_kwargs=_NETWORK,
+    ),
+}
+"""The same where an action lasts one control step, which then counts as a decision."""

@@ -14,7 +14,6 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from viapoint.training.config import TrainConfig
 from viapoint.training.model_files import build
 from viapoint.training.monitor import Monitor, TrainingStoppedError
-from viapoint.training.presets import PRESETS
 from viapoint.training.runs import Run, versions
 from viapoint.training.vec_env import ViaVecEnv
 
@@ -61,13 +60,15 @@ def resolved(config: TrainConfig) -> TrainConfig:
         config,
         n_timesteps=config.total_timesteps,
         n_envs=config.copies,
-        hyperparameters={**PRESETS[config.algo].arguments(), **config.hyperparameters},
+        eval_every=config.evaluation_interval,
+        checkpoint_every=config.checkpoint_interval,
+        hyperparameters={**config.preset.arguments(), **config.hyperparameters},
     )
 
 
 def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     """The untrained model that a resolved configuration asks for."""
-    return build(config.algo, PRESETS[config.algo].policy, env, config.hyperparameters, seed=config.seed)
+    return build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
 
 
 @contextmanager

@@ -137,12 +137,15 @@ class ViaVecEnv(VecEnv):
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
             "physics_steps": self.physics_steps,
+            "episodes": env.episodes_state() if hasattr(env, "episodes_state") else None,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on where :meth:`state` was taken, in this environment or another of the same kind and number."""
         env = self.venv.unwrapped
         env.reset(options=state["scenes"])
+        if state.get("episodes"):
+            env.restore_episodes(state["episodes"])
         for generator, saved in zip(env._generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
         self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])

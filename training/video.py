@@ -99,8 +99,11 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: fl
     for i in range(number):
         scene = scenes.take([i])
         observation, _ = camera.env.reset(options=scene.as_options())
-        action = np.asarray(decide({k: v[None] for k, v in observation.items()}, scene))[0]
-        info = camera.env.step(action.astype(np.float32))[-1]
+        over = False
+        while not over:
+            action = np.asarray(decide({k: v[None] for k, v in observation.items()}, scene))[0]
+            observation, _, terminated, truncated, info = camera.env.step(action.astype(np.float32))
+            over = terminated or truncated
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
         yield from _with_captions(camera.frames(scene), left, *verdict(info), hold=round(pause * camera.fps))
 

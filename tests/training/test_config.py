@@ -59,7 +59,7 @@ def test_nothing_is_shared_between_two_configurations():
     TrainConfig().env_kwargs["n_via"] = 2
     assert TrainConfig().env_kwargs == {}
     PRESETS["sac"].arguments()["policy_kwargs"]["net_arch"] = []
-    assert PRESETS["sac"].arguments()["policy_kwargs"] == {"net_arch": [256, 256]}
+    assert PRESETS["sac"].arguments()["policy_kwargs"]["net_arch"] == [256, 256]
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,7 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"n_timesteps": 0}, "n_timesteps"),
         (TrainConfig, {"n_envs": True}, "n_envs"),
         (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
+        (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viatd3 decides on whole movements"),
         (EvaluateConfig, {}, "name a run folder"),
         (EvaluateConfig, {"run": Path("a"), "pretrained": "b"}, "not both"),
         (EvaluateConfig, {"run": Path("a"), "methods": ()}, "methods"),

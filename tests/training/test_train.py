@@ -116,7 +116,7 @@ def test_what_a_run_leaves(tmp_path):
     model = load_model(run.model_folder)
     assert run.model_folder.name == "best"
     scenes = monitor.validation_scenes(run)
-    method = monitor.AgentMethod("agent", model)
+    method = monitor.agent_method("agent", model)
     again = evaluate([method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False)
     assert again.results[0].success.mean() == best
 

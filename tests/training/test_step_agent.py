@@ -1,0 +1,99 @@
+"""Agents that act in every control step, beside those that decide once."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.training.baselines import Straight, agent_method
+from viapoint.training.config import TrainConfig
+from viapoint.training.evaluate import evaluate
+from viapoint.training.frozen_scenes import load
+from viapoint.training.model_files import build
+from viapoint.training.monitor import validation_scenes
+from viapoint.training.presets import STEP_PRESETS
+from viapoint.training.runs import Run, load_model
+from viapoint.training.step_agent import StepAgentMethod, is_step_wise, whole_task
+from viapoint.training.train import train
+from viapoint.training.trial import Trial
+from viapoint.training.vec_env import ViaVecEnv
+
+STEP, WHOLE = "viapoint/PlanarObstaclesStep-v0", "viapoint/PlanarObstacles-v0"
+SMALL = {"learning_starts": 64, "gradient_steps": 1, "batch_size": 16, "buffer_size": 500}
+
+
+def config(out, **changes):
+    settings = {
+        "env": STEP, "algo": "sac", "out": out, "n_timesteps": 160, "n_envs": 16, "eval_scenes": 8, "eval_every": 80,
+        "hyperparameters": SMALL, "progress": False,
+    }  # fmt: skip
+    return TrainConfig(**{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def model():
+    preset = STEP_PRESETS["sac"]
+    return build("sac", preset.policy, ViaVecEnv(STEP, 4), {**preset.arguments(), "buffer_size": 10}, seed=0)
+
+
+def test_the_task_of_a_step_wise_id_is_its_twin():
+    assert is_step_wise(STEP)
+    assert not is_step_wise(WHOLE)
+    weights = {"progress": 2.0, "success": 3.0}
+    given = {"control_step": 0.02, "n_obstacles": 3, "reward_weights": weights}
+    assert whole_task(STEP, given) == (WHOLE, {"n_obstacles": 3, "reward_weights": {"success": 3.0}})
+    assert whole_task(WHOLE, {"n_via": 2}) == (WHOLE, {"n_via": 2})
+    Trial(*whole_task(STEP, given)[:1], 2, **whole_task(STEP, given)[1]).close()
+
+
+def test_what_a_method_carries_out_is_what_the_single_environment_does(model):
+    frozen, method = load("validation", WHOLE).take(slice(0, 6)), agent_method("agent", model)
+    assert isinstance(method, StepAgentMethod)
+    trial = Trial(WHOLE, 6)
+    together = method.carry_out(frozen.scenes, method.decide(trial.observe(frozen.scenes), frozen.scenes))
+    env = gym.make(STEP)
+    for i in range(6):
+        observation, _ = env.reset(options=frozen.scenes.take([i]).as_options())
+        total, over = 0.0, False
+        while not over:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, over = total + reward, terminated or truncated
+        assert together.reward[i] == pytest.approx(total, abs=1e-4)
+        for name in ("is_success", "collision", "reachable"):
+            assert together.info[name][i] == info[name]
+        for name in ("goal_error", "path_length", "duration", "min_clearance"):
+            assert together.info[name][i] == pytest.approx(info[name], abs=1e-4), name
+
+
+def test_it_stands_in_one_table_with_the_others(model):
+    frozen = load("validation", WHOLE).take(slice(0, 12))
+    methods = [agent_method("agent", model), Straight(Trial(WHOLE, 4))]
+    result = evaluate(methods, frozen, WHOLE, batch=5, time_decisions=False)
+    for each in result.results:
+        assert each.summary()["scenes"] == 12
+    assert set(result.results[1].outcomes) <= set(result.results[0].outcomes)
+
+
+def test_a_run_is_validated_on_the_scenes_of_the_twin_and_resumes_exactly(tmp_path):
+    whole = train(config(tmp_path / "whole", checkpoint_every=10_000))
+    assert validation_scenes(whole).env_id == WHOLE
+    assert [record["decisions"] for record in whole.curve] == [0, 80, 160]
+    train(config(tmp_path / "parts", n_timesteps=80, checkpoint_every=10_000))
+    parts = train(config(tmp_path / "parts", n_timesteps=160, resume=True))
+    assert parts.config.eval_every == 80
+    one, other = (load_model(run.folder / "final").policy.state_dict() for run in (whole, parts))
+    for name, tensor in one.items():
+        np.testing.assert_array_equal(tensor.numpy(), other[name].numpy(), err_msg=name)
+
+
+def test_presets_say_how_often_to_look(tmp_path):
+    for algo, preset in STEP_PRESETS.items():
+        asked = TrainConfig(env=STEP, algo=algo)
+        assert asked.total_timesteps == preset.n_timesteps
+        assert asked.evaluation_interval == preset.eval_every
+        assert asked.checkpoint_interval == preset.checkpoint_every
+        assert dataclasses.replace(asked, eval_every=0).evaluation_interval == 0
+    run = train(config(tmp_path / "run", n_timesteps=16, eval_every=0))
+    assert Run(run.folder).config.checkpoint_every == STEP_PRESETS["sac"].checkpoint_every

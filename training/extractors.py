@@ -1,0 +1,83 @@
+"""Observations as vectors for the standard algorithms: a set of obstacles, seen along the line to the goal."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
+
+from viapoint.envs.action import frame
+
+PLACES = 5.0
+"""Metres times this are of size one: obstacles lie within a few decimetres of the line."""
+
+
+class SceneExtractor(BaseFeaturesExtractor):
+    """Features of a scene that depend neither on the order of its obstacles nor on how many there might be.
+
+    Obstacles are seen in the frame of the straight line, from its middle; each passes through the same network, of
+    which sum and maximum over those present remain (Zaheer et al. 2017, Deep Sets, arXiv 1703.06114). The line runs
+    from `start` where the observation has one, otherwise from `hand`. What else is observed follows, made of size one;
+    vectors of the plane or of space other than the ends are turned into the frame.
+
+    Args:
+        observation_space: Of an environment of this package.
+        width: Of the network that sees one obstacle.
+    """
+
+    def __init__(self, observation_space: spaces.Dict, width: int = 64) -> None:
+        boxes = cast("dict[str, spaces.Box]", dict(observation_space.items()))
+        self.dimension = boxes["goal"].shape[0]
+        self.turned = tuple(name for name in ("velocity", "acceleration") if name in boxes)
+        self.plain = tuple(sorted(set(boxes) - {"start", "hand", "goal", "obstacles", *self.turned}))
+        own = 2 * self.dimension + 1 + ("start" in boxes) * self.dimension
+        rest = sum(math.prod(boxes[name].shape) for name in (*self.turned, *self.plain))
+        super().__init__(observation_space, own + rest + ("obstacles" in boxes) * 2 * width)
+        self._scale = {name: float(1.0 / abs(boxes[name].high).max()) for name in (*self.turned, *self.plain)}
+        self.each = nn.Sequential(
+            nn.Linear(2 * self.dimension + 1 + own, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        )
+
+    def forward(self, observation: dict[str, Tensor]) -> Tensor:
+        """Shape (B, features_dim)."""
+        hand, goal = observation["hand"], observation["goal"]
+        start = observation.get("start", hand)
+        axes = torch.stack(frame(goal - start), dim=-2)
+        middle = 0.5 * (start + goal)
+        distance = (goal - start).norm(dim=-1, keepdim=True)
+        own = [2.0 * middle, 2.0 * (goal - middle), 2.0 * distance]
+        if "start" in observation:
+            own.append(PLACES * _turned(axes, hand - middle))
+        ends = torch.cat(own, dim=-1)
+        parts = [ends]
+        parts += [_turned(axes, observation[name]) * self._scale[name] for name in self.turned]
+        parts += [observation[name] * self._scale[name] for name in self.plain]
+        if "obstacles" in observation:
+            parts += self._obstacles(observation["obstacles"], axes, middle, ends)
+        return torch.cat(parts, dim=-1)
+
+    def _obstacles(self, flat: Tensor, axes: Tensor, middle: Tensor, ends: Tensor) -> list[Tensor]:
+        """Sum and maximum over the obstacles that are there, shape (B, width) each."""
+        d = self.dimension
+        rows = flat.reshape(len(flat), -1, 2 * d + 2)
+        centre = _turned(axes.unsqueeze(1), rows[..., :d] - middle.unsqueeze(1))
+        half = _turned(axes.unsqueeze(1), rows[..., d : 2 * d])
+        half = torch.where(half[..., 1:2] < 0.0, -half, half)  # a bar has no sense of direction
+        seen = PLACES * torch.cat((centre, half, rows[..., 2 * d : 2 * d + 1]), dim=-1)
+        about = ends.unsqueeze(1).expand(-1, rows.shape[1], -1)
+        present = (rows[..., -1:] > 0.5).to(flat.dtype)
+        encoded = self.each(torch.cat((seen, about), dim=-1)) * present
+        return [0.5 * encoded.sum(dim=1), encoded.amax(dim=1)]
+
+
+EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExtractor}
+"""By the name that a model's file knows them by."""
+
+
+def _turned(axes: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors, shape (..., D), in a frame of shape (..., D, D)."""
+    return (axes * vectors.unsqueeze(-2)).sum(dim=-1)
