@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 RUN    := runs/demo
 
-.PHONY: help demo test check format scenes bench clean
+.PHONY: help demo test check format scenes hashes bench clean
 
 help:            ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -34,6 +34,9 @@ format: $(READY) ## let ruff put the source in order
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
 	@$(BIN)/python -m viapoint.training.make_scenes
+
+hashes: $(READY) ## hash a thousand episodes of every environment anew
+	@$(BIN)/python benchmarks/reliability_determinism.py --write
 
 bench: $(READY)  ## throughput as ratios
 	@$(BIN)/viapoint bench

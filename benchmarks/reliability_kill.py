@@ -1,0 +1,175 @@
+"""Kills trainings at random moments, takes them up again, and compares them with those that were left alone.
+
+    python benchmarks/reliability_kill.py [--kills 50] [--seed 0] [--json FILE]
+
+The process is ended by SIGKILL, which leaves it no time for anything. The moment is uniform over the time that a whole
+training takes, from the first import on; checkpoints are frequent, so that many kills fall amid a write. A killed
+training is resumed, and may be killed again, until it ends by itself. Then its best and its last model, its learning
+curve and its last checkpoint, with optimisers, replay buffer, random states and environment, must be those of the
+training that was left alone, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
+
+import argparse
+import json
+import signal
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from viapoint.training.config import TrainConfig
+from viapoint.training.files import UNFINISHED, read_arrays, read_json
+from viapoint.training.runs import Run
+
+ENV = "viapoint/PlanarObstacles-v0"
+OFF_POLICY: dict[str, Any] = {
+    "learning_starts": 32,
+    "gradient_steps": 2,
+    "batch_size": 16,
+    "buffer_size": 400,
+}
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "viatd3": {**OFF_POLICY, "fresh_scenes": 4},
+    "sac": OFF_POLICY,
+    "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
+}
+CLOCK = ("seconds", "decision_time", "t")
+"""Names of what is measured in seconds of real time."""
+DECISIONS, COPIES, EVERY = 480, 16, 32
+
+
+def config(folder: Path, algo: str, *, resume: bool = False) -> TrainConfig:
+    """A training of a second or two that writes much."""
+    return TrainConfig(
+        env=ENV, algo=algo, out=folder, resume=resume, n_timesteps=DECISIONS, n_envs=COPIES,
+        eval_every=2 * EVERY, eval_scenes=8, checkpoint_every=EVERY, env_kwargs={"threads": 1},
+        hyperparameters=ALGORITHMS[algo], progress=False,
+    )  # fmt: skip
+
+
+def start(folder: Path, algo: str, log: Path) -> int:
+    """Train in a process of its own; its number. What it says goes to the log."""
+    process = os.fork()
+    if process:
+        return process
+    code = 1
+    try:
+        with log.open("a") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+        from viapoint.training.train import train
+
+        train(config(folder, algo, resume=(folder / "config.json").exists()))
+        code = 0
+    except BaseException as error:
+        os.write(2, f"FAILED {type(error).__name__}: {error}\n".encode())
+    finally:
+        os._exit(code)
+
+
+def kill_after(process: int, seconds: float) -> bool:
+    """Kill a process at that time; False if it had ended by itself, without an error."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if ended:
+            assert os.waitstatus_to_exitcode(status) == 0, "a training failed: see the log"
+            return False
+        time.sleep(0.001)
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    return True
+
+
+def content(folder: Path) -> dict[str, Any]:
+    """Everything that a run came to, but for how long it took."""
+    run = Run(folder)
+    newest = run.checkpoints()[-1]
+    state = read_json(newest / "state.json")
+    for name in ("digest", "sha256"):
+        del state[name]
+    arrays = {name: read_arrays(folder / name / "weights.safetensors") for name in ("best", "final")}
+    return {
+        "curve": timeless(run.curve),
+        "state": timeless(state),
+        "checkpoint": newest.name,
+        "arrays": {**arrays, "tensors": read_arrays(newest / "tensors.safetensors")},
+    }
+
+
+def timeless(value: Any) -> Any:
+    """Nested values without what the clock said."""
+    if isinstance(value, dict):
+        return {name: timeless(each) for name, each in value.items() if name not in CLOCK}
+    return [timeless(each) for each in value] if isinstance(value, list) else value
+
+
+def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """What is not the same in two runs."""
+    found = [name for name in ("curve", "state", "checkpoint") if one[name] != other[name]]
+    for group, arrays in one["arrays"].items():
+        theirs = other["arrays"][group]
+        found += sorted(set(arrays) ^ set(theirs))
+        found += [name for name in set(arrays) & set(theirs) if not _same(arrays[name], theirs[name])]
+    return found
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes()
+
+
+def amid_a_write(folder: Path) -> bool:
+    """Whether a kill left an unfinished file or folder."""
+    return any(UNFINISHED.fullmatch(path.name) for path in folder.rglob(".*"))
+
+
+def experiment(algo: str, kills: int, generator: np.random.Generator, base: Path) -> dict[str, Any]:
+    """At least so many kills of one algorithm's trainings."""
+    log, began = base / f"{algo}.log", time.monotonic()
+    assert not kill_after(start(base / f"{algo}-whole", algo, log), 1e6)
+    seconds = time.monotonic() - began
+    whole = content(base / f"{algo}-whole")
+    result = {"kills": 0, "amid a write": 0, "before the run existed": 0, "runs": 0, "differing": []}
+    while result["kills"] < kills:
+        folder = base / f"{algo}-{result['runs']}"
+        while kill_after(start(folder, algo, log), generator.uniform(0.0, seconds)):
+            result["kills"] += 1
+            result["amid a write"] += amid_a_write(folder)
+            result["before the run existed"] += not (folder / "config.json").exists()
+        result["runs"] += 1
+        result["differing"] += differences(whole, content(folder))
+    result["checkpoints passed over"] = log.read_text().count("passed over a damaged checkpoint")
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    import viapoint.training.train  # noqa: F401 - once, and not in every process
+
+    generator, results = np.random.default_rng(arguments.seed), {}
+    with tempfile.TemporaryDirectory() as base:
+        for index, algo in enumerate(ALGORITHMS):
+            share = (arguments.kills * (index + 1)) // len(ALGORITHMS) - (arguments.kills * index) // len(
+                ALGORITHMS
+            )
+            results[algo] = experiment(algo, share, generator, Path(base))
+            print(algo, json.dumps(results[algo]), flush=True)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(results, indent=1))
+    raise SystemExit(any(result["differing"] for result in results.values()))
+
+
+if __name__ == "__main__":
+    main()

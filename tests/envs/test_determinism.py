@@ -1,0 +1,72 @@
+"""Equal seeds, equal episodes: however they are run, and as they were when their hashes were stored."""
+
+import json
+import multiprocessing
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import reliability_determinism as determinism
+
+QUICK = 200
+"""Of the thousand episodes behind the file; benchmarks/reliability_determinism.py runs all of them, every way."""
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """Some episodes of every id, in another process."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        found = pool.starmap(determinism.single, [(env_id, range(4)) for env_id in determinism.IDS])
+    return dict(zip(determinism.IDS, found, strict=True))
+
+
+@pytest.mark.parametrize("env_id", determinism.IDS)
+def test_however_they_are_run(env_id, elsewhere):
+    number = (
+        6 if env_id in determinism.STEP_TASKS else 16
+    )  # an episode of many steps takes as long as many of one
+    alone = determinism.single(env_id, range(number))
+    assert len(set(alone)) == number
+    assert determinism.native(env_id, range(number), 3 * number + 20) == alone  # more than one group
+    assert determinism.native(env_id, range(number), 5, threads=3) == alone
+    assert determinism.synchronous(env_id, range(number), 5) == alone
+    assert elsewhere[env_id] == alone[: len(elsewhere[env_id])]
+
+
+@pytest.mark.parametrize("env_id", determinism.IDS)
+def test_they_are_what_they_were(env_id):
+    stored = json.loads(determinism.FILE.read_text())
+    here = determinism.fingerprint()
+    others = [
+        f"{name} {was} (here {here[name]})" for name, was in stored["made_with"].items() if was != here[name]
+    ]
+    if others:
+        pytest.skip(f"the last bits of the stored hashes depend on {', '.join(others)}")
+    quick = QUICK // 2 if env_id in determinism.STEP_TASKS else QUICK
+    found = determinism.hashes(determinism.reference(env_id, quick))
+    assert found == stored["hashes"][env_id][: len(found)], "`make hashes`, if the change is meant"
+
+
+def test_the_file_names_every_environment():
+    stored = json.loads(determinism.FILE.read_text())
+    assert list(stored["hashes"]) == determinism.IDS
+    assert {len(each) for each in stored["hashes"].values()} == {determinism.EPISODES // determinism.EVERY}
+
+
+def test_a_hash_notices_the_last_bit():
+    observation, info = {"hand": np.ones(2, np.float32)}, {"is_success": True, "goal_error": 0.5}
+
+    def digest(reward=1.0, hand=1.0, error=0.5):
+        one = determinism.Digest(observation)
+        one.step(reward)
+        return one.end({"hand": np.array([1.0, hand], np.float32)}, {**info, "goal_error": error})
+
+    others = {digest(np.nextafter(1.0, 2.0)), digest(hand=np.nextafter(np.float32(1), np.float32(2)))}
+    others.add(digest(error=np.nextafter(0.5, 1.0)))
+    assert len(others) == 3
+    assert digest() not in others
+    assert digest() == digest()
