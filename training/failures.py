@@ -39,7 +39,7 @@ KINDS = (
     Kind("off_goal", "nothing touched, but not at rest at the goal within the joint limits"),
     Kind("tracking", "the plan is clear, the arm that follows it touches"),
     Kind("graze", "the plan enters an obstacle by 5 mm or less"),
-    Kind("wrong_way", "a clear collision, though another of its proposals would have succeeded"),
+    Kind("wrong_way", "a clear collision the wrong way round: another of its proposals would have succeeded"),
     Kind("collision", "a clear collision, and no other proposal would have succeeded"),
 )
 """In the order in which they are asked: each failure is of the first kind that fits."""
