@@ -30,8 +30,8 @@ from viapoint.envs.execution import Executor, Rollout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
 from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
+from viapoint.envs.scene_distribution import SceneDistribution
 from viapoint.envs.scene_options import draw_given
-from viapoint.envs.scene_sampling import SceneDistribution
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
@@ -226,7 +226,16 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._check_running()
         assert self.scenes is not None
         actions = checked_actions(actions, self.num_envs, self.action_layout.names)
-        plan = self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
+        return self.perform(self.action_layout.decode(actions, self.scenes.start, self.scenes.goal))
+
+    def perform(self, plan: Plan) -> Decision:
+        """Carry out one plan in each environment, with any number of via-points, without a reset.
+
+        Args:
+            plan: Of num_envs movements, from the starts to the goals.
+        """
+        self._check_running()
+        assert self.scenes is not None
         outcome = self._executor(plan, self.scenes)
         terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
         joints = self._executor.final_joints(self.scenes)

@@ -11,7 +11,8 @@ from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.reward import RewardWeights
-from viapoint.envs.scene_sampling import SceneDistribution, SceneSampler
+from viapoint.envs.scene_distribution import SceneDistribution
+from viapoint.envs.scene_sampling import SceneSampler
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,8 @@ import pytest
 
 from viapoint.envs.arms import ADULT
 from viapoint.envs.clearance import segment_distance_squared
-from viapoint.envs.scene_sampling import SceneDistribution, SceneSampler
+from viapoint.envs.scene_distribution import SceneDistribution
+from viapoint.envs.scene_sampling import SceneSampler
 from viapoint.envs.scenes import TARGETS, Scenes, check_scenes, rows_of_lights
 
 NUMBER = 300
@@ -49,8 +50,10 @@ def test_a_scene_depends_on_its_own_generator_alone():
             np.testing.assert_array_equal(one[0], all_[seed])
 
 
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"])
-def test_the_straight_movement_fails_and_random_ones_solve_nearly_every_scene(env_id):
+@pytest.mark.parametrize(
+    ("env_id", "share"), [("viapoint/PlanarObstacles-v0", 0.85), ("viapoint/PlanarWholeArm-v0", 0.6)]
+)
+def test_the_straight_movement_fails_and_random_ones_solve_most_scenes(env_id, share):
     """Physics agrees with the construction: straight collides everywhere, and there is a way round."""
     env = gym.make_vec(env_id, num_envs=100)
     env.reset(seed=0)
@@ -63,7 +66,7 @@ def test_the_straight_movement_fails_and_random_ones_solve_nearly_every_scene(en
         env.reset(options=scenes.as_options())
         *_, info = env.step(rng.uniform(-1.0, 1.0, (100, 3)))
         solved |= info["is_success"]
-    assert solved.mean() > 0.85
+    assert solved.mean() > share
 
 
 @pytest.mark.parametrize("n_obstacles", [0, 3, (2, 4)])
