@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes import Scenes
+from viapoint.training.motion_planner import MotionPlannerMethod
 from viapoint.training.planner import Planner, PlannerBudget
 from viapoint.training.step_agent import StepAgentMethod, is_step_wise
 from viapoint.training.trial import Trial, Trials
@@ -133,6 +134,7 @@ METHODS: dict[str, Callable[[Trial], Method]] = {
     "random16": lambda trial: RandomVias(trial, 16),
     "random80": lambda trial: RandomVias(trial, 80),
     "planner": PlannerMethod,
+    "ompl": MotionPlannerMethod,
 }
 """The baselines by the name the command line knows them by."""
 

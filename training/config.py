@@ -139,7 +139,7 @@ class EvaluateConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """agent, straight, constant, random, random16, random80, planner."""
+    """agent, straight, constant, random, random16, random80, planner, ompl."""
     candidates: int = 0
     """If not 0, the agent gets a second row, in which its critic ranks so many actions at each decision."""
     scenes: str = "test"

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.action import Plan
 from viapoint.envs.reach import ReachVectorEnv
+from viapoint.envs.reach_vector import Decision
 from viapoint.envs.scenes import Scenes
 
 Float = NDArray[np.float64]
@@ -52,21 +55,26 @@ class Trial:
 
     def __call__(self, scenes: Scenes, actions: Float) -> Trials:
         """Simulate one action in each of N scenes, one or more."""
-        pieces = [
-            self._some(scenes.take(slice(i, i + self._capacity)), actions[i : i + self._capacity])
-            for i in range(0, len(actions), self._capacity)
-        ]
+        return self._try(scenes, (actions,), lambda env, some: env.decide(some))
+
+    def perform(self, scenes: Scenes, plan: Plan) -> Trials:
+        """Simulate one plan in each of N scenes, one or more; plans may have any number of via-points."""
+        return self._try(scenes, plan, lambda env, *some: env.perform(Plan(*some)))
+
+    def _try(self, scenes: Scenes, what: tuple[Float, ...], act: Callable[..., Decision]) -> Trials:
+        """As many at a time as there are environments; those left over repeat the first."""
+        pieces = []
+        for i in range(0, len(what[0]), self._capacity):
+            some = slice(i, i + self._capacity)
+            number = len(what[0][some])
+            size = next(size for size in self._envs if size >= number)
+            env = self._envs[size]
+            filled = Scenes(*(_repeated(field, size) for field in scenes.take(some)))
+            env.reset(options=filled.as_options())
+            _, reward, info = act(env, *(_repeated(part[some], size) for part in what))
+            pieces.append(Trials(reward[:number], {name: value[:number] for name, value in info.items()}))
         info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
         return Trials(np.concatenate([piece.reward for piece in pieces]), info)
-
-    def _some(self, scenes: Scenes, actions: Float) -> Trials:
-        """As many as there are environments at most; those left over repeat the first."""
-        number = len(actions)
-        size = next(size for size in self._envs if size >= number)
-        env = self._envs[size]
-        env.reset(options=_filled(scenes, size).as_options())
-        _, reward, info = env.decide(np.concatenate((actions, np.tile(actions[:1], (size - number, 1)))))
-        return Trials(reward[:number], {name: value[:number] for name, value in info.items()})
 
     def close(self) -> None:
         """Let the environments go."""
@@ -74,6 +82,6 @@ class Trial:
             env.close()
 
 
-def _filled(scenes: Scenes, number: int) -> Scenes:
-    missing = number - len(scenes.start)
-    return Scenes(*(np.concatenate((field, np.repeat(field[:1], missing, axis=0))) for field in scenes))
+def _repeated(values: Float, number: int) -> Float:
+    """The first repeated at the end until there are `number`."""
+    return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))

@@ -1,0 +1,92 @@
+"""The motion planner of the library OMPL, as a method of the table."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from viapoint.envs.scenes import Scenes
+from viapoint.training import motion_planner
+from viapoint.training.baselines import make_method
+from viapoint.training.evaluate import evaluate
+from viapoint.training.frozen_scenes import load
+from viapoint.training.motion_planner import points_on
+from viapoint.training.trial import Trial
+
+WHOLE = "viapoint/PlanarObstacles-v0"
+
+
+def test_without_the_library_its_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl.base", None)
+    with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
+        make_method("ompl", WHOLE)
+
+
+def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
+    pytest.importorskip("ompl")
+    frozen = load("validation", WHOLE)
+    frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:5] for band in range(4)]))
+    result = evaluate([make_method("ompl", WHOLE)], frozen, WHOLE, batch=20, time_decisions=False).results[0]
+    summary = result.summary()
+    assert summary["success"]["rate"] >= 0.9
+    assert summary["jerk_ratio"] < 50.0
+    assert summary["collision"]["rate"] <= 0.1
+    counts = result.actions[:, 0]
+    assert set(counts) <= set(motion_planner.DENSE)
+    assert len(set(counts)) > 1
+    np.testing.assert_allclose(result.outcomes["duration"], result.actions[:, 1])
+
+
+def test_every_link_of_the_whole_arm_clears():
+    pytest.importorskip("ompl")
+    trial = Trial("viapoint/PlanarWholeArm-v0", 6)
+    scenes = trial.task.sampler()([np.random.default_rng(0)] * 6)
+    method = make_method("ompl", "viapoint/PlanarWholeArm-v0")
+    done = method.carry_out(scenes, method.decide({}, scenes))
+    assert done.success.mean() > 0.5
+    assert not (done.success & (done.info["min_clearance"] <= 0.0)).any()
+
+
+def test_where_there_is_no_way_it_gives_up():
+    """A ring of bars around the start."""
+    pytest.importorskip("ompl")
+    start, goal = np.array([-0.25, 0.35]), np.array([0.15, 0.35])
+    ring = [[0.07, 0.0, 0.0, 0.07], [-0.07, 0.0, 0.0, 0.07], [0.0, 0.07, 0.07, 0.0], [0.0, -0.07, 0.07, 0.0]]
+    rows = np.array([[*(start + bar[:2]), *bar[2:], 0.01] for bar in ring])
+    trial = Trial(WHOLE, 1)
+    scenes = Scenes(start[None], goal[None], np.concatenate((rows, np.zeros((1, 5))))[None])
+    budget = motion_planner.MotionPlannerBudget(attempts=1, seconds=0.05)
+    method = motion_planner.MotionPlannerMethod(trial, budget=budget)
+    done = method.carry_out(scenes, method.decide({}, scenes))
+    assert not done.success.any()
+
+
+def test_lines_are_near_capsules_when_their_closest_points_are():
+    """Against a dense search over both segments."""
+    generator = np.random.default_rng(0)
+    share = np.linspace(0.0, 1.0, 201)
+    for dimension in (2, 3):
+        for _ in range(100):
+            p, q, centre, half = generator.uniform(-1.0, 1.0, (4, dimension))
+            half = half * generator.integers(2)  # every other one a post
+            one = p + share[:, None] * (q - p)
+            other = centre + (2.0 * share[:, None] - 1.0) * half
+            distance = np.sqrt(((one[:, None] - other) ** 2).sum(axis=-1)).min()
+            near, far = (
+                motion_planner._nearer(tuple(p), tuple(q), tuple(centre), tuple(half), max(distance + d, 0.0))
+                for d in (1e-3, -0.02)
+            )
+            assert near
+            assert not far
+
+
+def test_points_lie_on_the_path_and_keep_its_corners():
+    path = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [2.0, 2.0]])
+    np.testing.assert_array_equal(points_on(path, 2), path)
+    np.testing.assert_allclose(points_on(path, 1), [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
+    for count in (3, 4, 8, 12):
+        points = points_on(path, count)
+        assert len(points) == count + 2
+        assert all((np.abs(points - corner).max(axis=-1) < 1e-12).any() for corner in path)
+        length = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum()
+        assert length == pytest.approx(4.0)
