@@ -10,16 +10,23 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
-import tyro
+from viapoint.training import doctor
 
-from viapoint.training.config import (
-    BenchConfig,
-    DemoConfig,
-    EvaluateConfig,
-    PaperConfig,
-    PlayConfig,
-    TrainConfig,
-)
+try:
+    import tyro
+
+    from viapoint.training.config import (
+        BenchConfig,
+        DemoConfig,
+        DoctorConfig,
+        EvaluateConfig,
+        ImportConfig,
+        PaperConfig,
+        PlayConfig,
+        TrainConfig,
+    )
+except ImportError as error:  # something is missing, or broken
+    doctor.without_command(error)
 
 
 class UsageError(ValueError):
@@ -45,6 +52,8 @@ COMMANDS: dict[str, Command] = {
     "bench": Command(BenchConfig, "viapoint.training.bench", "run"),
     "paper": Command(PaperConfig, "viapoint.training.paper.command", "run"),
     "demo": Command(DemoConfig, "viapoint.training.demo", "run"),
+    "doctor": Command(DoctorConfig, "viapoint.training.doctor", "run"),
+    "import-sb3": Command(ImportConfig, "viapoint.training.import_sb3", "run"),
 }
 """Every subcommand by its name; one line adds one."""
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import gymnasium as gym
 import tyro
@@ -258,6 +258,42 @@ class DemoConfig:
         for name in ("n_timesteps", "n_scenes"):
             if getattr(self, name) is not None:
                 _check_whole(name, getattr(self, name), 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorConfig:
+    """Tell what works on this machine, and what to install where something does not.
+
+    Example: viapoint doctor
+    """
+
+    out: Path = Path("runs")
+    """Folder that runs are to be written to."""
+    json: bool = False
+    """Whether to print JSON for programs instead of lines for people."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportConfig:
+    """Turn an archive of Stable-Baselines3 into a model of tensors and JSON. Opening such an archive runs its code.
+
+    Example: viapoint import-sb3 model.zip --env viapoint/PlanarObstacles-v0 --out models/mine --trust
+    """
+
+    file: tyro.conf.Positional[Path]
+    """The archive that SB3's `model.save` wrote."""
+    env: str = DEFAULT_ENV
+    """Id of the environment that the model was trained on, with default arguments."""
+    out: Path
+    """Folder for the model; must be new."""
+    algo: Literal["sac", "td3", "ppo", "tqc"] | None = None
+    """Its algorithm; as the archive looks if not given."""
+    trust: bool = False
+    """Open it without a question: it is known where it comes from."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        _check_env(self.env)
 
 
 def as_json(config: Any) -> dict[str, Any]:

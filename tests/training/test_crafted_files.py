@@ -180,7 +180,7 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for change in HUGE:
         edit(model, hyperparameters={**record["hyperparameters"], **change})
-        with pytest.raises(BadFileError, match="larger networks|allocate memory"):
+        with pytest.raises(BadFileError, match=r"larger networks|allocate memory"):
             load_model(model)
     edit(model, hyperparameters={**record["hyperparameters"], "buffer_size": 10**15})
     load_model(model)  # to decide, it needs no buffer

@@ -1,0 +1,240 @@
+"""What works on this machine, and what to install where something does not.
+
+Nothing but the standard library is imported before a check asks for it, so that this runs where little else does.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NoReturn
+
+PATIENCE = 120.0
+"""Time that a check in a process of its own may take, [s]."""
+SPACE = 1 << 30
+"""Free disk space that a few trainings need, [bytes]."""
+REINSTALL = "pip install --force-reinstall 'mujoco>=4'"
+OPTIONAL = {"moviepy": "gymnasium's RecordVideo", "ompl": "the baseline by a motion planner (RRT-Connect)"}
+"""Packages that only some things need, and what these are."""
+REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
+
+STEP = """
+import gymnasium as gym, viapoint.envs
+env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=3, threads=2)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print("one movement of three environments:", env.unwrapped.physics_steps, "physics steps")
+"""
+FRAME = """
+import gymnasium as gym, numpy as np, viapoint.envs
+env = gym.make("viapoint/PlanarObstacles-v0", render_mode="rgb_array", width=64, height=64)
+env.reset(seed=0)
+assert np.ptp(env.render()) > 0, "the frame is blank"
+context = env.unwrapped.batch._renderer._canvas._context
+print("a frame rendered by", type(context).__module__.rpartition(".")[2])
+env.close()
+"""
+AGENT = """
+from viapoint.training.commands import find_agent
+agent = find_agent(None, "viapoint/PlanarObstacles-v0")
+print("the shipped agent of", agent.env_id, "loads")
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What one check found."""
+
+    name: str
+    works: bool
+    needed: bool
+    """Whether nothing much works without it."""
+    found: str
+    remedy: str = ""
+    """What to do where it does not work."""
+
+
+def run(config: Any) -> None:
+    """Check everything and print it; exit code 1 where something that is needed does not work."""
+    findings = list(examine(config.out))
+    if config.json:
+        print(
+            json.dumps(
+                {"works": all_works(findings), "findings": [asdict(each) for each in findings]}, indent=1
+            )
+        )
+    else:
+        for finding in findings:
+            state = "ok" if finding.works else "MISSING" if finding.needed else "without"
+            print(f"{state:<8} {finding.name:<18} {finding.found}")
+            if not finding.works and finding.remedy:
+                print(f"{'':<8} {'':<18} -> {finding.remedy}")
+    raise SystemExit(0 if all_works(findings) else 1)
+
+
+def without_command(error: ImportError) -> NoReturn:
+    """Report nevertheless where `viapoint doctor` was asked for and what reads the command line cannot be imported."""
+    if sys.argv[1:2] == ["doctor"]:
+        run(SimpleNamespace(out=Path("runs"), json="--json" in sys.argv))
+    raise error
+
+
+def all_works(findings: list[Finding]) -> bool:
+    """Whether everything that is needed works."""
+    return all(finding.works for finding in findings if finding.needed)
+
+
+def examine(folder: Path) -> Iterator[Finding]:
+    """Every check in turn; `folder` is where runs are to be written."""
+    least = "3.11"
+    python = platform.python_version()
+    yield Finding(
+        name="Python", works=at_least(python, least), needed=True, found=f"{python} on {platform.platform()}",
+        remedy=f"viapoint needs Python {least} or newer",
+    )  # fmt: skip
+    yield from packages(importlib.metadata.requires("viapoint") or [])
+    yield mujoco_files()
+    yield in_a_process("MuJoCo engine", STEP, REINSTALL)
+    yield in_a_process(
+        "OpenGL", FRAME, "without it films are drawn from above; on Debian and Ubuntu: apt-get install libegl1 libgl1",
+        needed=False,
+    )  # fmt: skip
+    yield attempt("video encoder", encoder, "pip install imageio-ffmpeg")
+    yield attempt("torch", torch_threads, "pip install 'viapoint[training]'")
+    yield in_a_process("shipped agent", AGENT, "pip install --force-reinstall viapoint")
+    yield attempt("processors", processors, "")
+    yield attempt(
+        "disk", lambda: disk(folder), f"choose another folder than {folder}, or make room on its disk"
+    )
+
+
+def packages(requirements: list[str]) -> Iterator[Finding]:
+    """Versions against the bounds that the installed package states."""
+    for line in requirements:
+        found = REQUIREMENT.match(line)
+        extra = re.search(r"extra == ['\"](\w+)['\"]", line)
+        if found is None or found["name"] == "viapoint":
+            continue
+        name, least = found["name"], found["least"] or "0"
+        if extra is not None and extra[1] != "training" and name not in OPTIONAL:
+            continue  # a tool of development
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            version = ""
+        use = f" (for {OPTIONAL[name]})" if name in OPTIONAL else ""
+        yield Finding(
+            name=name, works=bool(version) and at_least(version, least), needed=name not in OPTIONAL,
+            found=f"{version or 'not installed'}, {least} or newer wanted{use}",
+            remedy=f"pip install '{name}>={least}'",
+        )  # fmt: skip
+
+
+def at_least(version: str, least: str) -> bool:
+    """Whether a version is the least one or newer."""
+    mine, wanted = (
+        [int(part) for part in re.findall(r"\d+", each.partition("+")[0])] for each in (version, least)
+    )
+    return mine[: len(wanted)] >= wanted
+
+
+def mujoco_files() -> Finding:
+    """An upgrade of MuJoCo 3 in place takes files away that MuJoCo 4 has just brought."""
+    gone, there = [], 0
+    for name in ("mujoco", "mujoco-core"):
+        try:
+            files = importlib.metadata.files(name) or []
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        for file in files:
+            if "__pycache__" not in file.parts:
+                there += 1
+                gone += [] if Path(str(file.locate())).exists() else [str(file)]
+    found = (
+        f"{there} files of its package are there"
+        if not gone
+        else f"{len(gone)} of {there} are gone, as {gone[0]}"
+    )
+    return Finding(
+        name="MuJoCo's files", works=there > 0 and not gone, needed=True, found=found,
+        remedy=f"an older version was upgraded in place, which breaks it; mend it with: {REINSTALL}",
+    )  # fmt: skip
+
+
+def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) -> Finding:
+    """Run a script in a process of its own: a crash or a hang in a library must not end the report."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE
+        )
+    except subprocess.TimeoutExpired:
+        found = f"no answer within {PATIENCE:.0f} s"
+        return Finding(name=name, works=False, needed=needed, found=found, remedy=remedy)
+    works = done.returncode == 0
+    said = (done.stdout if works else done.stderr).strip().splitlines() or [
+        f"ended with code {done.returncode}"
+    ]
+    return Finding(name=name, works=works, needed=needed, found=said[-1], remedy=remedy)
+
+
+def attempt(name: str, check: Callable[[], str], remedy: str) -> Finding:
+    """Run a check that returns what it found or raises."""
+    try:
+        return Finding(name=name, works=True, needed=True, found=check())
+    except Exception as error:
+        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Finding(name=name, works=False, needed=True, found=found, remedy=remedy)
+
+
+def encoder() -> str:
+    """Encode a few frames."""
+    import imageio_ffmpeg
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        writer = imageio_ffmpeg.write_frames(str(path), (64, 64), codec="libx264", ffmpeg_log_level="error")
+        writer.send(None)
+        for shade in range(8):
+            writer.send(bytes([shade * 30]) * (64 * 64 * 3))
+        writer.close()
+        size = path.stat().st_size
+    return f"a film of {size} bytes by ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+
+
+def torch_threads() -> str:
+    """Compute a little."""
+    import torch
+
+    assert float(torch.ones(3) @ torch.ones(3)) == 3.0
+    others = f", {torch.cuda.get_device_name(0)} is there, too" if torch.cuda.is_available() else ""
+    return f"training on the CPU, on one thread of {torch.get_num_threads()}{others}"
+
+
+def processors() -> str:
+    """How many threads the simulation gets."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{allowed} of {os.cpu_count()} may be used"
+
+
+def disk(folder: Path) -> str:
+    """Write a file where runs are to be, or would be made."""
+    place = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+    with tempfile.NamedTemporaryFile(dir=place) as file:
+        file.write(bytes(1 << 20))
+        file.flush()
+        os.fsync(file.fileno())
+    free = shutil.disk_usage(place).free
+    if free < SPACE:
+        raise OSError(f"only {free / 1e9:.1f} GB free in {place}, {SPACE / 1e9:.1f} GB wanted")
+    return f"{place} can be written, {free / 1e9:.1f} GB free"
