@@ -14,10 +14,12 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
 import multiprocessing
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing.connection import wait
 from typing import Any
 
 import tyro
@@ -26,6 +28,9 @@ from study.figures import draw
 from study.plan import Study
 
 from viapoint.training.files import write_bytes, write_json
+
+Answer = tuple[bool, str]
+"""Whether a job went well, and what it told."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -50,44 +55,70 @@ def main(words: Sequence[str] | None = None) -> int:
 def carry_out(jobs: Sequence[work.Job], processes: int) -> list[tuple[str, str]]:
     """Do the jobs, some at a time, and say how each went; the labels and reasons of those that failed are returned."""
     failed, began = [], time.monotonic()
-    for number, (job, answer) in enumerate(_answers(jobs, processes), 1):
-        try:
-            told = answer()
-        except Exception as error:
-            told = f"FAILED: {type(error).__name__}: {error}"
-            failed.append((job.label, str(error)))
+    for number, (job, (well, told)) in enumerate(_answers(jobs, processes), 1):
         minutes = (time.monotonic() - began) / 60.0
-        print(f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}: {told}", flush=True)
+        print(
+            f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}: {'' if well else 'FAILED: '}{told}",
+            flush=True,
+        )
+        if not well:
+            failed.append((job.label, told))
     return failed
 
 
-def _answers(jobs: Sequence[work.Job], processes: int) -> Iterator[tuple[work.Job, Any]]:
-    """Each job with a function that returns its answer or raises its error, in the order in which they end."""
-    if not processes:
-        for job in jobs:
-            yield job, lambda job=job: job.work(*job.arguments)
-        return
+def _answers(jobs: Sequence[work.Job], processes: int) -> Iterator[tuple[work.Job, Answer]]:
+    """Each job with its answer, in the order in which they end; what is done already needs no process."""
+    quick = [not processes or job.done() for job in jobs]
+    yield from ((job, _answer(job)) for job, here in zip(jobs, quick, strict=True) if here)
+    waiting = [job for job, here in zip(jobs, quick, strict=True) if not here]
+    places = list(range(processes))
+    running: dict[Any, Any] = {}
     context = multiprocessing.get_context("spawn")
-    places = context.Queue()
-    for place in range(processes):
-        places.put((place, processes))
-    with ProcessPoolExecutor(processes, context, initializer=_take_place, initargs=(places,)) as pool:
-        running = {pool.submit(job.work, *job.arguments): job for job in jobs}
-        try:
-            for future in as_completed(running):
-                yield running[future], future.result
-        except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
-            raise
+    while waiting or running:
+        while waiting and places:
+            job, place = waiting.pop(0), places.pop(0)
+            mine, theirs = context.Pipe(duplex=False)
+            process = context.Process(target=_work, args=(job, place, processes, theirs), name=job.label)
+            process.start()
+            theirs.close()
+            running[mine] = process, job, place
+        ready: list[Any] = wait(list(running))
+        for ended in ready:
+            process, job, place = running.pop(ended)
+            try:
+                answer = ended.recv()
+            except EOFError:
+                process.join()
+                answer = False, f"its process ended with code {process.exitcode}"
+            process.join()
+            places.append(place)
+            yield job, answer
 
 
-def _take_place(places: Any) -> None:
-    """Keep a process to its share of the cores, so that times can be compared."""
-    place, processes = places.get()
+def _work(job: work.Job, place: int, processes: int, answer: Any) -> None:
+    """Do a job in a process of its own, on its share of the cores, so that times can be compared."""
+    threading.Thread(target=_save_and_leave, daemon=True).start()
     if hasattr(os, "sched_getaffinity"):
         mine = sorted(os.sched_getaffinity(0))[place::processes]
         if mine:
             os.sched_setaffinity(0, mine)
+    answer.send(_answer(job))
+
+
+def _answer(job: work.Job) -> Answer:
+    """Whether a job went well, and what it told."""
+    try:
+        return True, job.work(*job.arguments)
+    except Exception as error:
+        return False, f"{type(error).__name__}: {error}"
+
+
+def _save_and_leave() -> None:
+    """Stop as by Ctrl-C once the parent is gone, however it went: a training saves itself first."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 if __name__ == "__main__":

@@ -126,8 +126,8 @@ def _records(cells: Sequence[Cell], name: str, study: Study) -> list[Numbers]:
     found = []
     for cell in cells:
         run, frozen = Run(cell.folder(study)), work.scenes(name, cell.env, study)
-        path = run.folder / "evaluations" / f"study-{name}.json"
-        record = work.kept(path, work.identity_of(frozen, run.model_folder, study))
+        identity = work.identity_of(frozen, run.model_folder, study)
+        record = work.kept(work.evaluation_path(cell, name, study), identity)
         if record is not None:
             found.append(record)
     return found

@@ -40,27 +40,58 @@ class Job(NamedTuple):
     label: str
     work: Callable[..., str]
     arguments: tuple[Any, ...]
+    is_done: Callable[..., bool]
+
+    def done(self) -> bool:
+        """Whether it has been done before, so that doing it again only tells how it went."""
+        return self.is_done(*self.arguments)
 
 
 def jobs(study: Study) -> list[Job]:
     """What there is to do, but for timing; the work itself sees what is done already."""
     found = []
     if {"train", "evaluate"} & set(study.only):
-        found += [Job(str(cell), complete, (cell, study)) for cell in study.cells()]
+        found += [Job(str(cell), complete, (cell, study), completed) for cell in study.cells()]
     if "baselines" in study.only:
         if "results" in study.tables:
             found += [
-                Job(f"{short(env)} {name}", baseline, (env, name, study))
+                Job(f"{short(env)} {name}", baseline, (env, name, study), has_baseline)
                 for env in study.environments
                 for name in study.baselines
             ]
         if "freedom" in study.tables:
             found += [
-                Job(f"{short(env)} planner {variant.name}", planned, (env, variant, study))
+                Job(f"{short(env)} planner {variant.name}", planned, (env, variant, study), has_planned)
                 for env in study.studied
                 for variant in FREEDOM
             ]
     return found
+
+
+def completed(cell: Cell, study: Study) -> bool:
+    """Whether a training and its evaluations are done, as far as they are asked for, or cannot be done."""
+    there = state(cell, study)
+    if there != "trained":
+        return there not in ("absent", "unfinished")
+    model = Run(cell.folder(study)).model_folder
+    return "evaluate" not in study.only or all(
+        kept(evaluation_path(cell, name, study), identity_of(scenes(name, cell.env, study), model, study))
+        for name in sets_of(cell.env)
+    )
+
+
+def has_baseline(env: str, name: str, study: Study) -> bool:
+    """Whether a baseline is measured on every set."""
+    return all(
+        kept(baseline_path(env, each, name, study), {"scenes": scenes(each, env, study).sha256})
+        for each in sets_of(env)
+    )
+
+
+def has_planned(env: str, variant: Variant, study: Study) -> bool:
+    """Whether the planner is measured with a degree of freedom."""
+    frozen = scenes("test", env, study).take(slice(0, PLANNED))
+    return kept(planned_path(env, variant, study), {"scenes": frozen.sha256}) is not None
 
 
 def complete(cell: Cell, study: Study) -> str:
@@ -100,7 +131,7 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     """The evaluation of a trained agent on a set, from its file where it is of this agent and these scenes."""
     run, frozen = Run(cell.folder(study)), scenes(name, cell.env, study)
     identity = identity_of(frozen, run.model_folder, study)
-    path = run.folder / "evaluations" / f"study-{name}.json"
+    path = evaluation_path(cell, name, study)
     found = kept(path, identity)
     if found is not None:
         return found
@@ -210,6 +241,11 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
 def scenes(name: str, env: str, study: Study) -> FrozenScenes:
     """A set of scenes, or its first ones."""
     return load(name, env).take(slice(0, study.n_scenes))
+
+
+def evaluation_path(cell: Cell, name: str, study: Study) -> Path:
+    """Of an agent's evaluation on a set."""
+    return cell.folder(study) / "evaluations" / f"study-{name}.json"
 
 
 def baseline_path(env: str, set_name: str, name: str, study: Study) -> Path:

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 
@@ -73,6 +74,8 @@ def test_the_figure_is_small(done):
 
 
 def test_a_second_call_does_nothing_again(done, monkeypatch):
+    assert all(job.done() for job in work.jobs(study_of(done, baselines=("stored", "random16"))))
+
     def never(*args, **kwargs):
         pytest.fail("did again what was done")
 
@@ -204,13 +207,25 @@ def test_a_study_of_nothing_is_refused(changes, named, tmp_path):
         study_of(tmp_path, **changes)
 
 
-def test_one_job_that_fails_does_not_stop_the_others(tmp_path):
+def test_one_job_that_fails_does_not_stop_the_others(tmp_path, monkeypatch):
     study = study_of(tmp_path)
-    jobs = [work.Job("bad", work.scenes, ("nowhere", ENV, study)), work.Job("good", work.cores, ())]
-    for processes in (0, 1):
-        failed = learning.carry_out(jobs, processes)
-        assert [label for label, _ in failed] == ["bad"]
-        assert "scenes must be one of" in failed[0][1]
+
+    def job(label, function, *arguments):
+        return work.Job(label, function, arguments, work.has_planned)
+
+    jobs = [
+        job("dead", os._exit, 7),
+        job("custom", work.read_json, tmp_path / "nothing.json"),  # an error that cannot be pickled
+    ]
+    monkeypatch.setattr(work.Job, "done", lambda self: False)
+    failed = dict(learning.carry_out(jobs, 1))
+    assert set(failed) == {"dead", "custom"}
+    assert "ended with code 7" in failed["dead"]
+    assert "nothing.json: is missing" in failed["custom"]
+    here = [job("bad", work.scenes, "nowhere", ENV, study), job("good", work.cores)]
+    failed = learning.carry_out(here, 0)
+    assert [label for label, _ in failed] == ["bad"]
+    assert "scenes must be one of" in failed[0][1]
 
 
 def test_a_cell_that_cannot_be_trained_says_why(tmp_path):
