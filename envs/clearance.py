@@ -61,26 +61,26 @@ def clearance_profile(
     links: Array = None,
     link_radii: tuple[float, ...] = (),
 ) -> Array:
-    """Clearance from the nearest obstacle at each time, for the hand and, where given, the links.
+    """Clearance of the hand and, where given, the links from each obstacle at each time.
 
     Args:
         hand: Positions, shape (..., T, D), [m].
         hand_radius: [m].
-        obstacles: Shape (..., n, 2 D + 1), [m]; n is 1 or more.
+        obstacles: Shape (..., n, 2 D + 1), [m].
         present: Whether a row is an obstacle, shape (..., n), bool.
         links: End points of the links' axes, shape (..., T, L, 2, D), [m].
         link_radii: Of the L links, [m].
 
     Returns:
-        Shape (..., T), [m].
+        Shape (..., n, T), [m].
     """
     xp = array_namespace(hand, obstacles)
     radii, shown = obstacles[..., :, None, -1], present[..., :, None]
-    parts = [_clearance(point_distance_squared(hand, obstacles), radii + hand_radius, shown)]
+    least = _clearance(point_distance_squared(hand, obstacles), radii + hand_radius, shown)
     for i, radius in enumerate(link_radii if links is not None else ()):
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
-        parts.append(_clearance(squared, radii + radius, shown))
-    return xp.min(xp.concat(parts, axis=-2), axis=-2)
+        least = xp.minimum(least, _clearance(squared, radii + radius, shown))
+    return least
 
 
 def point_distance_squared(points: Array, obstacles: Array) -> Array:

@@ -1,9 +1,8 @@
-"""Networks for a set of obstacles: an actor that knows several ways round, a critic that foresees the movement."""
+"""A critic that foresees the movement, and the policy of actor and critic."""
 
 from __future__ import annotations
 
-import itertools
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from gymnasium import spaces
@@ -14,88 +13,27 @@ from torch import Tensor, nn
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.features import (
-    GEOMETRY,
-    PHASES,
-    Anchors,
-    Look,
-    Observation,
-    SceneView,
-    foresee,
-    scene_view,
-)
+from viapoint.training.actor import Improved, ViaActor, best
+from viapoint.training.features import GEOMETRY, foresee, scene_view
+from viapoint.training.set_encoder import SetEncoder, layers
+from viapoint.training.sight import Observation
 
 
-def _layers(*sizes: int) -> nn.Sequential:
-    """Linear layers with rectifiers between them, and after them where there are two or more (He et al. 2015)."""
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in itertools.pairwise(sizes):
-        linear = nn.Linear(fan_in, fan_out)
-        nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
-        nn.init.zeros_(linear.bias)
-        layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers)
+class Judgement(NamedTuple):
+    """What to expect of H actions in each of B scenes, shape (B, H): one part is learnt, the others are formulas."""
 
+    learned: Tensor
+    clearance: Tensor
+    smoothness: Tensor
+    duration: Tensor
 
-class SetEncoder(nn.Module):
-    """A scene as a vector, whatever the number and order of its obstacles.
+    def known(self) -> Tensor:
+        """The part of the reward that the plan alone decides."""
+        return self.clearance + self.smoothness + self.duration
 
-    Each obstacle passes through the same network; sum and maximum over those present follow (Zaheer et al. 2017, Deep
-    Sets, arXiv 1703.06114).
-    """
-
-    def __init__(self, dimension: int, width: int) -> None:
-        super().__init__()
-        self.each = _layers(4 * dimension + 2, width, width)
-        self.size = 2 * width + 2 * dimension + 1
-
-    def forward(self, scene: SceneView) -> Tensor:
-        """Shape (B, size)."""
-        rows = scene.rows.shape[1]
-        ends = scene.ends.unsqueeze(1).expand(-1, rows, -1)
-        encoded = self.each(torch.cat((scene.rows, ends), dim=-1)) * scene.present.unsqueeze(-1)
-        return torch.cat((0.5 * encoded.sum(dim=1), encoded.amax(dim=1), scene.ends), dim=-1)
-
-
-class ViaActor(BaseModel):
-    """Several ways round, each improved, and how promising each is.
-
-    A head begins at an anchor, a fixed movement, and sees how that would fare. All heads share one network. So left
-    and right of an obstacle, wide and narrow are there from the start, and no gradient need cross an obstacle.
-    """
-
-    def __init__(
-        self, observation_space: spaces.Dict, action_space: spaces.Box, *, task: Task, width: int
-    ) -> None:
-        super().__init__(observation_space, action_space)
-        self.task, self.anchors = task, Anchors(task)
-        self.encoder = SetEncoder(task.arm.dimension, width // 4)
-        self.size = get_action_dim(action_space)
-        seen = self.encoder.size + GEOMETRY + PHASES * task.arm.dimension + self.size
-        self.each = _layers(seen, width, width)
-        self.improve = nn.Linear(width, self.size)
-        self.score = nn.Linear(width, 1)
-        nn.init.zeros_(self.improve.weight)
-        nn.init.zeros_(self.improve.bias)
-
-    def look(self, observation: Observation) -> Look:
-        """What the actor sees, all of it fixed functions of the observation."""
-        with torch.no_grad():
-            return self.anchors.look(observation)
-
-    def propose(self, look: Look) -> tuple[Tensor, Tensor]:
-        """Actions, shape (B, A, m), and the expected reward of each, shape (B, A)."""
-        scene = self.encoder(look.scene).unsqueeze(1).expand(-1, look.anchors.shape[1], -1)
-        hidden = self.each(torch.cat((scene, look.fares, look.anchors), dim=-1))
-        return torch.tanh(torch.atanh(look.anchors) + self.improve(hidden)), self.score(hidden).squeeze(-1)
-
-    def forward(self, observation: Observation) -> Tensor:
-        """The most promising action, shape (B, m)."""
-        actions, scores = self.propose(self.look(observation))
-        return actions[torch.arange(len(actions)), scores.argmax(dim=-1)]
-
-    def _predict(self, observation: Observation, deterministic: bool = False) -> Tensor:
-        return cast(Tensor, self(observation))
+    def reward(self) -> Tensor:
+        """The expected reward."""
+        return self.learned + self.known()
 
 
 class ViaCritic(BaseModel):
@@ -105,26 +43,33 @@ class ViaCritic(BaseModel):
     """
 
     def __init__(
-        self, observation_space: spaces.Dict, action_space: spaces.Box, *, task: Task, width: int
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        *,
+        task: Task,
+        width: int,
+        trajectory_features: bool = True,
     ) -> None:
         super().__init__(observation_space, action_space)
-        self.task = task
+        self.task, self.sighted = task, trajectory_features
         self.encoder = SetEncoder(task.arm.dimension, width // 4)
-        size = self.encoder.size + get_action_dim(action_space) + GEOMETRY + 1
-        self.value = nn.Sequential(_layers(size, width, width), nn.Linear(width, 1))
+        self.scene = nn.Linear(self.encoder.size, width)
+        self.movement = nn.Linear(GEOMETRY + 1 + get_action_dim(action_space), width, bias=False)
+        self.value = nn.Sequential(nn.ReLU(), layers(width, width), nn.Linear(width, 1))
 
-    def judge(self, observation: Observation, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Learned and known part of the reward of H actions in each of B scenes, shape (B, H) each."""
+    def judge(self, observation: Observation, actions: Tensor) -> Judgement:
+        """What to expect of H actions in each of B scenes, shape (B, H)."""
         foresight = foresee(observation, actions, self.task)
-        scene = self.encoder(scene_view(observation, self.task))
-        scene = scene.unsqueeze(1).expand(-1, actions.shape[1], -1)
-        learned = self.value(torch.cat((scene, actions, foresight.vector()), dim=-1)).squeeze(-1)
-        return learned, foresight.known_reward
+        features = foresight.vector() if self.sighted else torch.zeros_like(foresight.vector())
+        scene = self.scene(self.encoder(scene_view(observation, self.task))).unsqueeze(1)
+        learned = self.value(scene + self.movement(torch.cat((features, actions), dim=-1))).squeeze(-1)
+        clearance = foresight.clearance_reward if self.sighted else torch.zeros_like(learned)
+        return Judgement(learned, clearance, foresight.smoothness_reward, foresight.duration_reward)
 
     def forward(self, observation: Observation, actions: Tensor) -> tuple[Tensor]:
         """The expected reward of one action in each scene, shape (B, 1), as SB3's critics return it."""
-        learned, known = self.judge(observation, actions.unsqueeze(1))
-        return (learned + known,)
+        return (self.judge(observation, actions.unsqueeze(1)).reward(),)
 
 
 class ViaPolicy(TD3Policy):
@@ -136,8 +81,11 @@ class ViaPolicy(TD3Policy):
         lr_schedule: Learning rate against the progress that remains.
         task: The environment's task as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
         width: Of the hidden layers.
-        candidates: How many random neighbours of the proposals the critic ranks, besides the proposals themselves, at
-            each decision; 0 takes the actor's own choice.
+        rounds: How often the actor improves its movements.
+        kept: How many of the most promising ones go from each round to the next.
+        candidates: How many movements the critic ranks at each decision; 0 takes the actor's own choice.
+        heads: With how many anchors the actor begins; all if None, the straight movement if 1.
+        trajectory_features: Whether actor and critic see how movements would fare.
     """
 
     actor: ViaActor  # type: ignore[assignment]
@@ -151,11 +99,17 @@ class ViaPolicy(TD3Policy):
         *,
         task: dict[str, Any],
         width: int = 192,
+        rounds: int = 2,
+        kept: int = 6,
         candidates: int = 0,
+        heads: int | None = None,
+        trajectory_features: bool = True,
         **kwargs: Any,
     ) -> None:
         self.task = Task.from_dict(task, ARMS)
-        self.width, self.candidates = width, candidates
+        self.candidates = candidates
+        self._both: dict[str, Any] = {"width": width, "trajectory_features": trajectory_features}
+        self._rounds: dict[str, Any] = {"rounds": rounds, "kept": kept, "heads": heads}
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     def _build(self, lr_schedule: Any) -> None:
@@ -172,12 +126,13 @@ class ViaPolicy(TD3Policy):
     def make_actor(self, features_extractor: Any = None) -> Any:
         """An actor for the task."""
         spaces_: Any = (self.observation_space, self.action_space)
-        return ViaActor(*spaces_, task=self.task, width=self.width).to(self.device)
+        settings = {**self._both, **self._rounds}
+        return ViaActor(*spaces_, task=self.task, **settings).to(self.device)
 
     def make_critic(self, features_extractor: Any = None) -> Any:
         """A critic for the task."""
         spaces_: Any = (self.observation_space, self.action_space)
-        return ViaCritic(*spaces_, task=self.task, width=self.width).to(self.device)
+        return ViaCritic(*spaces_, task=self.task, **self._both).to(self.device)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         if not self.candidates:
@@ -185,20 +140,23 @@ class ViaPolicy(TD3Policy):
         return self.ranked(observation, self.candidates)
 
     def ranked(self, observation: Observation, candidates: int) -> Tensor:
-        """The best of the proposals and their neighbours in the critic's judgement, shape (B, m).
+        """The best of many movements in the critic's judgement, shape (B, m).
 
-        Neighbours lie on fixed offsets about the most promising proposals, so that a decision is deterministic.
+        Besides the anchors as many others are improved, spread evenly over the action space, so that a decision is
+        deterministic; of the half that promises most, and of what a second improvement makes of it, the critic
+        chooses.
         """
-        proposals, scores = self.actor.propose(self.actor.look(observation))
-        rows = torch.arange(len(proposals)).unsqueeze(-1)
-        promising = proposals[rows, scores.topk(4, dim=-1).indices]
-        offsets = self._offsets(-(-candidates // promising.shape[1]))
-        near = (promising.unsqueeze(2) + offsets).flatten(1, 2).clamp(-1.0, 1.0)
-        actions = torch.cat((proposals, near), dim=1)
-        learned, known = self.critic.judge(observation, actions)
-        return actions[rows[:, 0], (learned + known).argmax(dim=-1)]
+        actor = self.actor
+        scene, look = actor.encode(observation), actor.look(observation)
+        others = actor.look_at(observation, self._spread(candidates).expand(len(scene), -1, -1))
+        both = actor.improve(scene, look), actor.improve(scene, others)
+        every = Improved(*(torch.cat(parts, dim=1) for parts in zip(*both, strict=True)))
+        look = actor.look_at(observation, best(every, -(-candidates // 2)))
+        actions = torch.cat((look.actions, actor.improve(scene, look).actions), dim=1)
+        value = self.critic.judge(observation, actions).reward()
+        return actions[torch.arange(len(actions)), value.argmax(dim=-1)]
 
-    def _offsets(self, count: int) -> Tensor:
+    def _spread(self, count: int) -> Tensor:
         engine: Any = torch.quasirandom.SobolEngine
         sobol = engine(self.actor.size, scramble=True, seed=1).draw(count)
-        return cast(Tensor, 0.5 * (2.0 * sobol - 1.0) ** 3)  # denser near the proposal
+        return cast(Tensor, 2.0 * sobol - 1.0)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.task import Task
-from viapoint.training.features import Look, Observation, SceneView
+from viapoint.training.features import Look
+from viapoint.training.sight import Observation
 
 
 class ScenePool:
@@ -27,6 +28,8 @@ class ScenePool:
         seed: Of the draws.
         fresh: Scenes drawn in each round.
         rounds: For how many rounds they stay.
+        emphasis: How much more often hard scenes are sampled: as the number of free movements, plus one, to minus
+            this power.
         augment: Whether the companions enter.
     """
 
@@ -38,12 +41,14 @@ class ScenePool:
         *,
         fresh: int = 64,
         rounds: int = 32,
+        emphasis: float = 0.5,
         augment: bool = True,
     ) -> None:
         self._task, self._look, self._seed, self._augment = task, look, seed, augment
-        self._fresh, self._rounds = fresh, rounds
+        self._fresh, self._rounds, self._emphasis = fresh, rounds, emphasis
         self._sampler = task.sampler()
         self._held = [-1] * rounds
+        self._free = self._weights = np.zeros(0)
         self._tensors: list[Tensor] = []
         self._names: list[str] = []
         self._generator = np.random.default_rng(seed)
@@ -56,25 +61,27 @@ class ScenePool:
                 self._fill(slot, each)
                 self._held[slot] = each
         self._generator = np.random.default_rng((self._seed, number, 1))
+        weights = 1.0 / (1.0 + self._free) ** self._emphasis
+        self._weights = weights / weights.sum()
 
     def sample(self, count: int) -> tuple[Observation, Look]:
         """`count` observations, with repetition, and what an actor sees of them."""
-        rows = torch.from_numpy(self._generator.integers(len(self._tensors[0]), size=count))
-        parts = [tensor[rows] for tensor in self._tensors]
-        split = len(self._names)
-        scene = SceneView(*parts[split : split + 3])
-        return dict(zip(self._names, parts, strict=False)), Look(scene, *parts[split + 3 :])
+        rows = torch.from_numpy(self._generator.choice(len(self._weights), size=count, p=self._weights))
+        *observation, actions, fares = (tensor[rows] for tensor in self._tensors)
+        return dict(zip(self._names, observation, strict=True)), Look(actions, fares)
 
     def _fill(self, slot: int, number: int) -> None:
         observation = {name: torch.from_numpy(part) for name, part in self._draw(number).items()}
         look = self._look(observation)
-        parts = [*observation.values(), *look.scene, look.anchors, look.fares]
+        parts = [*observation.values(), *look]
         size = len(parts[0])
         if not self._tensors:
             self._names = list(observation)
             self._tensors = [part.new_empty((self._rounds * size, *part.shape[1:])) for part in parts]
+            self._free = np.zeros(self._rounds * size)
         for tensor, part in zip(self._tensors, parts, strict=True):
             tensor[slot * size : (slot + 1) * size] = part
+        self._free[slot * size : (slot + 1) * size] = look.free.sum(dim=-1).numpy()
 
     def _draw(self, number: int) -> dict[str, NDArray[np.float32]]:
         generator = np.random.default_rng((self._seed, number, 0))

@@ -41,6 +41,7 @@ def screen(task: Task, scenes: Scenes, actions: Float) -> Screened:
         rows = slice(i, i + CHUNK)
         tensors = {name: torch.from_numpy(part[rows]) for name, part in observation.items()}
         with torch.no_grad():
-            seen = foresee(tensors, torch.tensor(actions[rows], dtype=torch.float32).unsqueeze(1), task)
-        merit[rows] = torch.minimum(seen.clearance.amin(dim=-1), seen.reach_margin)[:, 0].numpy()
+            plans = torch.tensor(actions[rows], dtype=torch.float32).unsqueeze(1)
+            sight = foresee(tensors, plans, task).seen
+        merit[rows] = torch.minimum(sight.clearance.amin(dim=-1), sight.reach_margin)[:, 0].numpy()
     return Screened(merit < -CERTAIN, merit)

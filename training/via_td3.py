@@ -8,19 +8,25 @@ An episode is one decision, so nothing is bootstrapped.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.policies import ViaActor, ViaCritic, ViaPolicy
+from viapoint.training.actor import ViaActor
+from viapoint.training.features import Look
+from viapoint.training.policies import Judgement, ViaCritic, ViaPolicy
 from viapoint.training.scene_pool import ScenePool
+
+SHARPNESS = 8.0
+"""How fast the probability of success falls with the learned part of the reward, about one half."""
 
 
 class ViaTD3(TD3):
@@ -38,8 +44,12 @@ class ViaTD3(TD3):
         temperature: Difference of score that makes one of them e times as likely as another.
         promising: How many of the best-scored proposals of a scene, among a random half of them, an update looks at.
         others: And how many besides, drawn at random.
+        further: How many of the promising ones are improved again.
         fresh_scenes: Scenes drawn for the actor after each step of all environments.
         augment: Whether their mirror images and exchanged ends join them.
+        objective: What proposals climb: the expected reward, or the logarithm of the probability of success as the
+            critic's learned part tells it, with the known effort.
+        smoothness: Whether the objective counts the jerk of the movement.
         policy_kwargs: Of :class:`~viapoint.training.policies.ViaPolicy`; the task is asked of `env`.
         **kwargs: Of :class:`stable_baselines3.TD3`.
     """
@@ -63,15 +73,19 @@ class ViaTD3(TD3):
         temperature: float = 0.1,
         promising: int = 4,
         others: int = 2,
+        further: int = 3,
         fresh_scenes: int = 64,
         augment: bool = True,
+        objective: Literal["reward", "log_success"] = "reward",
+        smoothness: bool = True,
         policy_kwargs: dict[str, Any] | None = None,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
         self.explore_uniformly, self.noise, self.temperature = explore_uniformly, noise, temperature
-        self.promising, self.others = promising, others
+        self.promising, self.others, self.further = promising, others, further
         self.fresh_scenes, self.augment = fresh_scenes, augment
+        self.objective, self.smoothness = objective, smoothness
         kwargs = {"buffer_size": 50_000, "gamma": 0.0, "train_freq": 1, **kwargs}
         super().__init__(
             policy,
@@ -112,8 +126,9 @@ class ViaTD3(TD3):
         """Regress what the formulas leave of the reward."""
         assert self.replay_buffer is not None
         batch: Any = self.replay_buffer.sample(batch_size)
-        learned, known = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
-        loss = functional.smooth_l1_loss(learned, batch.rewards - known.detach(), beta=0.5)
+        judgement = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
+        target = batch.rewards - judgement.known().detach()
+        loss = functional.smooth_l1_loss(judgement.learned, target, beta=0.5)
         self.critic.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), 10.0)
@@ -121,25 +136,46 @@ class ViaTD3(TD3):
         return float(loss.item())
 
     def _update_actor(self, batch_size: int) -> tuple[float, float]:
-        """Improve proposals in the critic's judgement, and let their scores foretell it."""
+        """Improve anchors, then what became of them, in the critic's judgement, and let the scores foretell it."""
         assert self.pool is not None
         observation, look = self.pool.sample(batch_size)
-        number = look.anchors.shape[1]
-        look = look.at(torch.randperm(number)[: max(number // 2, self.promising)].expand(batch_size, -1))
-        with torch.no_grad():
-            best = self.actor.propose(look)[1].topk(self.promising, dim=-1).indices
-        others = torch.randint(0, look.anchors.shape[1], (batch_size, self.others))
-        proposals, scores = self.actor.propose(look.at(torch.cat((best, others), dim=-1)))
+        scene = self.actor.encode(observation)
+        first = self.actor.improve(scene, self._some_anchors(scene.detach(), look))
+        ahead = first.promise[:, : self.promising]
+        chosen = ahead.topk(min(self.further, ahead.shape[1]), dim=-1).indices
+        rows = torch.arange(batch_size).unsqueeze(-1)
+        again = self.actor.look_at(observation, first.actions[rows, chosen])
+        second = self.actor.improve(scene, again)
         self.critic.requires_grad_(False)
-        judgement = torch.add(*self.critic.judge(observation, proposals))
+        judgement = self.critic.judge(observation, torch.cat((first.actions, second.actions), dim=1))
         self.critic.requires_grad_(True)
-        score_loss = functional.smooth_l1_loss(scores, judgement.detach(), beta=0.5)
-        loss = score_loss - judgement.mean()
+        reward = judgement.reward().detach()
+        foretold = torch.cat((first.promise, second.promise, second.worth), dim=1)
+        targets = torch.cat((reward, reward[rows, chosen]), dim=1)
+        score_loss = functional.smooth_l1_loss(foretold, targets, beta=0.5)
+        loss = score_loss - self._merit(judgement).mean()
         self.actor.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), 10.0)
         self.actor.optimizer.step()
-        return float(judgement[:, : self.promising].mean().item()), float(score_loss.item())
+        return float(reward.amax(dim=1).mean().item()), float(score_loss.item())
+
+    def _merit(self, judgement: Judgement) -> Tensor:
+        """What proposals climb, shape (B, H)."""
+        effort = judgement.duration + (judgement.smoothness if self.smoothness else 0.0)
+        if self.objective == "log_success":
+            return functional.logsigmoid(SHARPNESS * (judgement.learned - 0.5)) + effort
+        return judgement.learned + judgement.clearance + effort
+
+    def _some_anchors(self, scene: Tensor, look: Look) -> Look:
+        """The most promising ones of a random half, and a few others."""
+        batch_size, number = look.actions.shape[:2]
+        promising = min(self.promising, number)
+        look = look.at(torch.randperm(number)[: max(number // 2, promising)].expand(batch_size, -1))
+        with torch.no_grad():
+            most = self.actor.improve(scene, look).promise.topk(promising, dim=-1).indices
+        others = torch.randint(0, look.actions.shape[1], (batch_size, self.others))
+        return look.at(torch.cat((most, others), dim=-1))
 
     def _sample_action(
         self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
@@ -151,7 +187,7 @@ class ViaTD3(TD3):
         assert self._last_obs is not None
         with torch.no_grad():
             observation, _ = self.policy.obs_to_tensor(self._last_obs)
-            proposals, scores = self.actor.propose(self.actor.look(observation))  # type: ignore[arg-type]
+            proposals, scores = self.actor.propose(observation)  # type: ignore[arg-type]
             head = torch.multinomial(torch.softmax(scores / self.temperature, dim=-1), 1)[:, 0]
             chosen = proposals[torch.arange(n_envs), head]
             noisy = torch.clamp(chosen + self.noise * torch.randn_like(chosen), -1.0, 1.0)

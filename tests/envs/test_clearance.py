@@ -75,7 +75,7 @@ def test_the_profile_has_the_clearance_as_its_least_value():
         hand_clearance(hand, ADULT.hand_radius, obstacles, present),
         arm_clearance(links, ADULT.link_radii, obstacles, present),
     )
-    np.testing.assert_allclose(profile.min(axis=-1), least.min(axis=-1), atol=1e-12)
+    np.testing.assert_allclose(profile.min(axis=-1), least, atol=1e-12)
 
 
 def test_absent_obstacles_are_far_and_order_is_irrelevant():

@@ -1,0 +1,82 @@
+"""Movements to begin with: a few ways round each, wide and narrow, early and late."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs._arrays import clamp
+from viapoint.envs.action import ActionLayout, frame
+from viapoint.envs.task import Task
+from viapoint.training.features import Look, look_at
+from viapoint.training.sight import INSTANTS
+
+Float = NDArray[np.float32]
+
+ALONG = (-0.32, -0.16, 0.0, 0.16, 0.32)
+HEIGHT = (0.12, 0.25, 0.40, 0.55, 0.70, 0.85)
+"""Where anchors' via-points lie from the middle of the straight line, relative to its length."""
+
+
+class Anchors:
+    """Fixed movements, scaled with the distance of start and goal.
+
+    As they scale, their paths are computed once. A policy that sees how each of them would fare needs to improve the
+    promising ones only.
+
+    Args:
+        task: The environment's.
+        count: Only so many of them, evenly spread; 1 is the straight movement.
+    """
+
+    def __init__(self, task: Task, count: int | None = None) -> None:
+        if not task.action.n_via:
+            raise ValueError("a policy of via-points needs an environment with n_via of 1 or more")
+        d = task.arm.dimension
+        layout = ActionLayout(dimension=d, via_scale=(1.0,) * d)
+        vias = _vias(d, count)
+        goal = np.eye(d)[0] * np.ones((len(vias), 1))
+        plan = layout.decode(np.concatenate((vias, np.zeros((len(vias), 1))), axis=-1), 0.0 * goal, goal)
+        trajectory, duration = plan.trajectory(), plan.durations.sum(axis=-1)
+        self.task = task
+        self.paths = trajectory(duration[:, None] * INSTANTS).astype(np.float32)
+        """In the frame of start and goal, shape (A, PHASES, D), for a distance of 1 m."""
+        places = np.arange(1, task.action.n_via + 1) / (task.action.n_via + 1)
+        on_path = trajectory(duration[:, None] * places) - places[:, None] * goal[:, None]
+        if task.action.n_via == 1:
+            on_path = vias[:, None]
+        scaled = on_path / np.array(task.action.via_scale[:d])
+        self.vias = scaled.reshape(len(vias), -1).astype(np.float32)
+        """Via components of their actions, shape (A, K D), for a distance of 1 m."""
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def look(self, observation: dict[str, Float]) -> Look:
+        """See how they would fare in each of B scenes; the observation is of NumPy arrays."""
+        start, line = observation["hand"], observation["goal"] - observation["hand"]
+        distance = np.sqrt((line * line).sum(axis=-1))[:, None, None]
+        scaled = np.stack(frame(line), axis=-2) * distance
+        hand = start[:, None, None] + self.paths @ scaled[:, None]
+        return look_at(observation, self._actions(distance), self.task, hand)
+
+    def _actions(self, distance: Float) -> Float:
+        """Shape (B, A, m), inside (-1, 1)."""
+        vias = self.vias * distance
+        rest = np.zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]), dtype=vias.dtype)
+        return np.asarray(clamp(np.concatenate((vias, rest), axis=-1), -0.97, 0.97))
+
+
+def _vias(dimension: int, count: int | None) -> NDArray[np.float64]:
+    """Via-points for a distance of 1 m, from the middle of the straight line, shape (A, D)."""
+    if count == 1:
+        return np.zeros((1, dimension))
+    along, height, turn = np.meshgrid(ALONG, HEIGHT, _turns(dimension), indexing="ij")
+    sideways = (np.cos(turn), np.sin(turn))[: dimension - 1]
+    vias = np.stack([along, *(height * side for side in sideways)], axis=-1).reshape(-1, dimension)
+    return vias if count is None else vias[np.linspace(0, len(vias) - 1, count).round().astype(int)]
+
+
+def _turns(dimension: int) -> NDArray[np.float64]:
+    """Directions sideways: left and right in the plane, eight all round in space."""
+    return np.linspace(0.0, 2.0 * np.pi, 2 if dimension == 2 else 8, endpoint=False)

@@ -1,0 +1,115 @@
+"""What can be seen of a planned movement: how near it comes to the obstacles, where, and whether the arm reaches.
+
+All of it is an exact function of scene and path, of NumPy arrays and of torch tensors, and differentiable with respect
+to the path. The nearest pair of points is searched for without gradients, over every body, obstacle and time; only the
+pairs found are then differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from viapoint.envs._arrays import clamp
+from viapoint.envs.clearance import FAR, clearance_profile
+from viapoint.envs.observation import ObstacleRows
+from viapoint.envs.task import Task
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+Observation = dict[str, Array]
+
+STRETCHES = 16
+"""Parts of equal duration, each with one nearest approach."""
+LOOKS = 3
+"""How often a movement is looked at in each of them."""
+PHASES = STRETCHES * LOOKS
+INSTANTS = np.arange(1, PHASES + 1, dtype=np.float32) / PHASES
+"""Fractions of the duration at which a movement is looked at, shape (PHASES,)."""
+NEAR = 0.06
+"""Clearance from which on an obstacle no longer matters, [m]."""
+_STEP = 1e-3
+"""Of the difference quotient that tells where an obstacle pushes, [m]."""
+
+
+class Sight(NamedTuple):
+    """What is seen of H movements in each of B scenes."""
+
+    clearance: Array
+    """Least in each stretch, shape (B, H, STRETCHES), [m]."""
+    reach_margin: Array
+    """Least over the movement, shape (B, H), [m]."""
+
+
+def see(observation: Observation, hand: Array, task: Task) -> Sight:
+    """Clearance and reach of hand paths, shape (B, H, PHASES, D), [m]."""
+    xp = array_namespace(hand)
+    margin = xp.min(task.arm.reach_margin(hand), axis=-1)
+    if "obstacles" not in observation:
+        return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
+    nearest, pairs = _nearest(observation, hand, task)
+    return Sight(_lowest(_clearance(nearest, *pairs, task)[..., 0, :]), margin)
+
+
+def push(observation: Observation, hand: Array, task: Task) -> tuple[Sight, Array]:
+    """What is seen of hand paths, and where the nearest obstacle of each stretch pushes the hand.
+
+    The push is the gradient of the clearance by difference quotients, the weaker the farther the obstacle, shape
+    (B, H, STRETCHES, D).
+    """
+    xp = array_namespace(hand)
+    margin = xp.min(task.arm.reach_margin(hand), axis=-1)
+    if "obstacles" not in observation:
+        at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
+        return Sight(xp.full_like(at_ends[..., 0], FAR), margin), xp.zeros_like(at_ends)
+    nearest, pairs = _nearest(observation, hand, task)
+    moves = xp.asarray(_STEP * np.eye(hand.shape[-1]), dtype=hand.dtype)
+    around = xp.concat((nearest, nearest[..., 1:2, :] + moves), axis=-2)
+    clearance = _clearance(around, *pairs, task)[..., 0, :]
+    gradient = (clearance[..., 3:] - clearance[..., 1:2]) / _STEP
+    lowest = _lowest(clearance[..., :3])
+    nearness = clamp(1.0 - lowest / NEAR, 0.0, 1.5)
+    return Sight(lowest, margin), gradient * nearness[..., None]
+
+
+def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, tuple[Array, Array]]:
+    """Nearest approach of each stretch: the hand just before, at and after it, and the obstacle it is to.
+
+    Shapes (B, H, STRETCHES, 3, D), (B, H, STRETCHES, 1, 2 D + 1) and (B, H, STRETCHES, 1).
+    """
+    xp = array_namespace(hand)
+    rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
+    obstacles = xp.concat((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
+    present = rows.present > 0.5
+    still = hand if xp is np or not hasattr(hand, "detach") else hand.detach()
+    profile = _clearance(still, obstacles[:, None], present[:, None], task)
+    profile = xp.reshape(profile, (*profile.shape[:3], STRETCHES, LOOKS))
+    which = xp.argmin(xp.min(profile, axis=-1), axis=2)
+    look = xp.argmin(xp.min(profile, axis=2), axis=-1)
+    phase = LOOKS * xp.arange(STRETCHES) + look
+    around = clamp(phase[..., None] + xp.arange(-1, 2), 0, PHASES - 1)
+    shape = (*around.shape[:2], 3 * STRETCHES, 1)
+    nearest = xp.take_along_axis(hand, xp.reshape(around, shape), axis=2)
+    nearest = xp.reshape(nearest, (*around.shape, hand.shape[-1]))
+    scene = xp.arange(len(hand))[:, None, None]
+    return nearest, (obstacles[scene, which][..., None, :], present[scene, which][..., None])
+
+
+def _lowest(three: Array) -> Array:
+    """Lowest point of the parabola through three neighbouring values, shape (..., 3), where it lies between them."""
+    xp = array_namespace(three)
+    before, at, after = three[..., 0], three[..., 1], three[..., 2]
+    slope, curvature = 0.5 * (after - before), after - 2.0 * at + before
+    between = curvature > xp.abs(slope)
+    drop = 0.5 * slope * slope / xp.where(between, curvature, xp.ones_like(curvature))
+    return xp.where(between, at - drop, at)
+
+
+def _clearance(hand: Array, obstacles: Array, present: Array, task: Task) -> Array:
+    """Of the hand and, where they count, the links, from each obstacle at each time, shape (..., n, T)."""
+    if not task.whole_arm:
+        return clearance_profile(hand, task.arm.hand_radius, obstacles, present)
+    links = task.arm.links(task.arm.posture(hand))
+    return clearance_profile(hand, task.arm.hand_radius, obstacles, present, links, task.arm.link_radii)
