@@ -83,7 +83,8 @@ def test_foresight_is_the_same_in_numpy_and_torch(trial):
     difference = np.abs(ours.vector() - theirs.vector().numpy())
     assert np.quantile(difference, 0.98) < 2e-3, "but where two obstacles are equally near"
     for name in ("clearance_reward", "smoothness_reward", "duration_reward"):
-        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name).numpy(), atol=5e-3)
+        atol = 2e-2 if name == "clearance_reward" else 1e-4  # single precision is coarse where axes cross
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name).numpy(), atol=atol)
 
 
 def test_the_obstacles_push_where_clearance_grows(trial):
