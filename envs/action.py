@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from array_api_compat import array_namespace
 
 from viapoint import primitives
+from viapoint.envs._arrays import namespace_of
 
 Array = Any
 Timing = Literal["optimal", "learned"]
@@ -121,7 +121,7 @@ class ActionLayout:
             start: Shape (..., D), [m].
             goal: Shape (..., D), [m], apart from the start.
         """
-        xp = array_namespace(action, start, goal)
+        xp = namespace_of(action)
         line = goal - start
         axes = frame(line)
         ends = self.n_via * self.dimension
@@ -143,7 +143,7 @@ class ActionLayout:
         Components outside [-1, 1] say that the movement lies outside the action space.
         """
         waypoints, durations = plan
-        xp = array_namespace(waypoints, durations)
+        xp = namespace_of(waypoints)
         start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
         line = goal - start
         components = []
@@ -167,7 +167,7 @@ class ActionLayout:
     def _durations(self, waypoints: Array, duration: Array, split: Array) -> Array:
         if self.timing == "optimal":
             return primitives.passage_durations(waypoints, duration)
-        xp = array_namespace(waypoints, duration)
+        xp = namespace_of(waypoints)
         logs = [xp.zeros_like(duration)]
         for k, ratio in enumerate(self._straight_split):
             logs.append(logs[-1] + ratio + LOG_SPLIT * split[..., k])
@@ -180,7 +180,7 @@ def frame(line: Array) -> list[Array]:
 
     In space a vertical line has no left; the x axis stands in.
     """
-    xp = array_namespace(line)
+    xp = namespace_of(line)
     along = line / xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
     x, y = along[..., 0], along[..., 1]
     if line.shape[-1] == 2:

@@ -7,9 +7,7 @@ batched over leading dimensions and accept NumPy arrays and torch tensors.
 
 from __future__ import annotations
 
-from array_api_compat import array_namespace
-
-from viapoint.envs._arrays import Array, clamp
+from viapoint.envs._arrays import Array, clamp, namespace_of
 
 FAR = 1.0
 """Clearance is reported up to this distance, [m]: also where there is no obstacle."""
@@ -28,7 +26,7 @@ def hand_clearance(points: Array, radius: float, obstacles: Array, present: Arra
     Returns:
         Shape (..., n), [m]; negative is penetration, at most FAR.
     """
-    xp = array_namespace(points, obstacles)
+    xp = namespace_of(points)
     nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
     return _clearance(nearest, obstacles[..., -1] + radius, present)
 
@@ -45,7 +43,7 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
     Returns:
         Shape (..., n), [m]; negative is penetration, at most FAR.
     """
-    xp = array_namespace(links, obstacles)
+    xp = namespace_of(links)
     each = []
     for i, radius in enumerate(radii):
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
@@ -74,7 +72,7 @@ def clearance_profile(
     Returns:
         Shape (..., n, T), [m].
     """
-    xp = array_namespace(hand, obstacles)
+    xp = namespace_of(hand)
     radii, shown = obstacles[..., :, None, -1], present[..., :, None]
     least = _clearance(point_distance_squared(hand, obstacles), radii + hand_radius, shown)
     for i, radius in enumerate(link_radii if links is not None else ()):
@@ -93,7 +91,7 @@ def point_distance_squared(points: Array, obstacles: Array) -> Array:
     Returns:
         Shape (..., n, T), [m^2].
     """
-    xp = array_namespace(points, obstacles)
+    xp = namespace_of(points)
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
     axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
@@ -118,7 +116,7 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> A
     Returns:
         Shape (..., n, T), [m^2].
     """
-    xp = array_namespace(first, obstacles)
+    xp = namespace_of(first)
     dimension = first.shape[-1]
     link = [second[..., None, :, i] - first[..., None, :, i] for i in range(dimension)]
     axis = [2.0 * obstacles[..., :, None, dimension + i] for i in range(dimension)]
@@ -145,6 +143,6 @@ def _dot(first: list[Array], second: list[Array]) -> Array:
 
 
 def _clearance(squared: Array, radii: Array, present: Array) -> Array:
-    xp = array_namespace(squared)
+    xp = namespace_of(squared)
     distance = xp.sqrt(squared + 1e-24) - radii
     return xp.where(present, xp.minimum(distance, FAR), xp.full_like(distance, FAR))

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from array_api_compat import array_namespace
-
-from viapoint.envs._arrays import clamp
+from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.action import frame
 from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.task import Task
@@ -42,7 +40,7 @@ class Look(NamedTuple):
 
     def at(self, some: Array) -> Look:
         """Only some of the movements, `some` of shape (B, n) in each scene."""
-        rows = array_namespace(some).arange(len(some))[:, None]
+        rows = namespace_of(some).arange(len(some))[:, None]
         return Look(self.actions[rows, some], self.fares[rows, some])
 
     @property
@@ -64,7 +62,7 @@ class Foresight(NamedTuple):
 
     def vector(self) -> Array:
         """The features as a network likes them, of size one, shape (B, H, GEOMETRY + 1)."""
-        xp = array_namespace(self.log_jerk)
+        xp = namespace_of(self.log_jerk)
         return xp.concat((_sized(self.seen), 0.3 * self.log_jerk[..., None]), axis=-1)
 
 
@@ -76,7 +74,7 @@ def fares_size(task: Task) -> int:
 def scene_view(observation: Observation, task: Task) -> SceneView:
     """The scene of an observation, seen along its straight line; `hand` is the start."""
     start, goal = observation["hand"], observation["goal"]
-    xp = array_namespace(start)
+    xp = namespace_of(start)
     line = goal - start
     distance = xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
     ends = 2.0 * xp.concat((start, goal, distance), axis=-1)
@@ -100,7 +98,7 @@ def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
         actions: Shape (B, H, m), in [-1, 1].
         task: The environment's.
     """
-    xp = array_namespace(actions)
+    xp = namespace_of(actions)
     start, goal = _ends(observation, actions)
     plan = task.action.decode(actions, start, goal)
     trajectory, duration = plan.trajectory(), xp.sum(plan.durations, axis=-1)
@@ -125,7 +123,7 @@ def look_at(observation: Observation, actions: Array, task: Task, hand: Array | 
 
     `hand` are their paths, shape (B, A, PHASES, D), where they are known already.
     """
-    xp = array_namespace(actions)
+    xp = namespace_of(actions)
     if hand is None:
         plan = task.action.decode(actions, *_ends(observation, actions))
         hand = plan.trajectory()(_times(xp.sum(plan.durations, axis=-1)))
@@ -137,7 +135,7 @@ def look_at(observation: Observation, actions: Array, task: Task, hand: Array | 
 
 def _ends(observation: Observation, actions: Array) -> tuple[Array, Array]:
     """Start and goal for each action."""
-    xp = array_namespace(actions)
+    xp = namespace_of(actions)
     shape = (*actions.shape[:2], observation["hand"].shape[-1])
     start, goal = (xp.broadcast_to(observation[name][:, None], shape) for name in ("hand", "goal"))
     return start, goal
@@ -145,12 +143,12 @@ def _ends(observation: Observation, actions: Array) -> tuple[Array, Array]:
 
 def _times(duration: Array) -> Array:
     """When movements are looked at, shape (..., PHASES), [s]."""
-    xp = array_namespace(duration)
+    xp = namespace_of(duration)
     return duration[..., None] * xp.asarray(INSTANTS, dtype=duration.dtype)
 
 
 def _sized(seen: Sight) -> Array:
-    xp = array_namespace(seen.clearance)
+    xp = namespace_of(seen.clearance)
     least, margin = xp.min(seen.clearance, axis=-1)[..., None], seen.reach_margin[..., None]
     parts = (seen.clearance * 20.0, least * 20.0, least * 150.0, margin * 20.0, least * 1000.0)
     return clamp(xp.concat(parts, axis=-1), -2.0, 2.0)

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from viapoint.envs._arrays import clamp
+from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.clearance import FAR, clearance_profile
 from viapoint.envs.observation import ObstacleRows
 from viapoint.envs.task import Task
@@ -45,7 +44,7 @@ class Sight(NamedTuple):
 
 def see(observation: Observation, hand: Array, task: Task) -> Sight:
     """Clearance and reach of hand paths, shape (B, H, PHASES, D), [m]."""
-    xp = array_namespace(hand)
+    xp = namespace_of(hand)
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
         return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
@@ -59,7 +58,7 @@ def push(observation: Observation, hand: Array, task: Task) -> tuple[Sight, Arra
     The push is the gradient of the clearance by difference quotients, the weaker the farther the obstacle, shape
     (B, H, STRETCHES, D).
     """
-    xp = array_namespace(hand)
+    xp = namespace_of(hand)
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
         at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
@@ -79,7 +78,7 @@ def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, 
 
     Shapes (B, H, STRETCHES, 3, D), (B, H, STRETCHES, 1, 2 D + 1) and (B, H, STRETCHES, 1).
     """
-    xp = array_namespace(hand)
+    xp = namespace_of(hand)
     rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
     obstacles = xp.concat((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
     present = rows.present > 0.5
@@ -99,7 +98,7 @@ def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, 
 
 def _lowest(three: Array) -> Array:
     """Lowest point of the parabola through three neighbouring values, shape (..., 3), where it lies between them."""
-    xp = array_namespace(three)
+    xp = namespace_of(three)
     before, at, after = three[..., 0], three[..., 1], three[..., 2]
     slope, curvature = 0.5 * (after - before), after - 2.0 * at + before
     between = curvature > xp.abs(slope)
