@@ -71,9 +71,9 @@ _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 PRESETS: dict[str, Preset] = {
     "viatd3": _preset(
         64,
-        16_000,
+        6_400,
         "ViaPolicy",  # its defaults are its settings
-        learning_rate={"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0},
+        learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
     ),
     "sac": _preset(64, 40_000, **_OFF_POLICY),
     "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),

@@ -67,7 +67,7 @@ class ViaTD3(TD3):
         *,
         learning_starts: int = 512,
         batch_size: int = 128,
-        gradient_steps: int = 20,
+        gradient_steps: int = 14,
         explore_uniformly: float = 0.25,
         noise: float = 0.05,
         temperature: float = 0.1,
