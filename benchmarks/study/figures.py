@@ -23,7 +23,17 @@ from viapoint.training.plots import AXES
 from viapoint.training.statistics import interquartile_mean
 
 Numbers = Mapping[str, Any]
-COLOURS = {"viatd3": "#1f5fa8", "sac": "#d1495b", "td3": "#8a6fb3", "ppo": "#d98e04", "tqc": "#3a8f6b"}
+COLOURS = {
+    "viatd3": "#1f5fa8",
+    "sac": "#d1495b",
+    "td3": "#8a6fb3",
+    "ppo": "#d98e04",
+    "tqc": "#3a8f6b",
+    "sac-step": "#7a1f2b",
+    "td3-step": "#4b3a66",
+    "ppo-step": "#7a5002",
+    "tqc-step": "#1d4a37",
+}
 SHOWN_BASELINES = {"random80": ("0.55", "D"), "constant": ("0.55", "s"), "stored": ("0.2", "_")}
 DOTS_PER_INCH, SHADES = 100, 48
 

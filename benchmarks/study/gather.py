@@ -40,7 +40,8 @@ def gather(study: Study) -> Numbers:
 
 def _environment(env: str, study: Study) -> Numbers:
     """One environment's results."""
-    found = _table(env, study.variants("results"), {}, study)
+    variants = study.variants("results", env)
+    found = _table(env, variants, {}, study)
     path = work.timings_path(env, study)
     times = {name: each["median"] for name, each in read_json(path).items()} if path.is_file() else {}
     return {
@@ -48,7 +49,7 @@ def _environment(env: str, study: Study) -> Numbers:
         "methods": found,
         "baselines": _baselines(env, study),
         "decision_time": times,
-        "curves": {variant.name: _curves(env, variant, study) for variant in study.variants("results")},
+        "curves": {variant.name: _curves(env, variant, study) for variant in variants},
         "failures": {name: _failures(env, name, study) for name in sets_of(env)},
         "improvement": _improvement(found),
         "compared": {name: _compared(env, name, study) for name in sets_of(env)},

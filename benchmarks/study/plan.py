@@ -9,18 +9,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from viapoint.envs.registration import TASKS
+from viapoint.envs.registration import STEP_TASKS, TASKS
+from viapoint.training.baselines import METHODS as BASELINE_METHODS
 from viapoint.training.config import DEFAULT_ENV, TrainConfig
 from viapoint.training.frozen_scenes import SETS, shipped_path
 from viapoint.training.policies import ViaPolicy
-from viapoint.training.presets import PRESETS, Algorithm
+from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm
 from viapoint.training.via_td3 import ViaTD3
 
 Table = Literal["results", "ablations", "freedom"]
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
 MEASURED = tuple(name for name in SETS if name != "validation")
 """Sets that are measured once training is over; models are chosen on `validation` alone."""
-BASELINES = ("straight", "constant", "random", "random16", "random80", "stored")
+BASELINES = ("stored", "straight", "constant", "random", "random16", "random80", "ompl")
 """Of the results: names of viapoint.training.baselines, and the planner's solutions that are stored with the scenes."""
 VALIDATIONS, CHECKPOINTS = 16, 8
 """Of each training, however long it is."""
@@ -39,11 +40,23 @@ class Variant:
     """Of ViaTD3 or of its policy, instead of the preset's."""
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Of the environment."""
+    step_wise: bool = False
+    """Whether it learns on the environment's step-wise twin, an action in every control step."""
 
 
-METHODS = tuple(Variant(name=algo, label=algo, algo=algo) for algo in get_args(Algorithm))
+METHODS = (
+    *(Variant(name=algo, label=algo, algo=algo) for algo in get_args(Algorithm)),
+    *(
+        Variant(name=f"{algo}-step", label=f"{algo} in every control step", algo=algo, step_wise=True)
+        for algo in get_args(Algorithm)
+        if algo in STEP_PRESETS
+    ),
+)
 """Each algorithm as its preset says."""
 WHOLE = METHODS[0]
+DEFAULT_METHODS = (*get_args(Algorithm), "sac-step")
+TWINS = {whole: step for step, whole in STEP_TASKS.items()}
+"""Step-wise twin of an environment."""
 ABLATIONS = (
     WHOLE,
     Variant(
@@ -93,8 +106,8 @@ class Study:
     """Folder for results.md, results.json and images/results_*.png."""
     envs: tuple[str, ...] = ()
     """Environments of the results; all that have frozen test scenes if not given."""
-    methods: tuple[str, ...] = tuple(get_args(Algorithm))
-    """Learning algorithms of the results."""
+    methods: tuple[str, ...] = DEFAULT_METHODS
+    """Of the results: learning algorithms, and with `-step` those that act in every control step."""
     studied: tuple[str, ...] = (DEFAULT_ENV,)
     """Environments of ablations and freedom."""
     tables: tuple[Table, ...] = get_args(Table)
@@ -119,8 +132,8 @@ class Study:
         for name, known in (
             ("envs", [env for env in TASKS if sets_of(env)]),
             ("studied", [env for env in TASKS if sets_of(env)]),
-            ("methods", list(PRESETS)),
-            ("baselines", [*BASELINES, "planner"]),
+            ("methods", [each.name for each in METHODS]),
+            ("baselines", ["stored", *BASELINE_METHODS]),
         ):
             unknown = [each for each in getattr(self, name) if each not in known]
             if unknown:
@@ -136,10 +149,11 @@ class Study:
         """Of the results."""
         return self.envs or tuple(env for env in TASKS if sets_of(env))
 
-    def variants(self, table: Table) -> tuple[Variant, ...]:
-        """The rows of a table."""
+    def variants(self, table: Table, env: str) -> tuple[Variant, ...]:
+        """The rows of a table of an environment."""
         if table == "results":
-            return tuple(each for each in METHODS if each.algo in self.methods)
+            asked = (each for each in METHODS if each.name in self.methods)
+            return tuple(each for each in asked if env in TWINS or not each.step_wise)
         return ABLATIONS if table == "ablations" else FREEDOM
 
     def cells(self) -> list[Cell]:
@@ -148,7 +162,7 @@ class Study:
         for seed in self.seeds:
             for table in self.tables:
                 for env in self.environments if table == "results" else self.studied:
-                    for variant in self.variants(table):
+                    for variant in self.variants(table, env):
                         found[Cell(env=env, variant=variant, seed=seed)] = None
         return list(found)
 
@@ -176,7 +190,7 @@ class Cell:
     def training(self, study: Study) -> TrainConfig:
         """The configuration of the run."""
         config = TrainConfig(
-            env=self.env,
+            env=TWINS[self.env] if self.variant.step_wise else self.env,
             algo=self.variant.algo,
             seed=self.seed,
             n_timesteps=study.n_timesteps,

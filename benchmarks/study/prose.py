@@ -19,8 +19,9 @@ kept. Of several seeds the number is the interquartile mean (of five seeds: the 
 bands). A method without seeds has the interval over scenes. The bands are those of the *solution share*, the
 fraction of uniformly random actions that solve a scene: easy scenes prove little. Jerk and duration are those of
 successes as multiples of the planner's in the same scene: the median over scenes, then over seeds. Jerk is taken at
-equal duration. Decision: the median time of one decision on one thread; of the planner, of a search. Minutes: wall
-time of a training without validation, median over seeds{cores}.
+equal duration. Decision: the median time of one decision on one thread; of the planner, of a search; of an agent
+that acts in every control step, of one step. Minutes: wall time of a training without validation, median over
+seeds{cores}.
 """
 
 KNOWLEDGE = """## What the critic knows, and what it must learn

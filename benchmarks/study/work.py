@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from study.plan import FREEDOM, METHODS, Cell, Study, Variant, sets_of, short
-from viapoint.training.baselines import AgentMethod, Method, make_method
+from study.plan import FREEDOM, Cell, Study, Variant, sets_of, short
+from viapoint.training.baselines import Method, agent_method, make_method
 from viapoint.training.config import TrainConfig, as_json
 from viapoint.training.demo import Certified
 from viapoint.training.evaluate import MethodResult, evaluate
@@ -44,7 +44,10 @@ class Job(NamedTuple):
 
     def done(self) -> bool:
         """Whether it has been done before, so that doing it again only tells how it went."""
-        return self.is_done(*self.arguments)
+        try:
+            return self.is_done(*self.arguments)
+        except (ValueError, OSError):
+            return False  # the work itself will say what is wrong
 
 
 def jobs(study: Study) -> list[Job]:
@@ -136,9 +139,9 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     if found is not None:
         return found
     model: Any = load_model(run.model_folder)
-    methods: list[Method] = [AgentMethod(ALONE, model)]
+    methods = [agent_method(ALONE, model)]
     if hasattr(model.policy, "ranked"):
-        methods.append(AgentMethod(RANKED, model, study.candidates))
+        methods.append(agent_method(RANKED, model, study.candidates))
     kwargs = dict(cell.variant.env_kwargs)
     with one_thread():
         results = evaluate(methods, frozen, cell.env, env_kwargs=kwargs, time_decisions=False).results
@@ -220,10 +223,10 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
     """Name, what it depends on, and the method."""
     found: list[tuple[str, str, Callable[[], Method]]] = [
         (name, name, lambda name=name: make_method(name, env, threads=1))  # type: ignore[misc]
-        for name in ("random16", "random80", "planner")
+        for name in ("random16", "random80", "planner", "ompl")
         if name in study.baselines or (name == "planner" and "stored" in study.baselines)
     ]
-    for variant in METHODS:
+    for variant in study.variants("results", env):
         cells = [Cell(env=env, variant=variant, seed=seed) for seed in study.seeds]
         first = next((cell for cell in cells if state(cell, study) == "trained"), None)
         if first is None:
@@ -233,7 +236,7 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
         source = identity_of(scenes("test", env, study), folder, study)["weights"]
         ways = {ALONE: 0} | ({RANKED: study.candidates} if hasattr(model.policy, "ranked") else {})
         for way, count in ways.items():
-            method = lambda way=way, model=model, count=count: AgentMethod(way, model, count)  # noqa: E731
+            method = lambda way=way, model=model, count=count: agent_method(way, model, count)  # noqa: E731
             found.append((f"{variant.name} {way}", f"{source} {count}", method))
     return found
 
