@@ -16,18 +16,18 @@ import argparse
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from viapoint.training.baselines import AgentMethod
+from viapoint.training.baselines import agent_method
 from viapoint.training.evaluate import evaluate
 from viapoint.training.frozen_scenes import load
 from viapoint.training.model_files import build
 from viapoint.training.train import one_thread
 from viapoint.training.vec_env import ViaVecEnv
 
-ENV_ID = "viapoint/PlanarObstacles-v0"
+ENV_ID, STEP_ID = "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0"
 SET = {"features_extractor_class": {"kind": "extractor", "name": "SceneExtractor"}}
 FALLING = {"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0}
 NOISE = {"kind": "normal", "sigma": 0.2}
@@ -48,6 +48,7 @@ class Setting:
     algorithm: str
     n_timesteps: int
     n_envs: int = 64
+    env: str = ENV_ID
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -56,6 +57,12 @@ def sac(n_timesteps: int = 20_000, n_envs: int = 64, algorithm: str = "sac", **c
     return Setting(
         algorithm=algorithm, n_timesteps=n_timesteps, n_envs=n_envs, hyperparameters={**OFF_POLICY, **changes}
     )
+
+
+def step(setting: Setting, **changes: Any) -> Setting:
+    """The same, with an action in every control step."""
+    hyperparameters = {**setting.hyperparameters, "gamma": 0.98, **changes}
+    return replace(setting, env=STEP_ID, hyperparameters=hyperparameters)
 
 
 def ppo(n_timesteps: int = 200_000, n_envs: int = 64, **changes: Any) -> Setting:
@@ -77,6 +84,7 @@ SETTINGS: dict[str, Setting] = {
     "td3": sac(algorithm="td3", action_noise=NOISE),
     "td3-set": sac(algorithm="td3", action_noise=NOISE, **network(256, 256)),
     "tqc-set": sac(algorithm="tqc", **network(256, 256)),
+    "step-sac-set": step(sac(100_000, **network(256, 256), gradient_steps=8, learning_starts=4096)),
     "ppo": ppo(),
     "ppo-set": ppo(**network(256, 256)),
 }
@@ -85,13 +93,12 @@ SETTINGS: dict[str, Setting] = {
 
 def attempt(setting: Setting, seed: int = 0) -> dict[str, Any]:
     """Train and measure once."""
-    env = ViaVecEnv(ENV_ID, setting.n_envs)
-    policy = "MultiInputPolicy"
-    model = build(setting.algorithm, policy, env, setting.hyperparameters, seed=seed)
+    env = ViaVecEnv(setting.env, setting.n_envs)
+    model = build(setting.algorithm, "MultiInputPolicy", env, setting.hyperparameters, seed=seed)
     began, used = time.perf_counter(), time.process_time()
     model.learn(setting.n_timesteps)
     seconds, used = time.perf_counter() - began, time.process_time() - used
-    agent = AgentMethod("agent", model)
+    agent = agent_method("agent", model)
     summary = evaluate([agent], load("validation", ENV_ID), ENV_ID, time_decisions=False).results[0].summary()
     bands = {name: round(100.0 * band["rate"], 1) for name, band in summary["success_by_band"].items()}
     env.close()

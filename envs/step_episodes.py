@@ -17,6 +17,7 @@ from viapoint.envs.outcome import (
     LIMIT_TOLERANCE,
     REST_SPEED,
     Outcome,
+    blank,
     least_clearance,
     norm,
 )
@@ -82,8 +83,11 @@ class StepEpisodes:
         numbers |= {name: np.zeros(n, dtype=np.int64) for name in ("steps", "still", "first_contact")}
         numbers |= {name: np.zeros(n, dtype=bool) for name in ("within", "reachable", "unstable")}
         self.running = Running(**{**numbers, "joints": np.zeros((n, j)), "hand": np.zeros((n, d))})
-        self._history = {"joints": np.zeros((n, most, j)), "planned": np.zeros((n, most, d))}
-        self._contact = np.zeros((n, most), dtype=bool)
+        self._past: dict[str, NDArray[Any]] = {
+            "joints": np.zeros((n, most, j)),
+            "planned": np.zeros((n, most, d)),
+            "contact": np.zeros((n, most), dtype=bool),
+        }
 
     def begin(self, rows: NDArray[np.int64], scenes: Scenes, joints: Float) -> None:
         """Start episodes at rest.
@@ -119,9 +123,8 @@ class StepEpisodes:
         hand = np.asarray(self.arm.hand(record.joints))
         moved = norm(np.diff(hand, axis=1, prepend=now.hand[rows, None]))
         planned = motion.position[:, 1:]
-        for name, part in (("joints", record.joints), ("planned", planned)):
-            self._history[name][rows[:, None], now.steps[rows, None] + np.arange(number)] = part
-        self._contact[rows[:, None], now.steps[rows, None] + np.arange(number)] = record.contact
+        for name, part in (("joints", record.joints), ("planned", planned), ("contact", record.contact)):
+            self._past[name][rows[:, None], now.steps[rows, None] + np.arange(number)] = part
         touched = record.contact.any(axis=-1) & (now.first_contact[rows] < 0)
         now.first_contact[rows[touched]] = (now.steps[rows] + record.contact.argmax(axis=-1))[touched]
         at_goal = (moved < REST_SPEED * timestep) & (norm(hand - scenes.goal[:, None]) < GOAL_TOLERANCE)
@@ -154,7 +157,7 @@ class StepEpisodes:
         steps = np.maximum(now.steps, 1)
         duration = self.timestep * np.where(success, np.maximum(now.steps - now.still, 1), steps)
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
-        return Outcome(
+        return blank(len(steps))._replace(
             is_success=success,
             collision=collision,
             first_contact_time=np.where(collision, now.first_contact * self.timestep, -1.0),
@@ -173,23 +176,23 @@ class StepEpisodes:
 
     def rollout(self, row: int, scene: Scenes) -> Rollout:
         """The movement of one episode so far, physics step by physics step, in its scene."""
-        number = max(int(self.running.steps[row]), 1)
-        joints, planned = (self._history[name][row, :number].copy() for name in ("joints", "planned"))
-        if not self.running.steps[row]:
-            joints[:], planned[:] = self.running.joints[row], self.running.hand[row]
+        steps = int(self.running.steps[row])
+        number = max(steps, 1)
+        joints, planned, contact = (part[row, :number].copy() for part in self._past.values())
+        if not steps:  # at rest at the start
+            joints[:], planned[:], contact[:] = self.running.joints[row], self.running.hand[row], False
         hand = np.asarray(self.arm.hand(joints))
         each = Scenes(*(np.repeat(field, number, axis=0) for field in scene))
         clearance = least_clearance(
             self.arm, hand[:, None], each, whole_arm=self.whole_arm, joints=joints[:, None]
         )
-        contact = self._contact[row, :number] & (self.running.steps[row] > 0)
         time = np.asarray(self.timestep * np.arange(1, number + 1))
         return Rollout(time, planned, joints, hand, contact, clearance)
 
     def state(self) -> dict[str, Any]:
         """All of it, in fresh arrays."""
-        parts = {**self.motion._asdict(), **self.running._asdict(), **self._history, "contact": self._contact}
-        parts["history_joints"], parts["joints"] = self._history["joints"], self.running.joints
+        past = {f"past_{name}": part for name, part in self._past.items()}
+        parts = {**self.motion._asdict(), **self.running._asdict(), **past}
         return {name: part.copy() for name, part in parts.items()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -197,9 +200,8 @@ class StepEpisodes:
         for record in (self.motion, self.running):
             for name, mine in record._asdict().items():
                 mine[:] = state[name]
-        self._history["joints"][:] = state["history_joints"]
-        self._history["planned"][:] = state["planned"]
-        self._contact[:] = state["contact"]
+        for name, mine in self._past.items():
+            mine[:] = state[f"past_{name}"]
 
 
 def step_rewards(

@@ -47,9 +47,17 @@ def test_the_task_of_a_step_wise_id_is_its_twin():
     Trial(*whole_task(STEP, given)[:1], 2, **whole_task(STEP, given)[1]).close()
 
 
-def test_what_a_method_carries_out_is_what_the_single_environment_does(model):
-    frozen, method = load("validation", WHOLE).take(slice(0, 6)), agent_method("agent", model)
-    assert isinstance(method, StepAgentMethod)
+class Forwards:
+    """Steers straight ahead, faster for some goals than for others, so that episodes end at different times."""
+
+    def predict(self, observation, deterministic):
+        speed = 0.3 + 0.3 * (1.0 + np.sin(50.0 * observation["goal"][..., :1]))
+        return np.concatenate((speed, 0.1 * speed), axis=-1), None
+
+
+def test_what_a_method_carries_out_is_what_the_single_environment_does():
+    frozen, model = load("validation", WHOLE).take(slice(0, 6)), Forwards()
+    method = StepAgentMethod("forwards", model, STEP, {})
     trial = Trial(WHOLE, 6)
     together = method.carry_out(frozen.scenes, method.decide(trial.observe(frozen.scenes), frozen.scenes))
     env = gym.make(STEP)
@@ -65,9 +73,11 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does(model):
             assert together.info[name][i] == info[name]
         for name in ("goal_error", "path_length", "duration", "min_clearance"):
             assert together.info[name][i] == pytest.approx(info[name], abs=1e-4), name
+    assert len(np.unique(together.info["duration"])) > 1
 
 
 def test_it_stands_in_one_table_with_the_others(model):
+    assert isinstance(agent_method("agent", model), StepAgentMethod)
     frozen = load("validation", WHOLE).take(slice(0, 12))
     methods = [agent_method("agent", model), Straight(Trial(WHOLE, 4))]
     result = evaluate(methods, frozen, WHOLE, batch=5, time_decisions=False)
