@@ -17,8 +17,10 @@ Float = NDArray[np.float64]
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
-LOOK_EVERY = 4
-"""Clearance and reach of the plan are looked at every fourth physics step, which is every few millimetres."""
+LOOK_EVERY = 0.008
+"""Clearance and reach of the plan are looked at that often, which is every few millimetres, [s]."""
+PACED = 32
+"""At how many evenly spaced times a movement is looked at for the arm's limits."""
 GROUP = 64
 """Movements carried out together: few enough for the cache, many enough for the threads."""
 
@@ -74,6 +76,8 @@ class Executor:
 
     def __call__(self, plan: Plan, scenes: Scenes) -> Outcome:
         """Carry out one plan in each simulation, which must have been placed at its start."""
+        stretch = self._stretch(plan)
+        plan = Plan(plan.waypoints, plan.durations * stretch[:, None])
         duration = np.asarray(plan.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         order = np.argsort(steps, kind="stable")
@@ -92,7 +96,7 @@ class Executor:
                 mine[group.sims] = theirs
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
         jerk_ratio = np.maximum(together.jerk_cost / straight, 1.0)
-        return together._replace(duration=duration, jerk_ratio=jerk_ratio)
+        return together._replace(duration=duration, jerk_ratio=jerk_ratio, stretch=stretch)
 
     def final_joints(self, scenes: Scenes) -> Float:
         """Where the arms ended, shape (N, J), [rad]."""
@@ -122,6 +126,19 @@ class Executor:
         time = np.arange(1, steps + 1) * float(self.simulator.timestep)
         return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
 
+    def _stretch(self, plan: Plan) -> Float:
+        """How much slower each movement is made for the arm's limits, shape (N,); 1 where it leaves the reach."""
+        if not self.arm.velocity_limit:
+            return np.ones(len(plan.durations))
+        factors = []
+        for first in range(0, len(plan.durations), GROUP):
+            some = plan.take(slice(first, first + GROUP))
+            times = some.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, PACED)
+            position, velocity, acceleration = some.trajectory().sample(times)
+            reachable = (self.arm.reach_margin(position) >= 0.0).all(axis=-1)
+            factors.append(np.where(reachable, self.arm.pace(position, velocity, acceleration), 1.0))
+        return np.concatenate(factors)
+
     def _refer(
         self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]
     ) -> References:
@@ -130,7 +147,7 @@ class Executor:
         trajectory = plan.take(rows).trajectory()
         time = self.simulator.timestep * np.arange(steps[rows].max() + 1)
         position, velocity, acceleration = trajectory.sample(time)
-        seen = position[:, ::LOOK_EVERY]
+        seen = position[:, :: round(LOOK_EVERY / self.simulator.timestep)]
         return References(
             sims=sims,
             rows=rows,

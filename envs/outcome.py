@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.approach import nearest_approach
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import FAR, arm_clearance, hand_clearance
 from viapoint.envs.scenes import Scenes
@@ -39,7 +40,7 @@ class Outcome(NamedTuple):
     goal_error: Float
     """[m], after the settling time."""
     duration: Float
-    """[s], planned."""
+    """[s], planned, and stretched where the arm's limits ask for it."""
     path_length: Float
     """[m], of the hand."""
     jerk_cost: Float
@@ -54,6 +55,8 @@ class Outcome(NamedTuple):
     """Whether the whole plan is within the arm's reach; if not, the arm does not start."""
     unstable: Bool
     """Whether the physics broke down."""
+    stretch: Float
+    """By which factor the movement was slowed down for the arm's limits; 1 where it was not."""
 
 
 def measure(
@@ -82,7 +85,7 @@ def measure(
     joints, contact = record.joints, record.contact
     if after.any():
         joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
-    hand = np.asarray(arm.hand(joints))
+    hand, links = _places(record, joints, after, last, arm)
     moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
     deviation = np.where(after, 0.0, ((hand - planned) ** 2).sum(axis=-1))
     low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
@@ -95,7 +98,7 @@ def measure(
         is_success=arrived & ~collision & ~record.unstable & within.all(axis=-1),
         collision=collision,
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
-        min_clearance=least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints),
+        min_clearance=least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints, links=links),
         goal_error=goal_error,
         path_length=_sum_in_order(moved),
         peak_speed=moved.max(axis=-1) / timestep,
@@ -103,6 +106,24 @@ def measure(
         reachable=np.ones(len(steps), dtype=bool),
         unstable=record.unstable,
     )
+
+
+def _places(
+    record: Record, joints: Float, after: Bool, last: tuple[Any, Any], arm: Arm
+) -> tuple[Float, Float | None]:
+    """Where hand and links were after each step: computed, or as the physics has recorded them.
+
+    It records them before each step, so those after the last are computed for every movement.
+    """
+    if record.traced is None:
+        return np.asarray(arm.hand(joints)), None
+    places = np.concatenate((record.traced[:, 1:], record.traced[:, -1:]), axis=1)
+    final = joints[last]
+    ends = np.asarray(arm.links(final)).reshape(len(final), -1, 3)
+    places[last] = np.concatenate((np.asarray(arm.hand(final))[:, None], ends), axis=1)
+    if after.any():
+        places = np.where(after[..., None, None], places[last][:, None], places)
+    return places[:, :, 0], places[:, :, 1:].reshape(*places.shape[:2], -1, 2, 3)
 
 
 def refused(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
@@ -118,11 +139,17 @@ def blank(number: int) -> Outcome:
     fields: dict[str, Any] = {name: np.zeros(number) for name in Outcome._fields}
     for name in ("is_success", "collision", "reachable", "unstable"):
         fields[name] = np.zeros(number, dtype=bool)
-    return Outcome(**{**fields, "first_contact_time": np.full(number, -1.0)})
+    return Outcome(**{**fields, "first_contact_time": np.full(number, -1.0), "stretch": np.ones(number)})
 
 
 def least_clearance(
-    arm: Arm, hand: Float, scenes: Scenes, *, whole_arm: bool, joints: Float | None = None
+    arm: Arm,
+    hand: Float,
+    scenes: Scenes,
+    *,
+    whole_arm: bool,
+    joints: Float | None = None,
+    links: Float | None = None,
 ) -> Float:
     """Least clearance over time and obstacles, shape (N,), [m].
 
@@ -132,13 +159,17 @@ def least_clearance(
         scenes: N of them.
         whole_arm: Whether the links count.
         joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
+        links: End points of the links' axes, shape (N, T, L, 2, D), [m]; by default those of the joints.
     """
     if not scenes.obstacles.shape[1]:
         return np.full(len(hand), FAR)
     present = scenes.present
+    if whole_arm and links is None:
+        links = arm.links(arm.posture(hand) if joints is None else joints)
+    if whole_arm and arm.traced:
+        return nearest_approach(np.asarray(links), arm.link_radii, scenes.obstacles, present)
     each = hand_clearance(hand, arm.hand_radius, scenes.obstacles, present)
     if whole_arm:
-        links = arm.links(arm.posture(hand) if joints is None else joints)
         each = np.minimum(each, arm_clearance(links, arm.link_radii, scenes.obstacles, present))
     return np.asarray(each.min(axis=-1))
 

@@ -23,18 +23,16 @@ from viapoint.envs.arguments import (
     seeds_of,
     whole_number,
 )
-from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.arms import ADULT, Arm, arm_of
 from viapoint.envs.beside import Beside
 from viapoint.envs.execution import Executor, Rollout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
 from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
-from viapoint.envs.scene_distribution import SceneDistribution
 from viapoint.envs.scene_options import draw_given
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Simulator
-from viapoint.envs.task import Task
+from viapoint.envs.task import Task, distribution_of
 
 Float = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -64,7 +62,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     Args:
         num_envs: Number of environments N.
-        arm: The arm that moves.
+        arm: The arm that moves, a record or the name of one.
         whole_arm: Whether the links must clear the obstacles, too, or the hand alone.
         n_via: Number of via-points of an action.
         n_obstacles: An exact number, or the fewest and the most.
@@ -83,7 +81,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self,
         num_envs: int = 1,
         *,
-        arm: Arm = ADULT,
+        arm: Arm | str = ADULT,
         whole_arm: bool = False,
         n_via: int = 1,
         n_obstacles: int | tuple[int, int] = (1, 5),
@@ -102,8 +100,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             duration_range=duration_range, reward_weights=reward_weights, render_mode=render_mode,
             width=width, height=height, threads=threads,
         )  # fmt: skip
-        if not hasattr(arm, "reach_margin"):
-            raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
+        arm = arm_of(arm)
         if not isinstance(whole_arm, bool | np.bool_):
             raise TypeError(f"whole_arm must be True or False, got {whole_arm!r}")
         self.num_envs = whole_number("num_envs", num_envs, 1)
@@ -115,7 +112,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=duration_range
             ),
             weights=RewardWeights.of(reward_weights),
-            scenes=SceneDistribution(n_obstacles=fewest_and_most(n_obstacles)),
+            scenes=distribution_of(arm)(n_obstacles=fewest_and_most(n_obstacles)),
         )
         """What an agent may compute with before it has moved."""
         self.arm, self.action_layout, self.observation_layout = arm, self.task.action, self.task.observation

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.scene_sampling import SceneSampler
+from viapoint.envs.sampler import Sampler
 from viapoint.envs.scenes import Scenes, check_scenes, problems
 
 Float = NDArray[np.float64]
@@ -21,7 +21,7 @@ ATTEMPTS = 50
 
 
 def draw_given(
-    options: Mapping[str, Any], sampler: SceneSampler, generators: Sequence[np.random.Generator], n_rows: int
+    options: Mapping[str, Any], sampler: Sampler, generators: Sequence[np.random.Generator], n_rows: int
 ) -> Scenes:
     """N scenes with what `options` gives, and the rest drawn to fit.
 
@@ -64,7 +64,7 @@ def draw_given(
 
 def _drawn(
     options: Mapping[str, Any],
-    sampler: SceneSampler,
+    sampler: Sampler,
     generators: Sequence[np.random.Generator],
     given: Scenes,
 ) -> Scenes:

@@ -26,6 +26,8 @@ class Record(NamedTuple):
     """Whether arm and obstacle touched at the state before each step, shape (n, T)."""
     unstable: NDArray[np.bool_]
     """Whether MuJoCo raised a warning, shape (n,); such a simulation stopped there."""
+    traced: Float | None
+    """Positions of the arm's traced sites before each step, shape (n, T, P, 3), [m]; None where there are none."""
 
 
 class Simulator:
@@ -40,6 +42,9 @@ class Simulator:
         self.batch = batch.Batch(self.model, num_envs, threads)
         """MuJoCo's engine, whose state rows are the simulations'."""
         self._rest_state = self.batch.state[0].copy()
+        self.recorded = ("qpos", "ncon", "site_xpos") if arm.traced else ("qpos", "ncon")
+        """What the engine records at every step."""
+        self._traced = [self.model.site(name).id for name in arm.traced]
         self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
         if n_obstacles:
             self._sizes = self.batch.expand("geom_size")
@@ -84,9 +89,11 @@ class Simulator:
         """
         steps = controls.shape[1]
         warnings = self._warnings(sims)
-        out = self.batch.rollout(steps, controls, record=("qpos", "ncon"), ids=sims)
+        out = self.batch.rollout(steps, controls, record=self.recorded, ids=sims)
         self.physics_steps += steps * len(sims)
-        return Record(out["qpos"], out["ncon"] > 0, (self._warnings(sims) > warnings) | ~_finite(out["qpos"]))
+        unstable = (self._warnings(sims) > warnings) | ~_finite(out["qpos"])
+        traced = out["site_xpos"][:, :, self._traced] if self.arm.traced else None
+        return Record(out["qpos"], out["ncon"] > 0, unstable, traced)
 
     def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of one simulation with the arm at `joints`, to draw them."""

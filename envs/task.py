@@ -11,8 +11,13 @@ from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.reward import RewardWeights
+from viapoint.envs.sampler import Sampler
 from viapoint.envs.scene_distribution import SceneDistribution
 from viapoint.envs.scene_sampling import SceneSampler
+from viapoint.envs.space_distribution import SpaceDistribution
+from viapoint.envs.space_sampling import SpaceSampler
+
+AnyDistribution = SceneDistribution | SpaceDistribution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,15 +28,17 @@ class Task:
     whole_arm: bool
     action: ActionLayout
     weights: RewardWeights
-    scenes: SceneDistribution
+    scenes: AnyDistribution
 
     @property
     def observation(self) -> ObservationLayout:
         """The layout of the observation."""
         return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
 
-    def sampler(self) -> SceneSampler:
+    def sampler(self) -> Sampler:
         """Draws scenes of the task."""
+        if isinstance(self.scenes, SpaceDistribution):
+            return SpaceSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
         return SceneSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
 
     def as_dict(self) -> dict[str, Any]:
@@ -46,15 +53,21 @@ class Task:
         Raises:
             ValueError: The arm is not among them, or a value is not allowed.
         """
-        if record["arm"] not in arms:
+        arm = arms.get(record["arm"])
+        if arm is None:
             raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}")
         return cls(
-            arm=arms[record["arm"]],
+            arm=arm,
             whole_arm=bool(record["whole_arm"]),
             action=ActionLayout(**_tuples(record["action"])),
             weights=RewardWeights(**record["weights"]),
-            scenes=SceneDistribution(**_tuples(record["scenes"])),
+            scenes=distribution_of(arm)(**_tuples(record["scenes"])),
         )
+
+
+def distribution_of(arm: Arm) -> type[SceneDistribution] | type[SpaceDistribution]:
+    """What describes the scenes of an arm: of the plane, or of space."""
+    return SceneDistribution if arm.dimension == 2 else SpaceDistribution
 
 
 def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -37,8 +37,19 @@ class Arm(Protocol):
         """Lowest and highest angle of each of the J joints, [rad]."""
 
     @property
+    def velocity_limit(self) -> tuple[float, ...]:
+        """Of the joints, [rad/s]; empty where there is none."""
+
+    @property
     def workspace(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Two opposite corners of the box in which movements start and end, [m]."""
+
+    @property
+    def traced(self) -> tuple[str, ...]:
+        """Sites of the model that the physics records: the hand, then both ends of each link; none where that is slow.
+
+        Where there are none, positions are computed from the joints.
+        """
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
         """The MuJoCo model of the arm with `n_obstacles` movable capsules.
@@ -58,5 +69,14 @@ class Arm(Protocol):
     def reach_margin(self, hand: Array) -> Array:
         """How far inside its reach the hand is, shape (...,), [m]; negative where no posture gets there."""
 
+    def pace(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """By which factor a movement must be slowed down for the arm's limits, shape (...,); 1 where it need not.
+
+        The movement is given at some times, shape (..., T, D) each; they need not be evenly spaced.
+        """
+
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Actuator controls, shape (..., U), that make the hand follow references of shape (..., D) each."""
+        """Actuator controls, shape (..., T, U), that make the hand follow references, shape (..., T, D) each.
+
+        The references are those of T consecutive physics steps.
+        """

@@ -9,9 +9,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from array_api_compat import array_namespace
 
-from viapoint.envs._arrays import Array, clamp
+from viapoint.envs._arrays import Array, clamp, namespace_of
+from viapoint.envs.arms.obstacles import add_obstacles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +43,8 @@ class PlanarArm:
     bandwidth: float = 40.0
     """Natural frequency of the joints' servo, critically damped, [rad/s]."""
     dimension: int = 2
+    traced: tuple[str, ...] = ()
+    velocity_limit: tuple[float, ...] = ()
 
     @classmethod
     def from_file(cls, model_file: str) -> PlanarArm:
@@ -101,13 +103,12 @@ class PlanarArm:
             actuator.biasprm[1:3] = -stiffness, -damping
         for geom in (spec.geom("upper_arm"), spec.geom("forearm")):
             geom.contype = int(whole_arm)
-        for row in range(n_obstacles):
-            _add_obstacle(spec, row)
+        add_obstacles(spec, n_obstacles)
         return spec.compile()
 
     def hand(self, joints: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.hand`."""
-        xp = array_namespace(joints)
+        xp = namespace_of(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
         return xp.stack(
@@ -116,7 +117,7 @@ class PlanarArm:
 
     def links(self, joints: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
-        xp = array_namespace(joints)
+        xp = namespace_of(joints)
         upper = joints[..., 0]
         elbow = self.lengths[0] * xp.stack((xp.cos(upper), xp.sin(upper)), axis=-1)
         shoulder = xp.zeros_like(elbow)
@@ -132,7 +133,7 @@ class PlanarArm:
 
         The least of the distances to the inner and outer circle of the reach and, as arcs, to the shoulder's limits.
         """
-        xp = array_namespace(hand)
+        xp = namespace_of(hand)
         distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
         near, far = self.reach
         low, high = self.joint_range[0]
@@ -140,13 +141,21 @@ class PlanarArm:
         arc = xp.minimum(shoulder - low, high - shoulder) * distance
         return xp.minimum(xp.minimum(distance - near, far - distance), arc)
 
+    def pace(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.arm.Arm.pace`: 1, as people's joints have no limits of speed.
+
+        Those of torque act in the physics; random movements reach them twice in ten thousand.
+        """
+        xp = namespace_of(position)
+        return xp.ones_like(position[..., 0, 0])
+
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Computed torque: see :meth:`viapoint.envs.arms.arm.Arm.controls`.
 
         The actuator's torque is control - stiffness x angle - damping x velocity, limited to `torque_limit`. So the
         control carries the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
         """
-        xp = array_namespace(position)
+        xp = namespace_of(position)
         joints, upper_arm, forearm, sine = self._postures(position)
         rates = self._rates(position, upper_arm, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
@@ -168,7 +177,7 @@ class PlanarArm:
 
     def _postures(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
         """Joint angles, unit vectors along upper arm and forearm, and the sine of the elbow angle."""
-        xp = array_namespace(hand)
+        xp = namespace_of(hand)
         l1, l2 = self.lengths
         low, high = self.joint_range[1]
         x, y = hand[..., 0], hand[..., 1]
@@ -228,20 +237,6 @@ def _lower_into_plane(spec: mujoco.MjSpec) -> None:
     spec.body("upper_arm").pos[2] = 0.0
     for handle in (spec.geom("hand"), spec.site("hand")):
         handle.pos[2] = 0.0
-
-
-def _add_obstacle(spec: mujoco.MjSpec, row: int) -> None:
-    """A capsule of no fixed place, size or direction: the simulator sets them for each simulation."""
-    body = spec.worldbody.add_body(name=f"obstacle_{row}", mocap=True, pos=(0.0, 0.0, -10.0))
-    body.add_geom(
-        name=f"obstacle_{row}",
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=(0.02, 0.02, 0.0),
-        contype=0,
-        conaffinity=1,
-        condim=1,
-        rgba=(0.83, 0.52, 0.30, 1.0),
-    )
 
 
 ADULT = PlanarArm.from_file("planar.xml")

@@ -21,9 +21,24 @@ def postures(arm, number=500, seed=0):
     return np.random.default_rng(seed).uniform(low + 0.05, high - 0.05, (number, len(low)))
 
 
-def test_posture_inverts_hand(arm):
-    joints = postures(arm)
-    np.testing.assert_allclose(arm.posture(arm.hand(joints)), joints, atol=1e-9)
+def places(arm, number=500, seed=0):
+    """Places of the hand all over its reach."""
+    draws = np.random.default_rng(seed).uniform(-0.8, 0.8, (40 * number, arm.dimension))
+    return draws[arm.reach_margin(draws) >= 0.0][:number]
+
+
+def test_posture_puts_the_hand_there_within_the_joints_ranges(arm):
+    hand = places(arm)
+    assert len(hand) == 500
+    joints = arm.posture(hand)
+    np.testing.assert_allclose(arm.hand(joints), hand, atol=2e-5)
+    low, high = np.array(arm.joint_range).T
+    assert ((joints >= low) & (joints <= high)).all()
+
+
+def test_posture_inverts_hand_where_there_is_one_only():
+    joints = postures(ADULT)
+    np.testing.assert_allclose(ADULT.posture(ADULT.hand(joints)), joints, atol=1e-9)
 
 
 def test_kinematics_agree_with_mujoco(arm):
@@ -34,9 +49,14 @@ def test_kinematics_agree_with_mujoco(arm):
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(data.site("hand").xpos[: arm.dimension], arm.hand(joints), atol=1e-12)
         np.testing.assert_allclose(arm.links(joints)[-1, 1], arm.hand(joints), atol=1e-12)
+        traced = np.array([data.site(name).xpos for name in arm.traced])
+        if len(traced):
+            np.testing.assert_allclose(traced[0], arm.hand(joints), atol=1e-12)
+            np.testing.assert_allclose(traced[1:], arm.links(joints).reshape(-1, 3), atol=1e-12)
 
 
-def test_links_hang_together_and_have_their_lengths(arm):
+def test_links_hang_together_and_have_their_lengths():
+    arm = ADULT
     links = arm.links(postures(arm))
     np.testing.assert_allclose(links[:, 1:, 0], links[:, :-1, 1], atol=1e-12)
     np.testing.assert_allclose(
@@ -103,14 +123,17 @@ def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
 
 
 def test_torch_and_numpy_give_the_same(arm):
-    hand = arm.hand(postures(arm, 50))
+    hand = places(arm, 50)
     for function in (
         arm.posture,
         arm.reach_margin,
         lambda h: arm.links(arm.posture(h)),
         lambda h: arm.controls(h, h, h),
+        lambda h: arm.pace(h, h, h),
     ):
-        np.testing.assert_allclose(function(torch.as_tensor(hand)).numpy(), function(hand), atol=1e-9)
+        np.testing.assert_allclose(
+            function(torch.as_tensor(hand)).numpy(), function(hand), rtol=1e-9, atol=1e-9
+        )
 
 
 def test_the_targets_are_in_reach_and_the_diagonals_cross_in_the_middle():

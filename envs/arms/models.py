@@ -1,0 +1,107 @@
+"""MJCF files of arms: reading them, and what is written in them about a chain of hinges."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.chain import Chain, Constants, Hinge
+
+Float = NDArray[np.float64]
+
+DIGITS = 12
+"""To which constants are rounded, so that what should be zero is and costs nothing."""
+
+
+def read_spec(model_file: str) -> mujoco.MjSpec:
+    """An MJCF file: one of the package's `assets` by its name, or any other by its path."""
+    own = files("viapoint.envs") / "assets" / model_file
+    if Path(model_file).name == model_file and own.is_file():
+        return mujoco.MjSpec.from_string(own.read_text(encoding="utf-8"))
+    return mujoco.MjSpec.from_file(model_file)
+
+
+def at_zero(model: mujoco.MjModel) -> mujoco.MjData:
+    """The model's places with all joints at 0."""
+    data = mujoco.MjData(model)
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            data.qpos[model.jnt_qposadr[joint]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def joint_frames(model: mujoco.MjModel, names: tuple[str, ...]) -> list[tuple[Float, Float]]:
+    """Axes, as columns of a matrix whose last is the joint's, and origin of each joint's frame at angle 0."""
+    data, frames = at_zero(model), []
+    for name in names:
+        joint = model.joint(name).id
+        turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
+        frames.append((_with_last_axis(turn, data.xaxis[joint]), data.xanchor[joint].copy()))
+    return frames
+
+
+def chain_of(model: mujoco.MjModel, names: tuple[str, ...]) -> Chain:
+    """The chain of the hinges `names`, in order from the base; everything else moves with the hinge before it."""
+    data, frames, hinges = at_zero(model), joint_frames(model, names), []
+    before: tuple[Float, Float] = np.eye(3), np.zeros(3)
+    for name, (turn, origin) in zip(names, frames, strict=True):
+        moved = moving_with(model, name)
+        mass = float(model.body_mass[moved].sum())
+        centre = (model.body_mass[moved, None] * data.xipos[moved]).sum(axis=0) / mass
+        relative = before[0].T @ turn
+        hinges.append(
+            Hinge(
+                turn=(_constants(relative[:, 0]), _constants(relative[:, 1]), _constants(relative[:, 2])),
+                offset=_constants(before[0].T @ (origin - before[1])),
+                mass=mass,
+                centre=_constants(turn.T @ (centre - origin)),
+                inertia=_rows(turn.T @ _inertia(model, data, moved, centre) @ turn),
+            )
+        )
+        before = turn, origin
+    return Chain(hinges=tuple(hinges))
+
+
+def moving_with(model: mujoco.MjModel, name: str) -> list[int]:
+    """The bodies that move with a joint and no later one."""
+    body = model.jnt_bodyid[model.joint(name).id]
+    return [other for other in range(model.nbody) if model.body_weldid[other] == body]
+
+
+def in_frame(frame: tuple[Float, Float], point: Any) -> Constants:
+    """A point of the world in a joint's frame."""
+    return _constants(frame[0].T @ (np.asarray(point) - frame[1]))
+
+
+def _inertia(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], centre: Float) -> Float:
+    """Of bodies together about a point, in the world's axes."""
+    total = np.zeros((3, 3))
+    for body in bodies:
+        axes, away = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
+        total += axes @ np.diag(model.body_inertia[body]) @ axes.T
+        total += model.body_mass[body] * (away @ away * np.eye(3) - np.outer(away, away))
+    return total
+
+
+def _with_last_axis(turn: Float, axis: Float) -> Float:
+    """The axes of a body, in another order or turned a little, so that the last is `axis`."""
+    nearest = int(np.abs(axis @ turn).argmax())
+    first = turn[:, (nearest + 1) % 3]
+    first = first - axis * (axis @ first)
+    first = first / np.linalg.norm(first)
+    return np.stack((first, np.cross(axis, first), axis), axis=-1)
+
+
+def _constants(values: Float) -> Constants:
+    x, y, z = (float(value) + 0.0 for value in np.round(values, DIGITS))
+    return x, y, z
+
+
+def _rows(matrix: Float) -> tuple[Constants, Constants, Constants]:
+    return _constants(matrix[0]), _constants(matrix[1]), _constants(matrix[2])

@@ -1,0 +1,78 @@
+"""What scenes in space are like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from viapoint.envs.action import check_increasing_pair
+
+MOST = 8
+"""Obstacles of a scene at most."""
+
+FAMILIES: dict[str, int] = {"clutter": 1, "shelf": 3, "gate": 3, "pillar": 1}
+"""What may stand in the way, and the fewest obstacles that it takes.
+
+`clutter` is a sphere, a post or a bar near the straight line, `shelf` a board of three bars side by side, `gate` two
+posts with a sill between them, `pillar` a thick post on the table. Other spheres, posts and bars stand about each.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpaceDistribution:
+    """What scenes of an arm that moves in space are like."""
+
+    n_obstacles: tuple[int, int] = (1, 6)
+    """Fewest and most obstacles; where a family takes more than the fewest, it gets them."""
+    families: tuple[str, ...] = tuple(FAMILIES)
+    """Drawn with equal chances; those that take more than the most obstacles are left out."""
+    distance: tuple[float, float] = (0.30, 0.50)
+    """From start to goal, [m]."""
+    sphere_radius: tuple[float, float] = (0.02, 0.05)
+    """[m]."""
+    post_radius: tuple[float, float] = (0.012, 0.03)
+    """[m]."""
+    pillar_radius: tuple[float, float] = (0.025, 0.05)
+    """[m]."""
+    bar_radius: tuple[float, float] = (0.008, 0.015)
+    """[m]."""
+    bar_half_length: tuple[float, float] = (0.06, 0.18)
+    """[m]."""
+    board_half_length: tuple[float, float] = (0.08, 0.16)
+    """Of a shelf's bars, [m]."""
+    board_spacing: float = 0.05
+    """Between a shelf's bars, [m]: nothing of the arm fits in between."""
+    gate_half_width: tuple[float, float] = (0.16, 0.24)
+    """Between the middle of a gate and each post, [m]; the gripper is 0.21 m wide."""
+    spread: float = 0.22
+    """Greatest distance of other obstacles from the straight line, [m]."""
+    ease: float = 0.5
+    """Hardness is a uniform number to this power: less is harder."""
+    link_margin: float = 0.012
+    """Least clearance of the movement that is kept clear, its links included, at the times that are looked at, [m]."""
+    end_margin: float = 0.02
+    """Least clearance of the arm at start and goal, [m]."""
+    reach_margin: float = 0.02
+    """How far inside the arm's reach start, goal and the movement that is kept clear stay, [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be sampled."""
+        fewest, most = self.n_obstacles
+        if not 0 <= fewest <= most <= MOST:
+            raise ValueError(
+                f"n_obstacles must be (fewest, most), 0 <= fewest <= most <= {MOST}, got {self.n_obstacles}"
+            )
+        unknown = sorted(set(self.families) - set(FAMILIES))
+        if unknown or not self.families:
+            raise ValueError(f"families must be some of {', '.join(FAMILIES)}, got {self.families!r}")
+        if most and not self.possible:
+            raise ValueError(f"families {self.families!r} take more than {most} obstacles")
+        for name in (
+            "distance", "sphere_radius", "post_radius", "pillar_radius", "bar_radius", "bar_half_length",
+            "board_half_length", "gate_half_width",
+        ):  # fmt: skip
+            check_increasing_pair(name, getattr(self, name))
+
+    @property
+    def possible(self) -> tuple[str, ...]:
+        """The families that take no more than the most obstacles."""
+        return tuple(name for name in self.families if FAMILIES[name] <= self.n_obstacles[1])

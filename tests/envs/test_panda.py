@@ -1,0 +1,206 @@
+"""Laws of the arm with seven joints."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from viapoint.envs.action import ActionLayout
+from viapoint.envs.approach import nearest_approach
+from viapoint.envs.arms import PANDA
+from viapoint.envs.clearance import FAR, arm_clearance
+from viapoint.envs.reach import ReachVectorEnv
+from viapoint.envs.simulator import Simulator
+
+LAYOUT = ActionLayout(dimension=3, duration_range=(1.0, 2.0))
+
+
+def movements(number=150, seed=0, duration=0.0):
+    """Movements within reach through random via-points; `duration` is the component of the action."""
+    rng = np.random.default_rng(seed)
+    low, high = np.array(PANDA.workspace)
+    start, goal = rng.uniform(low, high, (2, 8 * number, 3))
+    action = rng.uniform(-1.0, 1.0, (8 * number, 4))
+    action[:, 3] = duration
+    apart = np.linalg.norm(goal - start, axis=-1)
+    plan = LAYOUT.decode(action, start, goal)
+    path = plan.trajectory()(plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, 200))
+    good = (apart > 0.3) & (apart < 0.5) & (PANDA.reach_margin(path) >= 0.0).all(axis=-1)
+    return plan.take(np.flatnonzero(good)[:number])
+
+
+def looked_at(plan, times=200):
+    return plan.trajectory().sample(plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, times))
+
+
+def test_the_file_has_the_published_dimensions():
+    """At zero the arm stands upright, its hand pointing down: sums of the Denavit-Hartenberg table."""
+    assert PANDA.hand(np.zeros(7)) == pytest.approx([0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107 - 0.1034])
+    assert PANDA.hand(np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, 0])) == pytest.approx(
+        [0.0825 + 0.384 + 0.088, 0.0, 0.333 + 0.316 + 0.0825 - 0.107 - 0.1034]
+    )
+    assert PANDA.torque_limit == (87.0,) * 4 + (12.0,) * 3
+    assert PANDA.velocity_limit == (2.175,) * 4 + (2.61,) * 3
+
+
+def test_torques_are_the_inverse_dynamics_of_mujoco():
+    """Motion and weight apart: as gravity is compensated by the actuators, both count towards their limits."""
+    model = PANDA.compile(0, whole_arm=True)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    low, high = np.array(PANDA.joint_range).T
+    for _ in range(20):
+        joints, rates, accelerations = rng.uniform(low, high), rng.uniform(-2, 2, 7), rng.uniform(-9, 9, 7)
+        data.qpos[:], data.qvel[:], data.qacc[:] = joints, rates, accelerations
+        mujoco.mj_inverse(model, data)
+        moving, holding = PANDA.chain.torques(joints, rates, accelerations)
+        np.testing.assert_allclose(moving + holding, data.qfrc_inverse, atol=1e-9)
+        np.testing.assert_allclose(holding, data.qfrc_gravcomp, atol=1e-9)
+
+
+def test_the_hand_points_down_and_keeps_its_heading_and_nothing_touches_itself_or_the_table():
+    model = PANDA.compile(0, whole_arm=True)
+    data, rng = mujoco.MjData(model), np.random.default_rng(2)
+    places = rng.uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (8000, 3))
+    for joints in PANDA.posture(places[PANDA.reach_margin(places) >= 0.0])[:800]:
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        np.testing.assert_allclose(
+            data.site("hand").xmat.reshape(3, 3), np.diag([1.0, -1.0, -1.0]), atol=1e-4
+        )
+        assert data.ncon == 0
+
+
+def test_postures_are_differentiable_and_change_smoothly():
+    plan = movements(40)
+    position, velocity, _ = looked_at(plan)
+    hand = torch.as_tensor(position).requires_grad_()
+    joints = PANDA.posture(hand)
+    jacobian = torch.stack(
+        [torch.autograd.grad(joints[..., k].sum(), hand, retain_graph=True)[0] for k in range(7)]
+    )
+    rates = (jacobian.numpy() * velocity).sum(axis=-1)
+    along = np.moveaxis((PANDA.posture(position + 1e-6 * velocity) - PANDA.posture(position)) / 1e-6, -1, 0)
+    np.testing.assert_allclose(rates, along, atol=1e-3)
+
+
+def test_movements_of_the_centre_duration_are_tracked_and_links_are_where_they_were_foreseen():
+    """Hand within 1 mm rms and 2 mm at worst, links within 5 mm."""
+    plan = movements()
+    position, velocity, acceleration = looked_at(plan)
+    factor = PANDA.pace(position, velocity, acceleration)
+    steps = np.arange(0.0, 1.6 * LAYOUT.centre_duration * factor.max(), 0.004)
+    trajectory = plan._replace(durations=plan.durations * factor[:, None]).trajectory()
+    position, velocity, acceleration = trajectory.sample(steps)
+    number = len(position)
+    simulator = Simulator(PANDA, n_obstacles=0, whole_arm=True, num_envs=number, threads=1)
+    none = np.zeros((number, 0, 7)), np.zeros((number, 0), dtype=bool)
+    simulator.place(np.arange(number), PANDA.posture(position[:, 0]), *none)
+    record = simulator.rollout(
+        np.arange(number), PANDA.controls(*(part[:, :-1] for part in (position, velocity, acceleration)))
+    )
+    error = np.linalg.norm(PANDA.hand(record.joints) - position[:, 1:], axis=-1)
+    assert np.sqrt((error**2).mean(axis=-1)).max() < 1e-3
+    assert error.max() < 2e-3
+    foreseen = PANDA.links(PANDA.posture(position[:, 1:]))
+    assert np.linalg.norm(PANDA.links(record.joints) - foreseen, axis=-1).max() < 5e-3
+    assert not record.contact.any()
+    assert not record.unstable.any()
+
+
+def test_a_movement_too_fast_is_slowed_down_just_enough():
+    plan = movements(60, seed=5)
+    plan = plan._replace(durations=plan.durations * 0.3)
+    position, velocity, acceleration = looked_at(plan)
+    factor = PANDA.pace(position, velocity, acceleration)
+    assert (factor > 1.0).all()
+    slower = plan._replace(durations=plan.durations * factor[:, None])
+    position, velocity, acceleration = looked_at(slower)
+    np.testing.assert_allclose(PANDA.pace(position, velocity, acceleration), 1.0, atol=1e-4)
+    joints, time = PANDA.posture(position), slower.durations.sum(axis=-1)[:, None, None] / 199
+    rates = np.abs(np.diff(joints, axis=1) / time).max(axis=1) / np.array(PANDA.velocity_limit)
+    moving, holding = PANDA.chain.torques(
+        joints[:, 1:-1],
+        (joints[:, 2:] - joints[:, :-2]) / (2 * time),
+        (joints[:, 2:] - 2 * joints[:, 1:-1] + joints[:, :-2]) / time**2,
+    )
+    used = (np.abs(moving) / (np.array(PANDA.torque_limit) - np.abs(holding))).max(axis=1)
+    assert (np.maximum(rates, used).max(axis=-1) <= 1.01).all()
+    assert np.median(np.maximum(rates, np.sqrt(used)).max(axis=-1)) > 0.98
+
+
+def test_torque_limits_act():
+    """A movement of a tenth of the time that the limits ask for is not followed, and no torque exceeds its limit."""
+    plan = movements(1, seed=8)
+    path = plan._replace(durations=plan.durations * 0.06).trajectory()
+    model = PANDA.compile(0, whole_arm=True)
+    data = mujoco.MjData(model)
+    position, velocity, acceleration = path.sample(np.arange(60) * 0.004)
+    data.qpos[:] = PANDA.posture(position[0, 0])
+    greatest = np.zeros(7)
+    for control in PANDA.controls(position, velocity, acceleration)[0]:
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        greatest = np.maximum(greatest, np.abs(data.qfrc_actuator))
+    assert (greatest <= np.array(PANDA.torque_limit) + 1e-9).all()
+    assert (greatest[:4] > 86.9).any()
+
+
+def test_contact_exactly_where_a_link_reaches_into_an_obstacle():
+    number, rng = 2000, np.random.default_rng(4)
+    places = rng.uniform(*np.array(PANDA.workspace), (number, 3))
+    centre = places[:, None] + rng.uniform(-0.25, 0.25, (number, 3, 3))
+    axis = rng.uniform(-0.12, 0.12, (number, 3, 3)) * (rng.random((number, 3, 1)) < 0.6)
+    obstacles = np.concatenate((centre, axis, rng.uniform(0.01, 0.05, (number, 3, 1))), axis=-1)
+    present = rng.random((number, 3)) < 0.6
+    simulator = Simulator(PANDA, n_obstacles=3, whole_arm=True, num_envs=number, threads=1)
+    joints = PANDA.posture(places)
+    simulator.place(np.arange(number), joints, obstacles, present)
+    contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 10))).contact[:, 0]
+    clearance = arm_clearance(PANDA.links(joints)[:, None], PANDA.link_radii, obstacles, present).min(axis=-1)
+    np.testing.assert_array_equal(contact, clearance < 0.0)
+    assert 0.1 < contact.mean() < 0.9
+
+
+def test_the_arm_collides_with_itself_and_with_the_table():
+    model = PANDA.compile(0, whole_arm=True)
+    data = mujoco.MjData(model)
+    for joints, second in (
+        ([0, 0, 0, -3.05, 0, 0.0, 0], {"shoulder", "upper_arm", "base"}),  # folded onto itself
+        ([0, 1.2, 0, -1.2, 0, 2.4, 0], {"table"}),
+    ):
+        data.qpos[:] = joints
+        mujoco.mj_forward(model, data)
+        names = {model.geom(geom).name for contact in data.contact for geom in contact.geom}
+        assert names & second, names
+
+
+def test_the_nearest_approach_is_the_least_of_all_times():
+    rng, plan = np.random.default_rng(6), movements(30)
+    position, *_ = looked_at(plan, 160)
+    links = PANDA.links(PANDA.posture(position))
+    middle = position[:, 80, None] + rng.uniform(-0.3, 0.3, (30, 5, 3))
+    axis = rng.uniform(-0.1, 0.1, (30, 5, 3))
+    obstacles = np.concatenate((middle, axis, rng.uniform(0.01, 0.05, (30, 5, 1))), axis=-1)
+    present = rng.random((30, 5)) < 0.7
+    brute = arm_clearance(links, PANDA.link_radii, obstacles, present).min(axis=-1)
+    found = nearest_approach(links, PANDA.link_radii, obstacles, present)
+    np.testing.assert_allclose(found, brute, atol=1e-9)
+    nothing = nearest_approach(links, PANDA.link_radii, obstacles, np.zeros((30, 5), dtype=bool))
+    np.testing.assert_array_equal(nothing, FAR)
+
+
+def test_info_tells_how_much_slower_a_movement_was_made():
+    env = ReachVectorEnv(16, arm="panda", whole_arm=True, n_obstacles=0, duration_range=(0.3, 2.0), threads=1)
+    env.reset(seed=0)
+    slow, fast = np.zeros((16, 4)), np.zeros((16, 4))
+    slow[:, 3], fast[:, 3] = 1.0, -1.0
+    _, _, info = env.decide(slow)
+    np.testing.assert_array_equal(info["stretch"], 1.0)
+    assert info["is_success"].all()
+    env.reset(seed=0)
+    _, _, info = env.decide(fast)
+    assert (info["stretch"] > 1.0).all()
+    np.testing.assert_allclose(info["duration"], 0.3 * info["stretch"])
+    assert info["is_success"].all()
