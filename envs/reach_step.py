@@ -198,7 +198,9 @@ class StepReachVectorEnv(ReachVectorEnv):
         terms, progress = step_rewards(
             before, after, self.terminated | over, begun, scenes, self.task.action.centre_duration, self._weights
         )  # fmt: skip
-        if self.render_mode == "human":
+        if (
+            self.render_mode == "human" and (self.terminated | over)[0]
+        ):  # a movement is played when it is over
             self.render()
         info = {**after._asdict(), **terms.as_info(), "reward_progress": progress}
         return Decision(self._observe_start(), terms.total() + progress, info)

@@ -9,6 +9,7 @@ import pytest
 from viapoint.envs.execution import SETTLING
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import STEP_TASKS, twin_of
+from viapoint.envs.rendering import GLUnavailableError
 from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
 from viapoint.envs.steering import Motion, Steering
 from viapoint.envs.step_episodes import StepRewardWeights
@@ -199,6 +200,19 @@ def test_the_rollout_is_the_movement_so_far():
     assert np.abs(rollout.hand - rollout.planned).max() < 2e-3
     np.testing.assert_allclose(rollout.hand[-1], GOAL, atol=0.01)
     assert len(rollout.time) % env.steering.physics_steps == 0
+
+
+def test_pictures_show_the_movement_so_far():
+    env, _ = make(render_mode="rgb_array_list", width=64, height=64)
+    try:
+        frames = [len(env.render())]
+    except GLUnavailableError as error:
+        pytest.skip(f"no picture can be rendered here: {error}")
+    for _ in range(3):
+        env.step(np.array([0.5, 0.0], dtype=np.float32))
+        frames.append(len(env.render()))
+    assert frames == [1, 3, 5, 7]  # 50 frames/s, the start included
+    env.close()
 
 
 def test_weights_are_checked():
