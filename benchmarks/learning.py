@@ -13,6 +13,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
+import contextlib
 import multiprocessing
 import signal
 import sys
@@ -102,7 +103,8 @@ def _work(job: work.Job, place: int, processes: int, answer: Any) -> None:
         mine = sorted(os.sched_getaffinity(0))[place::processes]
         if mine:
             os.sched_setaffinity(0, mine)
-    answer.send(_answer(job))
+    with contextlib.suppress(BrokenPipeError):  # nobody is left to hear it
+        answer.send(_answer(job))
 
 
 def _answer(job: work.Job) -> Answer:
