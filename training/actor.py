@@ -63,12 +63,12 @@ class ViaActor(BaseModel):
 
     def look(self, observation: Observation) -> Look:
         """What the actor sees of its anchors."""
-        return self._tensors(self.anchors.look(_arrays(observation)))
+        return self._tensors(self.anchors.look(arrays(observation)))
 
     def look_at(self, observation: Observation, actions: Tensor) -> Look:
         """What it sees of actions of its own, shape (B, A, m)."""
         inside = actions.detach().clamp(-0.999, 0.999).cpu().numpy()
-        return self._tensors(look_at(_arrays(observation), inside, self.task))
+        return self._tensors(look_at(arrays(observation), inside, self.task))
 
     def encode(self, observation: Observation) -> Tensor:
         """The scene as the operator takes it, shape (B, width)."""
@@ -108,6 +108,6 @@ def best(improved: Improved, count: int) -> Tensor:
     return improved.actions[rows, chosen]
 
 
-def _arrays(observation: Observation) -> Observation:
+def arrays(observation: Observation) -> Observation:
     """Looking is done in NumPy: there are no gradients, and small arrays are dealt with faster."""
     return {name: part.detach().cpu().numpy() for name, part in observation.items()}

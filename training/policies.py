@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.actor import Improved, ViaActor, best
-from viapoint.training.features import GEOMETRY, foresee, scene_view
+from viapoint.training.actor import Improved, ViaActor, arrays, best
+from viapoint.training.features import GEOMETRY, Foresight, foresee, scene_view
 from viapoint.training.set_encoder import SetEncoder, layers
-from viapoint.training.sight import Observation
+from viapoint.training.sight import Observation, Sight
 
 
 class Judgement(NamedTuple):
@@ -60,12 +60,23 @@ class ViaCritic(BaseModel):
 
     def judge(self, observation: Observation, actions: Tensor) -> Judgement:
         """What to expect of H actions in each of B scenes, shape (B, H)."""
-        foresight = foresee(observation, actions, self.task)
+        foresight = self._foresee(observation, actions)
         features = foresight.vector() if self.sighted else torch.zeros_like(foresight.vector())
         scene = self.scene(self.encoder(scene_view(observation, self.task))).unsqueeze(1)
         learned = self.value(scene + self.movement(torch.cat((features, actions), dim=-1))).squeeze(-1)
         clearance = foresight.clearance_reward if self.sighted else torch.zeros_like(learned)
         return Judgement(learned, clearance, foresight.smoothness_reward, foresight.duration_reward)
+
+    def _foresee(self, observation: Observation, actions: Tensor) -> Foresight:
+        """In torch where gradients are asked for, otherwise in NumPy, which deals with small arrays faster."""
+        if actions.requires_grad and torch.is_grad_enabled():
+            return foresee(observation, actions, self.task)
+        known = foresee(arrays(observation), actions.detach().cpu().numpy(), self.task)
+
+        def tensor(part: Any) -> Tensor:
+            return torch.as_tensor(part, device=self.device)
+
+        return Foresight(Sight(*map(tensor, known.seen)), *map(tensor, known[1:]))
 
     def forward(self, observation: Observation, actions: Tensor) -> tuple[Tensor]:
         """The expected reward of one action in each scene, shape (B, 1), as SB3's critics return it."""
