@@ -211,6 +211,7 @@ class BenchConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         _check_env(self.env)
+        _check_whole_movements(self.env)
         _check_whole("num_envs", self.num_envs, 1)
         _check_whole("repeats", self.repeats, 1)
 
@@ -253,6 +254,7 @@ class DemoConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         _check_env(self.env)
+        _check_whole_movements(self.env)
         _check_whole("seed", self.seed, 0)
         _check_whole("candidates", self.candidates, 1)
         for name in ("n_timesteps", "n_scenes"):
@@ -328,6 +330,13 @@ def _plain(value: Any) -> Any:
 def _check_env(env: str) -> None:
     if env not in gym.registry:
         raise ValueError(f"env must be one of {', '.join((*viapoint.envs.TASKS, *STEP_TASKS))}, got {env!r}")
+
+
+def _check_whole_movements(env: str) -> None:
+    if env in STEP_TASKS:
+        raise ValueError(
+            f"env must be one where an action is a whole movement, {STEP_TASKS[env]} for one, got {env!r}"
+        )
 
 
 def _check_whole(name: str, value: Any, least: int) -> None:

@@ -80,6 +80,8 @@ def test_nothing_is_shared_between_two_configurations():
         (PlayConfig, {}, "name a run folder"),
         (PlayConfig, {"run": Path("a"), "n_scenes": 0}, "n_scenes"),
         (BenchConfig, {"num_envs": 0}, "num_envs"),
+        (BenchConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "an action is a whole movement"),
+        (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}, "viapoint/PlanarWholeArm-v0 for one"),
         (DemoConfig, {"candidates": 0}, "candidates"),
     ],
 )
