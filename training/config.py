@@ -13,8 +13,8 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.envs.registration import STEP_TASKS
-from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm, Preset
+from viapoint.envs.registration import STEP_TASKS, TASKS
+from viapoint.training.presets import PRESETS, REACH_PRESETS, STEP_PRESETS, Algorithm, Preset
 
 C = TypeVar("C")
 
@@ -99,7 +99,10 @@ class TrainConfig:
     @property
     def preset(self) -> Preset:
         """What holds for everything that is not given."""
-        return (STEP_PRESETS if self.env in STEP_TASKS else PRESETS)[self.algo]
+        if self.env in STEP_TASKS:
+            return STEP_PRESETS[self.algo]
+        reach = TASKS.get(self.env, {}).get("n_obstacles") == 0
+        return REACH_PRESETS[self.algo] if reach and self.algo in REACH_PRESETS else PRESETS[self.algo]
 
     @property
     def total_timesteps(self) -> int:

@@ -109,7 +109,7 @@ class ViaPolicy(TD3Policy):
         lr_schedule: Any,
         *,
         task: dict[str, Any],
-        width: int = 192,
+        width: int = 176,
         rounds: int = 2,
         kept: int = 6,
         candidates: int = 0,

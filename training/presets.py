@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -111,3 +112,8 @@ STEP_PRESETS: dict[str, Preset] = {
     ),
 }
 """The same where an action lasts one control step, which then counts as a decision."""
+
+REACH_PRESETS: dict[str, Preset] = {
+    "viatd3": dataclasses.replace(PRESETS["viatd3"], n_timesteps=1_280),
+}
+"""Where nothing is in the way, less will do."""
