@@ -70,13 +70,15 @@ class SceneSampler:
         )
         pending = np.arange(number)
         for _ in range(self._attempts):
+            if not len(pending):
+                return scenes
             drawn = Uniforms(np.stack([generators[int(i)].random(self._size) for i in pending]))
             given = None if ends is None else (ends[0][pending], ends[1][pending])
             found, attempt = self._attempt(drawn, given)
             scenes.put(pending[found], attempt.take(found))
             pending = pending[~found]
-            if not len(pending):
-                return scenes
+        if not len(pending):
+            return scenes
         raise RuntimeError(
             f"no scene with {self.distribution.n_obstacles} obstacles was found in {self._attempts} attempts"
             + ("" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}")

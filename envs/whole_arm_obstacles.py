@@ -50,8 +50,25 @@ class WholeArmObstacles:
 
     def __call__(self, u: Uniforms, witness: Witness) -> tuple[Float, NDArray[np.bool_]]:
         """See :class:`~viapoint.envs.scene_obstacles.Placer`."""
+        hardness = u.take(1) ** self._distribution.ease_whole_arm
+        return choose(u, self._choice(u, witness, hardness), hardness, self._distribution.n_obstacles)
+
+    def beside(
+        self, u: Uniforms, witness: Witness, rows: Float, count: int
+    ) -> tuple[Float, NDArray[np.bool_]]:
+        """More obstacles, shape (N, count, 2 D + 1), to close what is still open round the given rows, (N, n, 2 D + 1).
+
+        10 CANDIDATES + CHOICES + 1 + count uniform numbers are taken.
+        """
+        hardness = np.ones((len(rows), 1))
+        choice = self._choice(u, witness, hardness)
+        still_open = ~self._ways_closed(witness, rows).any(axis=1, keepdims=True)
+        choice = choice._replace(in_the_way=choice.free, closed=choice.closed & still_open)
+        return choose(u, choice, hardness, (count, count))
+
+    def _choice(self, u: Uniforms, witness: Witness, hardness: Float) -> Choice:
+        """Candidates, those that leave room and are in the way first."""
         d, arm = self._distribution, self._arm
-        hardness = u.take(1) ** d.ease_whole_arm
         links = np.asarray(arm.links(arm.posture(witness.path[:, _evenly(POSTURES)].astype(np.float32))))
         rows = self._candidates(u, witness, links)
         gap = d.link_margin + 0.002 + 0.08 * u.take(CANDIDATES) * (1.0 - hardness)
@@ -66,8 +83,7 @@ class WholeArmObstacles:
         some = np.argsort(2 - free - first.astype(np.int64), axis=-1, kind="stable")[:, :CHOICES]
         rows = np.take_along_axis(rows, some[..., None], axis=1)
         free, hit = (np.take_along_axis(each, some, axis=1) for each in (free, hit))
-        choice = Choice(rows, free, hit, self._ways_closed(witness, rows))
-        return choose(u, choice, hardness, d.n_obstacles)
+        return Choice(rows, free, hit, self._ways_closed(witness, rows))
 
     def _candidates(self, u: Uniforms, witness: Witness, links: Float) -> Float:
         """Posts and bars near the arm, shape (N, CANDIDATES, 5).

@@ -20,6 +20,8 @@ SETS = ("validation", "test", "hard")
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
 """Bands of the solution share, from easy to hard."""
 BAND_EDGES = (0.2, 0.05, 0.01)
+DRAWN = ""
+"""Family of the scenes that are drawn from the training distribution."""
 FIELDS = ("start", "goal", "obstacles", "share", "solution")
 
 
@@ -40,6 +42,13 @@ class FrozenScenes:
     """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,)."""
     solution: Float
     """An action that the planner found and the simulation confirmed, shape (N, m)."""
+    family: Any = DRAWN
+    """Name of each scene's family, shape (N,), or one for all; DRAWN for the training distribution."""
+
+    def __post_init__(self) -> None:
+        """One name for each scene."""
+        names = np.broadcast_to(np.asarray(self.family, dtype=np.str_), self.share.shape)
+        object.__setattr__(self, "family", names)
 
     @property
     def band(self) -> NDArray[np.int64]:
@@ -48,23 +57,25 @@ class FrozenScenes:
 
     @property
     def sha256(self) -> str:
-        """Hash of scenes and shares, independent of how the file is packed and of which solutions were found."""
+        """Hash of scenes, shares and families, whatever the file's packing and the solutions that were found."""
         digest = hashlib.sha256(self.env_id.encode())
         content = self.arrays()
         del content["solution"]
         for name, array in content.items():
             digest.update(f"{name}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        digest.update("\n".join(("family", *self.family)).encode())
         return digest.hexdigest()
 
     def arrays(self) -> dict[str, Float]:
-        """The content by name."""
+        """The numbers by name."""
         values = (*self.scenes, self.share, self.solution)
         return dict(zip(FIELDS, values, strict=True))
 
     def save(self, path: Path) -> None:
         """Write the set with its hash."""
-        np.savez_compressed(path, env_id=np.array(self.env_id), sha256=np.array(self.sha256), **self.arrays())  # type: ignore[arg-type]
+        words = {"env_id": self.env_id, "sha256": self.sha256, "family": self.family}
+        np.savez_compressed(path, **{k: np.array(v) for k, v in words.items()}, **self.arrays())  # type: ignore[arg-type]
 
     def take(self, rows: Any) -> FrozenScenes:
         """The scenes at `rows`, an index array, slice or mask."""
@@ -74,6 +85,7 @@ class FrozenScenes:
             scenes=self.scenes.take(rows),
             share=self.share[rows],
             solution=self.solution[rows],
+            family=self.family[rows],
         )
 
 
@@ -104,7 +116,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256")}
+            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256", "family")}
     except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
         raise ValueError(f"{path} is not a file of scenes: {error}") from None
     frozen = FrozenScenes(
@@ -113,6 +125,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         scenes=Scenes(content["start"], content["goal"], content["obstacles"]),
         share=content["share"],
         solution=content["solution"],
+        family=content["family"],
     )
     if frozen.sha256 != str(content["sha256"]):
         raise ValueError(f"{path} is damaged: its content does not have the hash that it states")

@@ -1,96 +1,110 @@
 """Makes the frozen scenes again: `python -m viapoint.training.make_scenes`.
 
-The sets are drawn from the training distribution with seeds that training never uses, a quarter of each set in each
-band of the solution share as far as the bands occur. Every scene is certified: the planner solved it in simulation.
+`validation` and `test` are drawn from the training distribution with seeds that training never uses, a quarter of each
+set in each band of the solution share. `hard` holds scenes of families that are never trained on, as many of each, all
+with a share below 5 %. Every scene was solved in simulation by some of at most 4,096 random actions, so that its
+difficulty is known, and by the planner.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from viapoint.envs.scene_families import FAMILIES, family_sampler
 from viapoint.envs.scenes import Scenes
-from viapoint.training.difficulty import planned_share, solution_share
-from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, shipped_path
-from viapoint.training.planner import Planner
+from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, FrozenScenes, bands, shipped_path
+from viapoint.training.scene_search import Found, Kinds, Source, search
 from viapoint.training.trial import Trial
 
-SEEDS = {"validation": 1_000_003, "test": 2_000_003}
+Float = NDArray[np.float64]
+
+SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017}
 """First seeds of the sets; training draws from seeds below a million."""
-SIZES = {"validation": 500, "test": 1000}
+SIZES = {"validation": 500, "test": 1000, "hard": 500}
 WITHOUT_OBSTACLES = 100
 """Scenes of a set with nothing in the way."""
-ENV_IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0")
-"""Environments with shipped scenes."""
-DRAWN_AT_ONCE = 2048
-MOST_DRAWN = 64 * DRAWN_AT_ONCE
-SPARE, SAFE = 1.2, 1.1
-"""How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
+HARDEST = BAND_EDGES[1]
+"""Shares of hard scenes are less."""
+ALL = ("validation", "test", "hard")
+SETS = {
+    "viapoint/PlanarReach-v0": ALL[:2],
+    "viapoint/PlanarObstacles-v0": ALL,
+    "viapoint/PlanarWholeArm-v0": ALL,
+}
+"""Environments with shipped scenes, and their sets."""
 
 
-def make(env_id: str, name: str, size: int | None = None) -> FrozenScenes:
+def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:
     """Draw, measure and certify a set of scenes.
 
     Args:
         env_id: The environment they are for.
-        name: `validation` or `test`.
-        size: Number of scenes N; by default the set's.
+        name: `validation`, `test` or `hard`.
+        size: Number of scenes N, a multiple of the bands or families; by default the set's.
+        threads: Of the simulation, 0 for one per core; the result does not depend on it.
+
+    Raises:
+        RuntimeError: Scenes of some kind are too rare.
     """
-    trial = Trial(env_id)
+    trial = Trial(env_id, threads=threads)
     size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
-    drawn = _draw(trial, np.random.default_rng(SEEDS[name]), size)
-    pieces = []
-    for i in tqdm(
-        range(0, len(drawn.start), 64), desc=f"{env_id} {name}", unit="x64 scenes", file=sys.stderr
-    ):
-        scenes = drawn.take(slice(i, i + 64))
-        share, planned = solution_share(trial, scenes, seed=SEEDS[name]), Planner(trial)(scenes)
-        solved = planned.success & (share > 0.0)
-        pieces.append((scenes.take(solved), share[solved], planned.action[solved]))
+    names = list(FAMILIES) if name == "hard" else [""]
+    parts = [
+        _of_family(trial, family, size // len(names)) if family else _drawn(trial, name, size)
+        for family in names
+    ]
     trial.close()
-    scenes = Scenes(*(np.concatenate(fields) for fields in zip(*(piece[0] for piece in pieces), strict=True)))
-    share, solution = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
-    frozen = FrozenScenes(name=name, env_id=env_id, scenes=scenes, share=share, solution=solution)
-    return frozen.take(np.sort(_balanced(share, size)))
+    order = np.arange(size).reshape(len(names), -1).T.ravel()  # families in turn
+    return FrozenScenes(
+        name=name,
+        env_id=env_id,
+        scenes=Scenes(*(np.concatenate(f) for f in zip(*(part.scenes for part in parts), strict=True))),
+        share=np.concatenate([part.share for part in parts]),
+        solution=np.concatenate([part.solution for part in parts]),
+        family=np.repeat(names, size // len(names)),
+    ).take(order)
 
 
-def _draw(trial: Trial, generator: np.random.Generator, size: int) -> Scenes:
-    """Scenes in about equal numbers in each band of the estimated share, a few more than needed."""
-    sampler, wanted = trial.task.sampler(), int(SPARE * size)
-    if trial.task.scenes.n_obstacles[1] == 0:
-        return sampler([generator] * size)
-    drawn, estimates = [], []
-    for _ in range(MOST_DRAWN // DRAWN_AT_ONCE):
-        drawn.append(sampler([generator] * DRAWN_AT_ONCE))
-        estimates.append(SAFE * _estimate(trial, drawn[-1]))
-        count = np.bincount(bands(np.concatenate(estimates)), minlength=len(BANDS))
-        if (count >= wanted / len(BANDS)).all():
-            break
-    together = Scenes(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
-    return together.take(_balanced(np.concatenate(estimates), wanted))
+def _drawn(trial: Trial, name: str, size: int) -> Found:
+    """Scenes of the training distribution, as many in each band."""
+    seed, task = SEEDS[name], trial.task
+    if task.scenes.n_obstacles[1] == 0:
+        source = _source(task.sampler(), seed, block=size)
+        kinds = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
+    else:
+        rare = not task.whole_arm  # few scenes are hard where the hand alone must clear
+        source = _source(
+            task.sampler(),
+            seed,
+            block=2048 if rare else 512,
+            levels=((0.03, 2048), (0.013, 16384)) if rare else ((0.03, 1024),),
+        )
+        kinds = Kinds(of_share=bands, names=BANDS, quota=size // len(BANDS))
+    return search(trial, source, kinds, seed=seed, label=f"{trial.env_id} {name}")
 
 
-def _estimate(trial: Trial, scenes: Scenes) -> NDArray[np.float64]:
-    """Planned shares, more exact where they are small, shape (N,)."""
-    share = planned_share(trial, scenes, draws=256)
-    for below, draws in ((0.03, 2048), (0.013, 16384)):
-        for row in np.flatnonzero(share < below):
-            share[row] = planned_share(trial, scenes.take([row]), seed=draws, draws=draws)[0]
-    return share
+def _of_family(trial: Trial, family: str, size: int) -> Found:
+    """Hard scenes of one family."""
+    seed = SEEDS["hard"] + 101 * list(FAMILIES).index(family)
+    kinds = Kinds(of_share=lambda share: np.where(share < HARDEST, 0, -1), names=("share < 5 %",), quota=size)
+    source = _source(family_sampler(trial.task, family), seed, block=64)
+    return search(trial, source, kinds, seed=seed, label=f"{trial.env_id} hard, {family}")
 
 
-def _balanced(share: NDArray[np.float64], size: int) -> NDArray[np.int64]:
-    """Indices of `size` scenes, the first ones of each band in equal numbers, short bands made up for by the others."""
-    band = bands(share)
-    rank = np.empty(len(share), dtype=np.int64)
-    for index in range(len(BANDS)):
-        rank[band == index] = np.arange((band == index).sum())
-    return np.lexsort((-band, rank))[:size]
+def _source(
+    sampler: Callable[[list[np.random.Generator]], Scenes],
+    seed: int,
+    *,
+    block: int,
+    levels: tuple[tuple[float, int], ...] = (),
+) -> Source:
+    generator = np.random.default_rng(seed)
+    return Source(draw=lambda number: sampler([generator] * number), block=block, levels=levels)
 
 
 def main() -> None:
@@ -98,20 +112,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Make the frozen scenes and compare their hashes with those shipped."
     )
-    parser.add_argument("--env", nargs="*", default=list(ENV_IDS), help="environment ids")
+    parser.add_argument("--env", nargs="*", default=list(SETS), choices=list(SETS), help="environment ids")
     parser.add_argument("--sets", nargs="*", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
     parser.add_argument("--out", type=Path, default=None, help="folder to write to instead of the package's")
+    parser.add_argument("--threads", type=int, default=0, help="of the simulation, 0 for one per core")
     arguments = parser.parse_args()
     for env_id in arguments.env:
-        for name in arguments.sets:
-            frozen, shipped = make(env_id, name), shipped_path(name, env_id)
+        for name in (name for name in SETS[env_id] if name in arguments.sets):
+            frozen, shipped = make(env_id, name, threads=arguments.threads), shipped_path(name, env_id)
+            before = "new" if not shipped.exists() else _sha256(shipped)
             path = shipped if arguments.out is None else arguments.out / shipped.name
             path.parent.mkdir(parents=True, exist_ok=True)
-            before = "new" if not path.exists() else _sha256(path)
             frozen.save(path)
             counts = ", ".join(f"{label}: {(frozen.band == i).sum()}" for i, label in enumerate(BANDS))
             verdict = "unchanged" if before == frozen.sha256 else f"was {before}"
-            print(f"{path.name}: {len(frozen.share)} scenes ({counts}) sha256 {frozen.sha256} ({verdict})")
+            print(
+                f"{path.name}: {len(frozen.share)} scenes ({counts}) sha256 {frozen.sha256} ({verdict})",
+                flush=True,
+            )
 
 
 def _sha256(path: Path) -> str:
