@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.scenes import Scenes
 from viapoint.training.baselines import Method
-from viapoint.training.frozen_scenes import BANDS, FrozenScenes
+from viapoint.training.frozen_scenes import BANDS, DRAWN, FrozenScenes
 from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.trial import Trial
 
@@ -42,6 +42,8 @@ class MethodResult:
     """Of single decisions, [s]; one number, the mean of a batch, for a slow method."""
     band: NDArray[np.int64]
     """Index into BANDS of each scene, -1 where the share is unknown, shape (n,)."""
+    family: NDArray[np.str_]
+    """Of each scene, '' for drawn ones, shape (n,)."""
     distance: Float
     """From start to goal, shape (n,), [m]."""
     partial: bool
@@ -63,6 +65,11 @@ class MethodResult:
             "success": _rate(success),
             "success_by_band": {
                 name: _rate(success[self.band == i]) for i, name in enumerate(BANDS) if (self.band == i).any()
+            },
+            "success_by_family": {
+                str(name): _rate(success[self.family == name])
+                for name in dict.fromkeys(self.family.tolist())
+                if name != DRAWN
             },
             "collision": _rate(np.asarray(self.outcomes["collision"], dtype=bool)),
             "unreachable": _rate(~np.asarray(self.outcomes["reachable"], dtype=bool)),
@@ -193,6 +200,7 @@ def _evaluate_one(
         actions=np.concatenate(actions) if actions else np.zeros((0, trial.task.action.size)),
         decision_times=times,
         band=np.where(np.isnan(frozen.share), -1, frozen.band)[:done],
+        family=frozen.family[:done],
         distance=np.linalg.norm(frozen.scenes.goal - frozen.scenes.start, axis=-1)[:done],
         partial=interrupted and done < number,
         interrupted=interrupted,

@@ -45,6 +45,10 @@ def _in_band(name: str) -> Callable[[Summary], str]:
     return lambda summary: _percent(summary["success_by_band"].get(name))
 
 
+def _in_family(name: str) -> Callable[[Summary], str]:
+    return lambda summary: _percent(summary.get("success_by_family", {}).get(name))
+
+
 COLUMNS = (
     Column("success", lambda summary: _percent(summary["success"])),
     Column("95 % interval", lambda summary: _interval(summary["success"])),
@@ -62,21 +66,30 @@ COLUMNS = (
 NOTES = (
     "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
-    "that solve a scene. Clearance and goal error are medians of all scenes, jerk ratio (to the straight "
-    "movement) and duration of the successes. SPL: success weighted by straight distance over path length. "
+    "that solve a scene; in hard sets also among scenes of each family. Clearance and goal error are medians "
+    "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted by straight distance over path length. "
     "Decision: wall time of single decisions; where the 98th percentile is missing, the mean in a batch."
 )
 
 
 def rows(record: Record) -> list[list[str]]:
     """Headings, then the cells of each method; columns in which no method has a value are left out."""
-    heads = ["method", *(column.heading for column in COLUMNS)]
+    columns = _columns(record)
+    heads = ["method", *(column.heading for column in columns)]
     table = [
-        [_name(name, summary), *(column.cell(summary) for column in COLUMNS)]
+        [_name(name, summary), *(column.cell(summary) for column in columns)]
         for name, summary in record["methods"].items()
     ]
     shown = [i for i in range(len(heads)) if any(line[i] != "-" for line in table)]
     return [[line[i] for i in shown] for line in (heads, *table)]
+
+
+def _columns(record: Record) -> list[Column]:
+    """Those of every table, and behind the bands one for each family that there is."""
+    summaries = record["methods"].values()
+    names = dict.fromkeys(name for summary in summaries for name in summary.get("success_by_family", {}))
+    behind = 2 + len(BANDS)
+    return [*COLUMNS[:behind], *(Column(name, _in_family(name)) for name in names), *COLUMNS[behind:]]
 
 
 def title(record: Record) -> str:

@@ -81,6 +81,7 @@ def fake(success, **changes):
         "actions": np.zeros((n, 3)),
         "decision_times": np.linspace(0.001, 0.003, 101),
         "band": np.arange(n) % 4,
+        "family": np.full(n, ""),
         "distance": np.full(n, 0.4),
         "partial": False,
     }
@@ -103,6 +104,14 @@ def test_the_metrics_are_what_their_names_say():
     assert summary["min_clearance"] == pytest.approx(0.0)
     assert summary["decision_time"] == pytest.approx(0.002)
     assert summary["decision_time_98"] == pytest.approx(0.00296)
+
+
+def test_success_is_told_by_family_where_there_are_families():
+    by_family = fake([True, False, True], family=np.array(["gate", "gate", ""])).summary()[
+        "success_by_family"
+    ]
+    assert {name: (rate["count"], rate["of"]) for name, rate in by_family.items()} == {"gate": (1, 2)}
+    assert fake([True]).summary()["success_by_family"] == {}
 
 
 def test_without_a_success_there_are_no_figures_of_successes():

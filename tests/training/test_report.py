@@ -48,6 +48,15 @@ def test_the_document_holds_every_method_and_metric(record, tmp_path):
     assert record["sha256"][:12] in document.read_text()
 
 
+def test_families_have_columns_of_their_own(record):
+    rate = {"rate": 0.25, "low": 0.1, "high": 0.5, "count": 1, "of": 4}
+    summary = {**record["methods"]["still [bold]"], "success_by_family": {"cul-de-sac": rate}}
+    heads, first, other = report.rows({**record, "methods": {"one": summary, **record["methods"]}})[:3]
+    assert first[heads.index("cul-de-sac")] == "25.0 %"
+    assert other[heads.index("cul-de-sac")] == "-"
+    assert "cul-de-sac" not in report.rows(record)[0]
+
+
 def test_the_printed_table_loses_nothing_to_markup(record):
     console = Console(width=100, record=True, file=io.StringIO())
     report.show(record, console)
