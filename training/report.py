@@ -67,8 +67,9 @@ NOTES = (
     "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
     "that solve a scene; in hard sets also among scenes of each family. Clearance and goal error are medians "
-    "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted by straight distance over path length. "
-    "Decision: wall time of single decisions; where the 98th percentile is missing, the mean in a batch."
+    "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted "
+    "by straight distance over path length. Decision: wall time of single decisions; where the 98th percentile is "
+    "missing, the mean in a batch."
 )
 
 
