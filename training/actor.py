@@ -25,7 +25,7 @@ class Improved(NamedTuple):
     promise: Tensor
     """Expected reward of the better ones, shape (B, A)."""
     worth: Tensor
-    """Expected reward of the ones looked at, shape (B, A)."""
+    """Expected reward of the ones looked at but for the part that is known, shape (B, A)."""
 
 
 class ViaActor(BaseModel):
@@ -86,11 +86,11 @@ class ViaActor(BaseModel):
         scene, look = self.encode(observation), self.look(observation)
         for _ in range(self.rounds):
             look = self.look_at(observation, best(self.improve(scene, look), self.kept))
-        return look.actions, self.improve(scene, look).worth
+        return look.actions, self.improve(scene, look).worth + look.known
 
     def _tensors(self, look: Look) -> Look:
-        actions, fares = (torch.as_tensor(part, device=self.device) for part in look)
-        return Look(actions, fares if self.sighted else torch.zeros_like(fares))
+        look = Look(*(torch.as_tensor(part, device=self.device) for part in look))
+        return look if self.sighted else look._replace(fares=torch.zeros_like(look.fares))
 
     def forward(self, observation: Observation) -> Tensor:
         """The most worthy action, shape (B, m)."""

@@ -1,4 +1,4 @@
-"""Movements to begin with: a few ways round each, wide and narrow, early and late."""
+"""Movements to begin with: the straight one and ways round, wide and narrow, early and late."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from viapoint.envs._arrays import clamp
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.task import Task
-from viapoint.training.features import Look, look_at
+from viapoint.training.features import Look, look_along
 from viapoint.training.sight import INSTANTS
 
 Float = NDArray[np.float32]
@@ -41,6 +41,9 @@ class Anchors:
         self.task = task
         self.paths = trajectory(duration[:, None] * INSTANTS).astype(np.float32)
         """In the frame of start and goal, shape (A, PHASES, D), for a distance of 1 m."""
+        ratio = trajectory.cost() * duration**5 / 360.0
+        self.log_jerk = np.log(np.maximum(ratio, 1.0)).astype(np.float32)
+        """Of their jerk cost relative to the straight movement's, shape (A,)."""
         places = np.arange(1, task.action.n_via + 1) / (task.action.n_via + 1)
         on_path = trajectory(duration[:, None] * places) - places[:, None] * goal[:, None]
         if task.action.n_via == 1:
@@ -58,7 +61,9 @@ class Anchors:
         distance = np.sqrt((line * line).sum(axis=-1))[:, None, None]
         scaled = np.stack(frame(line), axis=-2) * distance
         hand = start[:, None, None] + self.paths @ scaled[:, None]
-        return look_at(observation, self._actions(distance), self.task, hand)
+        actions = self._actions(distance)
+        log_jerk = np.broadcast_to(self.log_jerk, actions.shape[:2])
+        return look_along(observation, actions, self.task, hand, log_jerk, np.ones_like(log_jerk))
 
     def _actions(self, distance: Float) -> Float:
         """Shape (B, A, m), inside (-1, 1)."""
@@ -69,11 +74,10 @@ class Anchors:
 
 def _vias(dimension: int, count: int | None) -> NDArray[np.float64]:
     """Via-points for a distance of 1 m, from the middle of the straight line, shape (A, D)."""
-    if count == 1:
-        return np.zeros((1, dimension))
     along, height, turn = np.meshgrid(ALONG, HEIGHT, _turns(dimension), indexing="ij")
     sideways = (np.cos(turn), np.sin(turn))[: dimension - 1]
     vias = np.stack([along, *(height * side for side in sideways)], axis=-1).reshape(-1, dimension)
+    vias = np.concatenate((np.zeros((1, dimension)), vias))
     return vias if count is None else vias[np.linspace(0, len(vias) - 1, count).round().astype(int)]
 
 

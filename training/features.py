@@ -37,16 +37,30 @@ class Look(NamedTuple):
     """That make the movements, shape (B, A, m), inside (-1, 1)."""
     fares: Array
     """How each would fare: clearance, reach, and where the nearest obstacle pushes in each stretch, shape (B, A, .)."""
+    known: Array
+    """The part of each one's reward that the plan alone decides, shape (B, A)."""
 
     def at(self, some: Array) -> Look:
         """Only some of the movements, `some` of shape (B, n) in each scene."""
         rows = namespace_of(some).arange(len(some))[:, None]
-        return Look(self.actions[rows, some], self.fares[rows, some])
+        return Look(*(part[rows, some] for part in self))
 
     @property
     def free(self) -> Array:
         """Which of the movements touch nothing and stay in reach, shape (B, A), bool."""
         return (self.fares[..., STRETCHES] > 0.0) & (self.fares[..., STRETCHES + 2] > 0.0)
+
+
+class KnownReward(NamedTuple):
+    """The terms of the reward that the plan alone decides, shape (B, H) each."""
+
+    clearance: Array
+    smoothness: Array
+    duration: Array
+
+    def total(self) -> Array:
+        """Shape (B, H)."""
+        return self.clearance + self.smoothness + self.duration
 
 
 class Foresight(NamedTuple):
@@ -55,10 +69,7 @@ class Foresight(NamedTuple):
     seen: Sight
     log_jerk: Array
     """Log of the jerk cost relative to the straight movement of the same duration, shape (B, H)."""
-    clearance_reward: Array
-    smoothness_reward: Array
-    duration_reward: Array
-    """The terms of the reward that the plan alone decides, shape (B, H)."""
+    reward: KnownReward
 
     def vector(self) -> Array:
         """The features as a network likes them, of size one, shape (B, H, GEOMETRY + 1)."""
@@ -98,39 +109,59 @@ def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
         actions: Shape (B, H, m), in [-1, 1].
         task: The environment's.
     """
-    xp = namespace_of(actions)
-    start, goal = _ends(observation, actions)
-    plan = task.action.decode(actions, start, goal)
-    trajectory, duration = plan.trajectory(), xp.sum(plan.durations, axis=-1)
-    line = goal - start
-    straight = 360.0 * xp.sum(line * line, axis=-1) / duration**5
-    ratio = trajectory.cost() / straight
-    log_jerk = xp.log(xp.maximum(ratio, xp.ones_like(ratio)))
-    seen = see(observation, trajectory(_times(duration)), task)
-    relative = duration / task.action.centre_duration
+    hand, log_jerk, relative = _planned(observation, actions, task)
+    seen = see(observation, hand, task)
+    return Foresight(seen, log_jerk, known_reward(seen, log_jerk, relative, task))
+
+
+def look_at(observation: Observation, actions: Array, task: Task) -> Look:
+    """See how actions of shape (B, A, m) would fare."""
+    hand, log_jerk, relative = _planned(observation, actions, task)
+    return look_along(observation, actions, task, hand, log_jerk, relative)
+
+
+def look_along(
+    observation: Observation, actions: Array, task: Task, hand: Array, log_jerk: Array, relative: Array
+) -> Look:
+    """See how actions would fare whose paths, jerk and duration are known already.
+
+    Args:
+        observation: Of B scenes.
+        actions: Shape (B, A, m).
+        task: The environment's.
+        hand: Their paths, shape (B, A, PHASES, D), [m].
+        log_jerk: Log of their jerk cost relative to the straight movement's, shape (B, A).
+        relative: Their duration relative to the zero action's, shape (B, A).
+    """
+    xp = namespace_of(hand)
+    seen, pushed = push(observation, hand, task)
+    axes = xp.stack(frame(observation["goal"] - observation["hand"]), axis=-1)
+    in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
+    known = known_reward(seen, log_jerk, relative, task).total()
+    return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known)
+
+
+def known_reward(seen: Sight, log_jerk: Array, relative: Array, task: Task) -> KnownReward:
+    """As :func:`viapoint.envs.reward.reward_terms` has it."""
+    xp = namespace_of(log_jerk)
     least = clamp(xp.min(seen.clearance, axis=-1), *CLEARANCE_RANGE)
-    return Foresight(
-        seen,
-        log_jerk,
+    return KnownReward(
         task.weights.clearance * least / CLEARANCE_UNIT,
         -task.weights.smoothness * (log_jerk - 5.0 * xp.log(relative)),
         -task.weights.duration * (relative - 1.0),
     )
 
 
-def look_at(observation: Observation, actions: Array, task: Task, hand: Array | None = None) -> Look:
-    """See how actions of shape (B, A, m) would fare.
-
-    `hand` are their paths, shape (B, A, PHASES, D), where they are known already.
-    """
+def _planned(observation: Observation, actions: Array, task: Task) -> tuple[Array, Array, Array]:
+    """Hand paths, log of the relative jerk cost, and duration relative to the zero action's."""
     xp = namespace_of(actions)
-    if hand is None:
-        plan = task.action.decode(actions, *_ends(observation, actions))
-        hand = plan.trajectory()(_times(xp.sum(plan.durations, axis=-1)))
-    seen, pushed = push(observation, hand, task)
-    axes = xp.stack(frame(observation["goal"] - observation["hand"]), axis=-1)
-    in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
-    return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1))
+    start, goal = _ends(observation, actions)
+    plan = task.action.decode(actions, start, goal)
+    trajectory, duration = plan.trajectory(), xp.sum(plan.durations, axis=-1)
+    line = goal - start
+    ratio = trajectory.cost() * duration**5 / (360.0 * xp.sum(line * line, axis=-1))
+    log_jerk = xp.log(xp.maximum(ratio, xp.ones_like(ratio)))
+    return trajectory(_times(duration)), log_jerk, duration / task.action.centre_duration
 
 
 def _ends(observation: Observation, actions: Array) -> tuple[Array, Array]:

@@ -14,26 +14,21 @@ from torch import Tensor, nn
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
 from viapoint.training.actor import Improved, ViaActor, arrays, best
-from viapoint.training.features import GEOMETRY, Foresight, foresee, scene_view
+from viapoint.training.features import GEOMETRY, Foresight, KnownReward, foresee, scene_view
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation, Sight
 
 
 class Judgement(NamedTuple):
-    """What to expect of H actions in each of B scenes, shape (B, H): one part is learnt, the others are formulas."""
+    """What to expect of H actions in each of B scenes."""
 
     learned: Tensor
-    clearance: Tensor
-    smoothness: Tensor
-    duration: Tensor
-
-    def known(self) -> Tensor:
-        """The part of the reward that the plan alone decides."""
-        return self.clearance + self.smoothness + self.duration
+    """The part of the reward that no formula gives, shape (B, H)."""
+    known: KnownReward
 
     def reward(self) -> Tensor:
-        """The expected reward."""
-        return self.learned + self.known()
+        """The expected reward, shape (B, H)."""
+        return cast(Tensor, self.learned + self.known.total())
 
 
 class ViaCritic(BaseModel):
@@ -64,8 +59,10 @@ class ViaCritic(BaseModel):
         features = foresight.vector() if self.sighted else torch.zeros_like(foresight.vector())
         scene = self.scene(self.encoder(scene_view(observation, self.task))).unsqueeze(1)
         learned = self.value(scene + self.movement(torch.cat((features, actions), dim=-1))).squeeze(-1)
-        clearance = foresight.clearance_reward if self.sighted else torch.zeros_like(learned)
-        return Judgement(learned, clearance, foresight.smoothness_reward, foresight.duration_reward)
+        known = foresight.reward
+        if not self.sighted:
+            known = known._replace(clearance=torch.zeros_like(learned))
+        return Judgement(learned, known)
 
     def _foresee(self, observation: Observation, actions: Tensor) -> Foresight:
         """In torch where gradients are asked for, otherwise in NumPy, which deals with small arrays faster."""
@@ -76,7 +73,9 @@ class ViaCritic(BaseModel):
         def tensor(part: Any) -> Tensor:
             return torch.as_tensor(part, device=self.device)
 
-        return Foresight(Sight(*map(tensor, known.seen)), *map(tensor, known[1:]))
+        return Foresight(
+            Sight(*map(tensor, known.seen)), tensor(known.log_jerk), KnownReward(*map(tensor, known.reward))
+        )
 
     def forward(self, observation: Observation, actions: Tensor) -> tuple[Tensor]:
         """The expected reward of one action in each scene, shape (B, 1), as SB3's critics return it."""

@@ -67,8 +67,9 @@ class ScenePool:
     def sample(self, count: int) -> tuple[Observation, Look]:
         """`count` observations, with repetition, and what an actor sees of them."""
         rows = torch.from_numpy(self._generator.choice(len(self._weights), size=count, p=self._weights))
-        *observation, actions, fares = (tensor[rows] for tensor in self._tensors)
-        return dict(zip(self._names, observation, strict=True)), Look(actions, fares)
+        parts = [tensor[rows] for tensor in self._tensors]
+        split = len(self._names)
+        return dict(zip(self._names, parts[:split], strict=True)), Look(*parts[split:])
 
     def _fill(self, slot: int, number: int) -> None:
         observation = {name: torch.from_numpy(part) for name, part in self._draw(number).items()}

@@ -127,7 +127,7 @@ class ViaTD3(TD3):
         assert self.replay_buffer is not None
         batch: Any = self.replay_buffer.sample(batch_size)
         judgement = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
-        target = batch.rewards - judgement.known().detach()
+        target = batch.rewards - judgement.known.total().detach()
         loss = functional.smooth_l1_loss(judgement.learned, target, beta=0.5)
         self.critic.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -151,7 +151,7 @@ class ViaTD3(TD3):
         self.critic.requires_grad_(True)
         reward = judgement.reward().detach()
         foretold = torch.cat((first.promise, second.promise, second.worth), dim=1)
-        targets = torch.cat((reward, reward[rows, chosen]), dim=1)
+        targets = torch.cat((reward, judgement.learned.detach()[rows, chosen]), dim=1)
         score_loss = functional.smooth_l1_loss(foretold, targets, beta=0.5)
         loss = score_loss - self._merit(judgement).mean()
         self.actor.optimizer.zero_grad()
@@ -162,10 +162,11 @@ class ViaTD3(TD3):
 
     def _merit(self, judgement: Judgement) -> Tensor:
         """What proposals climb, shape (B, H)."""
-        effort = judgement.duration + (judgement.smoothness if self.smoothness else 0.0)
+        known = judgement.known
+        effort: Tensor = known.duration + (known.smoothness if self.smoothness else 0.0)
         if self.objective == "log_success":
             return functional.logsigmoid(SHARPNESS * (judgement.learned - 0.5)) + effort
-        return judgement.learned + judgement.clearance + effort
+        return judgement.learned + known.clearance + effort
 
     def _some_anchors(self, scene: Tensor, look: Look) -> Look:
         """The most promising ones of a random half, and a few others."""

@@ -63,9 +63,7 @@ def test_what_is_foreseen_of_a_movement_is_what_happens(trial):
     np.testing.assert_array_equal(margin > 0.0, done.info["reachable"])
     np.testing.assert_allclose(np.exp(seen.log_jerk[:, 0].numpy()), done.info["jerk_ratio"], rtol=1e-4)
     known = sum(done.info[f"reward_{name}"] for name in ("clearance", "smoothness", "duration"))
-    error = np.abs(
-        (seen.clearance_reward + seen.smoothness_reward + seen.duration_reward)[:, 0].numpy() - known
-    )
+    error = np.abs(seen.reward.total()[:, 0].numpy() - known)
     assert error.mean() < 2e-2, "but for what lies between two looks"
     assert np.median(error) < 1e-2
     least = seen.seen.clearance[:, 0].amin(dim=-1).numpy()
@@ -82,9 +80,9 @@ def test_foresight_is_the_same_in_numpy_and_torch(trial):
     theirs = foresee(observed(trial, scenes), torch.as_tensor(actions), trial.task)
     difference = np.abs(ours.vector() - theirs.vector().numpy())
     assert np.quantile(difference, 0.98) < 2e-3, "but where two obstacles are equally near"
-    for name in ("clearance_reward", "smoothness_reward", "duration_reward"):
-        atol = 2e-2 if name == "clearance_reward" else 1e-4  # single precision is coarse where axes cross
-        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name).numpy(), atol=atol)
+    for name, mine, others in zip(ours.reward._fields, ours.reward, theirs.reward, strict=True):
+        atol = 2e-2 if name == "clearance" else 1e-4  # single precision is coarse where axes cross
+        np.testing.assert_allclose(mine, others.numpy(), atol=atol)
 
 
 def test_the_obstacles_push_where_clearance_grows(trial):
@@ -121,6 +119,7 @@ def test_anchors_fare_as_their_actions_do(trial):
     inside = (np.abs(look.actions) < 0.97).all(axis=-1)
     ours, theirs = (seen.fares[inside][:, :STRETCHES] for seen in (look, again))
     assert np.quantile(np.abs(ours - theirs), 0.98) < 2e-3, "but where two obstacles are equally near"
+    np.testing.assert_allclose(look.known[inside], again.known[inside], atol=5e-2)
 
 
 def test_the_order_of_the_obstacles_is_irrelevant_and_turning_the_scene_too(trial):
