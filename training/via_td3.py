@@ -166,7 +166,8 @@ class ViaTD3(TD3):
         effort: Tensor = known.duration + (known.smoothness if self.smoothness else 0.0)
         if self.objective == "log_success":
             return functional.logsigmoid(SHARPNESS * (judgement.learned - 0.5)) + effort
-        return judgement.learned + known.clearance + effort
+        merit: Tensor = judgement.learned + known.clearance + effort
+        return merit
 
     def _some_anchors(self, scene: Tensor, look: Look) -> Look:
         """The most promising ones of a random half, and a few others."""
