@@ -1,0 +1,210 @@
+"""Ctrl-C, a second run in the folder and a full disk, with real processes: nothing is lost, and it is said what is."""
+
+import errno
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from viapoint.training import cli, runs
+from viapoint.training.config import TrainConfig
+from viapoint.training.files import BadFileError, read_arrays
+from viapoint.training.runs import Run, load_model
+from viapoint.training.train import TrainingFailedError, train
+
+ENV = "viapoint/PlanarObstacles-v0"
+TINY = {"learning_starts": 32, "gradient_steps": 1, "batch_size": 16, "buffer_size": 4000}
+SMALL = {**TINY, "policy_kwargs": {"net_arch": [16]}}
+PATIENCE = 300.0
+"""Longest wait for another process, [s]; it ends as soon as there is what is waited for."""
+
+
+def config(folder, **changes):
+    values = {
+        "env": ENV, "algo": "sac", "out": folder, "n_timesteps": 320, "n_envs": 32, "eval_every": 0,
+        "checkpoint_every": 64, "env_kwargs": {"threads": 1}, "hyperparameters": SMALL, "progress": False,
+    }  # fmt: skip
+    return TrainConfig(**{**values, **changes})
+
+
+@pytest.fixture
+def start():
+    """Starts the command in a process of its own."""
+    processes = []
+
+    def start(*words):
+        script = "from viapoint.training.cli import main; main()"
+        process = subprocess.Popen(
+            [sys.executable, "-c", script, *map(str, words)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(process, what):
+    until = time.monotonic() + PATIENCE
+    while not what():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_ctrl_c_in_training_saves_and_leaves_and_nobody_else_gets_in(start, tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = "--algo sac --n-timesteps 1000000 --n-envs 32 --eval-every 0 --checkpoint-every 64 --env-kwargs threads=1"
+    more = [f"{name}={json.dumps(value)}" for name, value in SMALL.items()]
+    process = start("train", "--out", folder, *words.split(), "--hyperparameters", *more)
+    wait_for(process, lambda: len(list(folder.glob("checkpoints/0*"))) == 2)
+    for words in (["--resume"], []):
+        with pytest.raises(SystemExit):
+            cli.main(["train", "--out", str(folder), *words])
+    refused = capsys.readouterr().err.splitlines()
+    assert f"is in use by the process with number {process.pid}" in refused[0]
+    assert "holds a run already" in refused[1]
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "all is saved" in told
+    run = Run(folder)
+    assert load_model(folder / "final").num_timesteps == run.decisions > 64
+    before = run.decisions
+    resumed = train(TrainConfig(out=folder, resume=True, n_timesteps=before + 32, progress=False))
+    assert resumed.decisions == before + 32
+
+
+def test_ctrl_c_in_an_evaluation_leaves_what_is_finished_and_says_that_it_is_partial(
+    start, small_scenes, tmp_path
+):
+    small_scenes.save(tmp_path / "scenes.npz")
+    out = tmp_path / "out.json"
+    words = ["evaluate", "--env", ENV, "--scenes", tmp_path / "scenes.npz", "--json", out]
+    process = start(*words, "--methods", "straight", "random80", "planner")
+    seen = ""
+    while "straight line" not in seen:  # it is done, and the next method is at work
+        read = process.stderr.read(1)
+        assert read, seen
+        seen += read
+    process.send_signal(signal.SIGINT)
+    process.wait(PATIENCE)
+    assert process.returncode == 130
+    assert "the results are partial" in process.stderr.read()
+    record = json.loads(out.read_text())
+    assert record["partial"] is True
+    assert record["methods"]["straight line"]["scenes"] == 40
+    assert record["methods"]["straight line"]["partial"] is False
+    assert "planner" not in record["methods"]
+
+
+def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipped):
+    run = train(config(tmp_path / "run", n_timesteps=32))
+    words = ["evaluate", str(run.folder), "--env", ENV, "--methods", "straight", "random", "--n-scenes", "4"]
+    cli.main(words)
+    whole = (run.folder / "evaluations" / "test.json").read_text()
+
+    def interrupted(self, observation, scenes):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("viapoint.training.baselines.RandomVias.decide", interrupted)
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    assert end.value.code == 130
+    assert (run.folder / "evaluations" / "test.json").read_text() == whole
+    assert json.loads((run.folder / "evaluations" / "test.partial.json").read_text())["partial"] is True
+
+
+@pytest.fixture
+def full_disk():
+    """Files larger than 80 kB cannot be written, as on a full disk, by the system's own refusal."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, hard))
+    yield lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_stops_training_with_the_reason_and_keeps_what_was_there(full_disk, tmp_path):
+    with pytest.raises(
+        TrainingFailedError, match=r"cannot go on: .*tensors\.safetensors.*keeps.*--resume"
+    ) as error:
+        train(config(tmp_path / "run"))
+    assert error.value.__cause__.errno in (errno.EFBIG, errno.ENOSPC)
+    run = Run(tmp_path / "run")
+    kept = run.checkpoints()
+    assert 0 < run.decisions < 320
+    assert not list(run.folder.rglob(".*.part"))
+    full_disk()  # there is room again
+    assert run.restore(runs_model(run))[1] == []
+    resumed, whole = (
+        train(TrainConfig(out=run.folder, resume=True, progress=False)),
+        train(config(tmp_path / "whole")),
+    )
+    assert kept
+    for name, array in read_arrays(whole.folder / "final" / "weights.safetensors").items():
+        np.testing.assert_array_equal(
+            read_arrays(resumed.folder / "final" / "weights.safetensors")[name], array
+        )
+
+
+def runs_model(run):
+    from viapoint.training.train import new_model
+    from viapoint.training.vec_env import ViaVecEnv
+
+    return new_model(run.config, ViaVecEnv(run.config.env, run.config.copies, threads=1))
+
+
+def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):
+    """With a constant learning rate even where the first half was meant to be all."""
+    whole = train(config(tmp_path / "whole", n_timesteps=128))
+    train(config(tmp_path / "halves", n_timesteps=64))
+    halves = train(TrainConfig(out=tmp_path / "halves", resume=True, n_timesteps=128, progress=False))
+    one, other = (read_arrays(run.checkpoints()[-1] / "tensors.safetensors") for run in (whole, halves))
+    assert set(one) == set(other)
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, other[name], err_msg=name)
+
+
+def test_a_start_that_got_no_further_can_be_repeated(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("lock", "lock.pid", "versions.json", f".config.json.{32 * 'a'}.part"):
+        (folder / name).write_text("")
+    assert Run.create(config(folder)).decisions == 0
+    assert (folder / "config.json").is_file()
+
+
+def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
+    """The second finds a free folder, but the first is faster."""
+    folder, check = tmp_path / "run", runs._check_free
+
+    def slow(path):
+        check(path)
+        monkeypatch.setattr(runs, "_check_free", check)
+        Run.create(config(path, seed=1))
+
+    monkeypatch.setattr(runs, "_check_free", slow)
+    with pytest.raises(BadFileError, match="holds a run already"):
+        Run.create(config(folder, seed=2))
+    assert Run(folder).config.seed == 1
+
+
+def test_other_versions_are_told(tmp_path, capsys):
+    run = train(config(tmp_path / "run", n_timesteps=32))
+    (run.folder / "versions.json").write_text(json.dumps({**run.versions, "mujoco": "3.3.0"}))
+    train(TrainConfig(out=run.folder, resume=True, n_timesteps=64, progress=False))
+    assert "began with mujoco 3.3.0 (now" in capsys.readouterr().err
+    (run.folder / "versions.json").write_text(json.dumps({"viapoint": "7.2.0"}))
+    (run.folder / "config.json").write_text(json.dumps({"colour": "red"}))
+    with pytest.raises(BadFileError, match=r"written by viapoint 7\.2\.0"):
+        Run(run.folder)
+    assert os.path.exists(run.folder / "final" / "model.json")
