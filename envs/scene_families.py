@@ -113,7 +113,7 @@ def ring(u: Uniforms, site: Site) -> Float:
         towards = np.where(at_goal, path[:, -PHASES // 4], path[:, PHASES // 4])
     entry = turned(unit(towards - centre), _centred(u, 0.3))
     posts, radius = u.take(1) < 0.4, between(BAR_RADIUS, u.take(1)[:, 0])
-    size, porch = between((0.024, 0.032), u.take(1)[:, 0]), between((0.03, 0.06), u.take(1)[:, 0])
+    size, porch = between((0.042, 0.050), u.take(1)[:, 0]), between((0.03, 0.06), u.take(1)[:, 0])
     gap = site.room + between((0.004, 0.012), u.take(1)[:, 0]) * (1.0 + 3.0 * site.whole_arm)
     opening = 2.0 * np.arcsin((gap + radius) / (1.2 * distance))
     sides = 3 if site.whole_arm else 4
@@ -127,7 +127,7 @@ def ring(u: Uniforms, site: Site) -> Float:
     away = _side(goal + start - 2.0 * centre, entry)
     corner = centre + turned(entry, 0.5 * opening * away) * (distance / np.cos(0.5 * step))[:, None]
     bars.append(_bar(corner + entry * porch[:, None], entry, porch, radius))
-    far = distance + size - radius
+    far = between((0.045, 0.055), u.take(1)[:, 0]) + size  # so close that the hand fits between no other two
     first = np.arcsin(np.minimum((gap + size) / far, 1.0))
     step = (2.0 * np.pi - 2.0 * first) / 4.0
     round_ones = [

@@ -1,0 +1,143 @@
+"""Laws of the families of hard scenes: each is what its name says."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs.arms import ADULT
+from viapoint.envs.clearance import segment_distance_squared
+from viapoint.envs.scene_families import FAMILIES, ROWS, family_sampler
+from viapoint.envs.scenes import check_scenes
+
+HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
+NUMBER = {HAND: 40, WHOLE_ARM: 4}
+
+
+def task_of(env_id, **kwargs):
+    env = gym.make_vec(env_id, num_envs=1, **kwargs)
+    env.close()
+    return env.unwrapped.task
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    return {env_id: task_of(env_id) for env_id in (HAND, WHOLE_ARM)}
+
+
+@pytest.fixture(scope="module")
+def drawn(tasks):
+    """Scenes of every family for the hand, from generators of their own."""
+    return {
+        name: family_sampler(tasks[HAND], name)([np.random.default_rng(i) for i in range(NUMBER[HAND])])
+        for name in FAMILIES
+    }
+
+
+def obstacles(scenes, i):
+    rows = scenes.obstacles[i][scenes.present[i]]
+    return rows[:, :2], rows[:, 2:4], rows[:, 4]
+
+
+def ends_of(centre, axis):
+    return np.stack((centre - axis, centre + axis), axis=-2)
+
+
+@pytest.mark.parametrize("env_id", [HAND, WHOLE_ARM])
+@pytest.mark.parametrize("name", FAMILIES)
+def test_scenes_of_a_family_can_begin_and_end_and_something_is_in_the_way(name, env_id, tasks):
+    sampler = family_sampler(tasks[env_id], name)
+    scenes = sampler([np.random.default_rng(seed) for seed in range(NUMBER[env_id])])
+    check_scenes(scenes, ADULT, whole_arm=tasks[env_id].whole_arm)
+    assert scenes.obstacles.shape[1] == ROWS
+    squared = segment_distance_squared(scenes.start[:, None], scenes.goal[:, None], scenes.obstacles)[..., 0]
+    clearance = np.sqrt(squared) - scenes.obstacles[..., -1] - ADULT.hand_radius
+    assert (np.where(scenes.present, clearance, 1.0).min(axis=-1) < -0.003).all()
+    alone = sampler([np.random.default_rng(3)])
+    for one, all_ in zip(alone, scenes, strict=True):
+        np.testing.assert_array_equal(one[0], all_[3])
+
+
+def test_a_gate_is_two_walls_in_line_with_a_gap_little_wider_than_the_hand(drawn):
+    for i in range(NUMBER[HAND]):
+        centre, axis, radius = obstacles(drawn["gate"], i)
+        assert len(centre) == 2
+        first, second = ends_of(centre, axis)
+        apart = np.linalg.norm(first[:, None] - second, axis=-1)
+        gap = apart.min() - radius.sum() - 2.0 * ADULT.hand_radius
+        assert 0.015 < gap < 0.05
+        for point in first:
+            line = second[1] - second[0]
+            offset = point - second[0]
+            assert abs(line[0] * offset[1] - line[1] * offset[0]) / np.linalg.norm(line) < 1e-9
+
+
+def test_a_corridor_is_a_lane_between_parallel_bars_with_a_wall_to_either_side(drawn):
+    for i in range(NUMBER[HAND]):
+        centre, axis, radius = obstacles(drawn["corridor"], i)
+        assert len(centre) == 4
+        direction = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+        across = np.abs(direction @ direction.T)
+        np.testing.assert_allclose(np.sort(across, axis=-1)[:, :2], 0.0, atol=1e-9)
+        np.testing.assert_allclose(np.sort(across, axis=-1)[:, 2:], 1.0, atol=1e-9)
+        widths = []
+        for a in range(4):
+            for b in range(a):
+                offset = centre[a] - centre[b]
+                if across[a, b] > 0.5 and abs(offset @ direction[a]) < 1e-9:  # opposite each other
+                    lane = abs(offset[0] * direction[a, 1] - offset[1] * direction[a, 0])
+                    widths.append(lane - radius[a] - radius[b] - 2.0 * ADULT.hand_radius)
+        assert any(0.02 < width < 0.07 for width in widths)
+
+
+def test_a_ring_surrounds_start_or_goal_but_for_one_opening(drawn):
+    angle = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
+    rays = 0.16 * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    scenes = drawn["ring"]
+    for i in range(NUMBER[HAND]):
+        blocked = []
+        for end in (scenes.start[i], scenes.goal[i]):
+            first = np.broadcast_to(end, rays.shape)
+            squared = segment_distance_squared(first, end + rays, scenes.obstacles[i])
+            room = scenes.obstacles[i, :, -1:] + ADULT.hand_radius
+            blocked.append(((squared < room**2) & scenes.present[i][:, None]).any(axis=0))
+        ring = max(blocked, key=np.mean)
+        assert 0.7 < ring.mean() < 1.0
+        assert (ring != np.roll(ring, 1)).sum() == 2  # one opening
+        assert min(map(np.mean, blocked)) < 0.3
+
+
+def test_oblique_bars_are_long_parallel_and_oblique(drawn):
+    scenes = drawn["oblique bar"]
+    for i in range(NUMBER[HAND]):
+        _, axis, _ = obstacles(scenes, i)
+        half = np.linalg.norm(axis, axis=-1, keepdims=True)
+        assert (half > 0.12).all()
+        line = scenes.goal[i] - scenes.start[i]
+        angle = np.arccos(np.abs((axis / half) @ line) / np.linalg.norm(line))
+        assert np.ptp(angle) < 1e-6
+        assert np.radians(28.0) < angle[0] < np.radians(63.0)
+
+
+def test_a_cul_de_sac_holds_what_comes_straight_from_the_start(drawn):
+    """A wall with two sides at its ends, both on the start's side of it."""
+    scenes = drawn["cul-de-sac"]
+    for i in range(NUMBER[HAND]):
+        centre, axis, _ = obstacles(scenes, i)
+        ends = ends_of(centre, axis)
+        found = False
+        for back in range(len(centre)):
+            others = [k for k in range(len(centre)) if k != back]
+            near = {k: np.linalg.norm(ends[k][:, None] - ends[back], axis=-1) for k in others}
+            sides = {int(near[k].min(axis=0).argmin()): k for k in others if near[k].min() < 1e-9}
+            if len(sides) == 2:
+                normal = np.array([-axis[back][1], axis[back][0]])
+                ahead = np.sign((scenes.start[i] - centre[back]) @ normal)
+                found |= all(np.sign((centre[k] - centre[back]) @ normal) == ahead for k in sides.values())
+        assert found
+
+
+def test_what_has_no_families_is_refused(tasks):
+    with pytest.raises(ValueError, match="gate, corridor, ring, oblique bar, cul-de-sac, got 'maze'"):
+        family_sampler(tasks[HAND], "maze")
+    with pytest.raises(ValueError, match="up to 5 obstacles"):
+        family_sampler(task_of(HAND, n_obstacles=2), "gate")
