@@ -3,7 +3,16 @@
     OMP_NUM_THREADS=1 python benchmarks/tuning.py --out tuning.jsonl [NAME ...]
 
 Nothing here looks at the test scenes. A line of the output is one setting; a name that is in the file already is not
-tried again. Without names all of them are tried, one after the other, which takes hours; the best became the presets.
+tried again. Without names all of them are tried, one after the other, which takes hours.
+
+What was measured once, seed 0, on the 500 validation scenes of PlanarObstacles-v0 (processor time on a busy machine):
+
+    name      decisions   success   > 20 %   5-20 %   1-5 %   < 1 %   jerk ratio   processor minutes
+    sac          20,000    23.8 %     66.4     26.4     2.4     0.0        14.92   1.9
+    sac-set      20,000    42.4 %     93.6     54.4    17.6     4.0         5.55   2.8
+    ppo-set     200,000    32.0 %     74.4     34.4    13.6     5.6        19.33   7.8
+
+So all presets have the set encoder. The other settings are there to be tried.
 """
 
 from __future__ import annotations
