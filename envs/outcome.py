@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.approach import nearest_approach
+from viapoint.envs.approach import ends_of, nearest_approach
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import FAR, arm_clearance, hand_clearance
 from viapoint.envs.scenes import Scenes
@@ -85,7 +85,7 @@ def measure(
     joints, contact = record.joints, record.contact
     if after.any():
         joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
-    hand, links = _places(record, joints, after, last, arm)
+    hand = _hand(record, joints, after, last, arm)
     moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
     deviation = np.where(after, 0.0, ((hand - planned) ** 2).sum(axis=-1))
     low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
@@ -98,7 +98,7 @@ def measure(
         is_success=arrived & ~collision & ~record.unstable & within.all(axis=-1),
         collision=collision,
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
-        min_clearance=least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints, links=links),
+        min_clearance=_measured_clearance(record, hand, joints, last, scenes, arm, whole_arm=whole_arm),
         goal_error=goal_error,
         path_length=_sum_in_order(moved),
         peak_speed=moved.max(axis=-1) / timestep,
@@ -108,22 +108,34 @@ def measure(
     )
 
 
-def _places(
-    record: Record, joints: Float, after: Bool, last: tuple[Any, Any], arm: Arm
-) -> tuple[Float, Float | None]:
-    """Where hand and links were after each step: computed, or as the physics has recorded them.
-
-    It records them before each step, so those after the last are computed for every movement.
-    """
+def _hand(record: Record, joints: Float, after: Bool, last: tuple[Any, Any], arm: Arm) -> Float:
+    """Where the hand was after each step: computed, or as the physics has recorded it, which it does before each."""
     if record.traced is None:
-        return np.asarray(arm.hand(joints)), None
-    places = np.concatenate((record.traced[:, 1:], record.traced[:, -1:]), axis=1)
-    final = joints[last]
-    ends = np.asarray(arm.links(final)).reshape(len(final), -1, 3)
-    places[last] = np.concatenate((np.asarray(arm.hand(final))[:, None], ends), axis=1)
+        return np.asarray(arm.hand(joints))
+    hand = np.empty((*joints.shape[:2], 3))
+    hand[:, :-1] = record.traced.places[:, 1:, record.traced.hand]
+    hand[last] = arm.hand(joints[last])
     if after.any():
-        places = np.where(after[..., None, None], places[last][:, None], places)
-    return places[:, :, 0], places[:, :, 1:].reshape(*places.shape[:2], -1, 2, 3)
+        hand = np.where(after[..., None], hand[last][:, None], hand)
+    return hand
+
+
+def _measured_clearance(
+    record: Record,
+    hand: Float,
+    joints: Float,
+    last: tuple[Any, Any],
+    scenes: Scenes,
+    arm: Arm,
+    *,
+    whole_arm: bool,
+) -> Float:
+    """Least clearance over all steps: of what the physics has recorded before each, and at the end."""
+    if record.traced is None or not whole_arm:
+        return least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints)
+    final = least_clearance(arm, hand[last][:, None], scenes, whole_arm=True, joints=joints[last][:, None])
+    before = nearest_approach(record.traced, arm.link_radii, scenes.obstacles, scenes.present, last[1])
+    return np.minimum(before, final)
 
 
 def refused(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
@@ -143,13 +155,7 @@ def blank(number: int) -> Outcome:
 
 
 def least_clearance(
-    arm: Arm,
-    hand: Float,
-    scenes: Scenes,
-    *,
-    whole_arm: bool,
-    joints: Float | None = None,
-    links: Float | None = None,
+    arm: Arm, hand: Float, scenes: Scenes, *, whole_arm: bool, joints: Float | None = None
 ) -> Float:
     """Least clearance over time and obstacles, shape (N,), [m].
 
@@ -159,17 +165,15 @@ def least_clearance(
         scenes: N of them.
         whole_arm: Whether the links count.
         joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
-        links: End points of the links' axes, shape (N, T, L, 2, D), [m]; by default those of the joints.
     """
     if not scenes.obstacles.shape[1]:
         return np.full(len(hand), FAR)
     present = scenes.present
-    if whole_arm and links is None:
-        links = arm.links(arm.posture(hand) if joints is None else joints)
-    if whole_arm and arm.traced:
-        return nearest_approach(np.asarray(links), arm.link_radii, scenes.obstacles, present)
+    links = arm.links(arm.posture(hand) if joints is None else joints) if whole_arm else None
+    if links is not None and arm.traced:
+        return nearest_approach(ends_of(np.asarray(links)), arm.link_radii, scenes.obstacles, present)
     each = hand_clearance(hand, arm.hand_radius, scenes.obstacles, present)
-    if whole_arm:
+    if links is not None:
         each = np.minimum(each, arm_clearance(links, arm.link_radii, scenes.obstacles, present))
     return np.asarray(each.min(axis=-1))
 

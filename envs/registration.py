@@ -10,6 +10,18 @@ TASKS: dict[str, dict[str, Any]] = {
     "viapoint/PlanarReach-v0": {"n_obstacles": 0},
     "viapoint/PlanarObstacles-v0": {},
     "viapoint/PlanarWholeArm-v0": {"whole_arm": True},
+    "viapoint/PandaReach-v0": {
+        "arm": "panda",
+        "whole_arm": True,
+        "n_obstacles": 0,
+        "duration_range": (1.0, 2.0),
+    },
+    "viapoint/PandaObstacles-v0": {
+        "arm": "panda",
+        "whole_arm": True,
+        "n_obstacles": (1, 6),
+        "duration_range": (1.0, 2.0),
+    },
 }
 """Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.reach.ReachVectorEnv`."""
 

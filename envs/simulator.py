@@ -9,6 +9,7 @@ import numpy as np
 from mujoco import batch
 from numpy.typing import NDArray
 
+from viapoint.envs.approach import Traced
 from viapoint.envs.arms.arm import Arm
 
 Float = NDArray[np.float64]
@@ -26,8 +27,8 @@ class Record(NamedTuple):
     """Whether arm and obstacle touched at the state before each step, shape (n, T)."""
     unstable: NDArray[np.bool_]
     """Whether MuJoCo raised a warning, shape (n,); such a simulation stopped there."""
-    traced: Float | None
-    """Positions of the arm's traced sites before each step, shape (n, T, P, 3), [m]; None where there are none."""
+    traced: Traced | None
+    """The arm's traced sites before each step; None where it has none."""
 
 
 class Simulator:
@@ -44,7 +45,8 @@ class Simulator:
         self._rest_state = self.batch.state[0].copy()
         self.recorded = ("qpos", "ncon", "site_xpos") if arm.traced else ("qpos", "ncon")
         """What the engine records at every step."""
-        self._traced = [self.model.site(name).id for name in arm.traced]
+        sites = [self.model.site(name).id for name in arm.traced]
+        self._traced = (sites[0], np.array(sites[1:]).reshape(-1, 2)) if sites else None
         self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
         if n_obstacles:
             self._sizes = self.batch.expand("geom_size")
@@ -92,7 +94,7 @@ class Simulator:
         out = self.batch.rollout(steps, controls, record=self.recorded, ids=sims)
         self.physics_steps += steps * len(sims)
         unstable = (self._warnings(sims) > warnings) | ~_finite(out["qpos"])
-        traced = out["site_xpos"][:, :, self._traced] if self.arm.traced else None
+        traced = Traced(out["site_xpos"], *self._traced) if self._traced else None
         return Record(out["qpos"], out["ncon"] > 0, unstable, traced)
 
     def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:

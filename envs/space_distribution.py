@@ -27,6 +27,8 @@ class SpaceDistribution:
     """Drawn with equal chances; those that take more than the most obstacles are left out."""
     distance: tuple[float, float] = (0.30, 0.50)
     """From start to goal, [m]."""
+    steepness: float = 0.5
+    """Greatest height gained on the way from start to goal, relative to the distance: arms come from above."""
     sphere_radius: tuple[float, float] = (0.02, 0.05)
     """[m]."""
     post_radius: tuple[float, float] = (0.012, 0.03)
@@ -37,15 +39,15 @@ class SpaceDistribution:
     """[m]."""
     bar_half_length: tuple[float, float] = (0.06, 0.18)
     """[m]."""
-    board_half_length: tuple[float, float] = (0.08, 0.16)
+    board_half_length: tuple[float, float] = (0.06, 0.13)
     """Of a shelf's bars, [m]."""
-    board_spacing: float = 0.05
+    board_spacing: float = 0.04
     """Between a shelf's bars, [m]: nothing of the arm fits in between."""
     gate_half_width: tuple[float, float] = (0.16, 0.24)
     """Between the middle of a gate and each post, [m]; the gripper is 0.21 m wide."""
     spread: float = 0.22
     """Greatest distance of other obstacles from the straight line, [m]."""
-    ease: float = 0.5
+    ease: float = 0.25
     """Hardness is a uniform number to this power: less is harder."""
     link_margin: float = 0.012
     """Least clearance of the movement that is kept clear, its links included, at the times that are looked at, [m]."""

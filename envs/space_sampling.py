@@ -8,22 +8,21 @@ function of a row of uniform numbers, so each environment draws from its own gen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.clearance import arm_clearance, hand_clearance
 from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
+from viapoint.envs.space_bodies import Bodies, Swept
 from viapoint.envs.space_distribution import SpaceDistribution
 from viapoint.envs.space_obstacles import NUMBERS, PARTS, Course, single, structure
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 16
+ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 14
 """How many pairs of ends, witnesses, structures and other obstacles are drawn at once, and at how many times a
 movement is looked at."""
 ATTEMPTS = 400
@@ -31,15 +30,6 @@ GIVE_WAY = 1.3
 """How far what is in the witness's way moves, relative to what it lacks in clearance."""
 IN_THE_WAY = 0.004
 """How deep the straight movement cuts into what is in its way, [m]."""
-
-
-class Swept(NamedTuple):
-    """Where the arm is at some times of N movements."""
-
-    hand: Float
-    """Shape (N, T, 3), [m]."""
-    links: Float
-    """End points of the links' axes, shape (N, T, L, 2, 3), [m]."""
 
 
 class SpaceSampler:
@@ -113,7 +103,7 @@ class SpaceSampler:
         """Starts and goals inside the workspace with the straight line between them inside the reach."""
         low, high = (np.array(corner) for corner in self.arm.workspace)
         start = low + (high - low) * u[..., :3]
-        height, angle = 2.0 * u[..., 3] - 1.0, 2.0 * np.pi * u[..., 4]
+        height, angle = self.distribution.steepness * (2.0 * u[..., 3] - 1.0), 2.0 * np.pi * u[..., 4]
         level = np.sqrt(1.0 - height**2)
         shortest, longest = self.distribution.distance
         step = np.stack((level * np.cos(angle), level * np.sin(angle), height), axis=-1)
@@ -148,21 +138,22 @@ class SpaceSampler:
         """Which scenes get something in the way, shape (N,), and their obstacles, shape (N, rows, 7)."""
         (least, most), number = self.distribution.n_obstacles, len(start)
         general, hardness = u[0], u[0][:, :1] ** self.distribution.ease
-        swept = self._swept(np.concatenate((path, start[:, None], goal[:, None]), axis=1))
+        swept = Swept.of(self.arm, path, whole_arm=self.whole_arm)
         built = self._built(general[:, 1], _each(u[1], STRUCTURES), hardness, (start, goal, path), swept)
-        whole = self._free(swept, built.reshape(number, -1, 7)).reshape(built.shape[:3]).all(axis=-1)
+        whole = self._free(swept.outer, built.reshape(number, -1, 7)).reshape(built.shape[:3]).all(axis=-1)
         fits = whole & self._blocks(start, goal, built)
         wanted = least + np.floor((most - least + 1) * general[:, 2])
         chosen = built[np.arange(number), fits.argmax(axis=-1)]
         chosen[wanted == 0.0] = 0.0
         good = fits.any(axis=-1) | (wanted == 0.0)
+        good &= self._free(swept.inner, chosen).all(axis=-1)
         some, others = np.flatnonzero(good), np.zeros((number, self._rows, 7))
         missing = np.maximum(wanted - (chosen[..., -1] > 0.0).sum(axis=-1), 0.0)
         enough, others[some] = self._others(
             _each(u[2], OTHERS)[some],
             (start[some], goal[some], path[some]),
             hardness[some],
-            Swept(swept.hand[some], swept.links[some]),
+            swept.take(some),
             missing[some],
         )
         good[some] = enough
@@ -183,7 +174,8 @@ class SpaceSampler:
             rows[some], retreat[some] = structure(
                 name, self.distribution, here, u[some, :, :NUMBERS], self.arm.hand_radius
             )
-        lacking = self.distribution.link_margin + 0.002 - self._clearance(swept, rows.reshape(len(u), -1, 7))
+        clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7)).min(axis=-1)
+        lacking = self.distribution.link_margin + 0.002 - clearance
         lacking = np.maximum(lacking.reshape(rows.shape[:3]), 0.0)
         together = (self._families[which] == "shelf")[:, None, None]
         lacking = np.where(together, lacking.max(axis=-1, keepdims=True), lacking)
@@ -194,12 +186,16 @@ class SpaceSampler:
         self, u: Float, course: tuple[Float, Float, Float], hardness: Float, swept: Swept, missing: Float
     ) -> tuple[Bool, Float]:
         """Which scenes get as many further obstacles as are missing, and these, shape (N, rows, 7)."""
-        rows = self._loose(u, course, hardness)
-        key = np.where(self._free(swept, rows), u[..., -1], -1.0)
+        here = self._course(course, u[..., -1], hardness)
+        rows = self._loose(u, here)
+        room = self._room(swept.outer, rows)
+        rows = _pushed(rows, here.place, hardness * np.maximum(room - 0.002, 0.0))
+        key = np.where((room > 0.0) & _within_bounds(rows), u[..., -1], -1.0)
         order = np.argsort(-key, axis=-1, kind="stable")[:, : self._rows]
         used = np.arange(order.shape[1]) < missing[:, None]
         enough = (np.take_along_axis(key, order, axis=1) >= 0.0).sum(axis=-1) >= missing
-        return enough, np.where(used[..., None], np.take_along_axis(rows, order[..., None], axis=1), 0.0)
+        chosen = np.where(used[..., None], np.take_along_axis(rows, order[..., None], axis=1), 0.0)
+        return enough & self._free(swept.inner, chosen).all(axis=-1), chosen
 
     def _which(self, u: Float) -> NDArray[np.int64]:
         """Index of the family that a uniform number stands for."""
@@ -216,42 +212,50 @@ class SpaceSampler:
         heading = np.where(length > 1e-6, step / np.maximum(length, 1e-6), (1.0, 0.0, 0.0))
         return Course(start[:, None], goal[:, None], path[each, phase], heading, hardness)
 
-    def _loose(self, u: Float, course: tuple[Float, Float, Float], hardness: Float) -> Float:
+    def _loose(self, u: Float, here: Course) -> Float:
         """Spheres, posts and bars, a half about the straight line, a half about the witness, shape (N, OTHERS, 7)."""
-        here = self._course(course, u[..., -1], hardness)
         away = self.distribution.spread * (2.0 * u[..., 3:6] - 1.0)
-        near = away * (1.0 - 0.5 * hardness[..., None])
         about = (np.arange(OTHERS) % 2 == 0)[:, None]
-        centre = np.where(about, here.on_line(u[..., -1]) + near, here.place + away)
+        centre = np.where(about, here.on_line(u[..., -1]), here.place) + away
         centre[..., 2] = np.maximum(centre[..., 2], 0.02)
         return single(self.distribution, centre, u[..., [0, 1, 2, 4, 5, 3]])
 
-    def _swept(self, hand: Float) -> Swept:
-        return Swept(hand, np.asarray(self.arm.links(self.arm.posture(hand))))
-
-    def _free(self, swept: Swept, rows: Float) -> Bool:
-        """Which rows leave room for the witness, and at its ends, and are within bounds, shape (N, n)."""
+    def _room(self, bodies: Bodies, rows: Float) -> Float:
+        """How much nearer each row may come to the witness, which wants more room at its ends, shape (N, n), [m]."""
         d = self.distribution
-        ends = Swept(swept.hand[:, -2:], swept.links[:, -2:])
-        free = self._clearance(swept, rows) > d.link_margin
-        free &= self._clearance(ends, rows) > d.end_margin
-        free &= (np.abs(rows[..., :3]) < 1.0).all(axis=-1)
-        free &= (rows[..., 3:6] ** 2).sum(axis=-1) < LARGEST_HALF_AXIS**2
-        return free | (rows[..., -1] <= 0.0)
+        if not len(bodies.radii):
+            return np.full(rows.shape[:2], np.inf)
+        clearance = bodies.clearance(rows)
+        at_ends = clearance[..., [0, -1]].min(axis=-1) - d.end_margin
+        return np.asarray(np.minimum(clearance.min(axis=-1) - d.link_margin, at_ends))
+
+    def _free(self, bodies: Bodies, rows: Float) -> Bool:
+        """Which rows leave room for the witness and are within bounds, shape (N, n); what is none does."""
+        return ((self._room(bodies, rows) > 0.0) & _within_bounds(rows)) | (rows[..., -1] <= 0.0)
 
     def _blocks(self, start: Float, goal: Float, built: Float) -> Bool:
         """Which structures the straight movement hits, shape (N, STRUCTURES)."""
         line = start[:, None] + (goal - start)[:, None] * np.linspace(0.0, 1.0, PHASES // 2)[:, None]
-        clearance = self._clearance(self._swept(line), built.reshape(len(built), -1, 7))
+        bodies = Swept.of(self.arm, line, whole_arm=self.whole_arm).outer
+        clearance = bodies.clearance(built.reshape(len(built), -1, 7)).min(axis=-1)
         hit = (clearance < -IN_THE_WAY).reshape(built.shape[:3]) & (built[..., -1] > 0.0)
         return np.asarray(hit.any(axis=-1))
 
-    def _clearance(self, swept: Swept, rows: Float) -> Float:
-        """Least clearance of the arm from each row, shape (N, n), [m]."""
-        present = np.ones(rows.shape[:-1], dtype=bool)
-        if self.whole_arm:
-            return np.asarray(arm_clearance(swept.links, self.arm.link_radii, rows, present))
-        return np.asarray(hand_clearance(swept.hand, self.arm.hand_radius, rows, present))
+
+def _within_bounds(rows: Float) -> Bool:
+    """Which rows are no farther and no longer than scenes allow."""
+    near = np.abs(rows[..., :3]).max(axis=-1) < 1.0
+    return np.asarray(near & ((rows[..., 3:6] ** 2).sum(axis=-1) < LARGEST_HALF_AXIS**2))
+
+
+def _pushed(rows: Float, place: Float, way: Float) -> Float:
+    """Rows moved towards a place by less than the room there is, which cannot reach the arm; posts along the table."""
+    towards = place - rows[..., :3]
+    standing = (rows[..., 3:5] == 0.0).all(axis=-1) & (rows[..., 5] > 0.0)
+    towards[..., 2] = np.where(standing, 0.0, towards[..., 2])
+    length = np.sqrt((towards**2).sum(axis=-1))
+    share = np.minimum(way, length) / np.maximum(length, 1e-9)
+    return np.concatenate((rows[..., :3] + share[..., None] * towards, rows[..., 3:]), axis=-1)
 
 
 def _each(u: Float, number: int) -> Float:

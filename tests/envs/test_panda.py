@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from viapoint.envs.action import ActionLayout
-from viapoint.envs.approach import nearest_approach
+from viapoint.envs.approach import ends_of, nearest_approach
 from viapoint.envs.arms import PANDA
 from viapoint.envs.clearance import FAR, arm_clearance
 from viapoint.envs.reach import ReachVectorEnv
@@ -185,9 +185,12 @@ def test_the_nearest_approach_is_the_least_of_all_times():
     obstacles = np.concatenate((middle, axis, rng.uniform(0.01, 0.05, (30, 5, 1))), axis=-1)
     present = rng.random((30, 5)) < 0.7
     brute = arm_clearance(links, PANDA.link_radii, obstacles, present).min(axis=-1)
-    found = nearest_approach(links, PANDA.link_radii, obstacles, present)
+    found = nearest_approach(ends_of(links), PANDA.link_radii, obstacles, present)
     np.testing.assert_allclose(found, brute, atol=1e-9)
-    nothing = nearest_approach(links, PANDA.link_radii, obstacles, np.zeros((30, 5), dtype=bool))
+    half = nearest_approach(ends_of(links), PANDA.link_radii, obstacles, present, np.full(30, 79))
+    brute = arm_clearance(links[:, :80], PANDA.link_radii, obstacles, present).min(axis=-1)
+    np.testing.assert_allclose(half, brute, atol=1e-9)
+    nothing = nearest_approach(ends_of(links), PANDA.link_radii, obstacles, np.zeros((30, 5), dtype=bool))
     np.testing.assert_array_equal(nothing, FAR)
 
 
