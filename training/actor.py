@@ -89,7 +89,7 @@ class ViaActor(BaseModel):
         return look.actions, self.improve(scene, look).worth + look.known
 
     def _tensors(self, look: Look) -> Look:
-        look = Look(*(torch.as_tensor(part, device=self.device) for part in look))
+        look = Look(*(torch.as_tensor(part, dtype=torch.float32, device=self.device) for part in look))
         return look if self.sighted else look._replace(fares=torch.zeros_like(look.fares))
 
     def forward(self, observation: Observation) -> Tensor:

@@ -13,9 +13,9 @@ from viapoint.training.sight import INSTANTS
 
 Float = NDArray[np.float32]
 
-ALONG = (-0.32, -0.16, 0.0, 0.16, 0.32)
-HEIGHT = (0.12, 0.25, 0.40, 0.55, 0.70, 0.85)
-"""Where anchors' via-points lie from the middle of the straight line, relative to its length."""
+ALONG = {2: (-0.32, -0.16, 0.0, 0.16, 0.32), 3: (-0.25, 0.0, 0.25)}
+HEIGHT = {2: (0.12, 0.25, 0.40, 0.55, 0.70, 0.85), 3: (0.20, 0.45, 0.75)}
+"""Where anchors' via-points lie from the middle of the straight line, relative to its length, by the dimension of space."""
 
 
 class Anchors:
@@ -74,7 +74,7 @@ class Anchors:
 
 def _vias(dimension: int, count: int | None) -> NDArray[np.float64]:
     """Via-points for a distance of 1 m, from the middle of the straight line, shape (A, D)."""
-    along, height, turn = np.meshgrid(ALONG, HEIGHT, _turns(dimension), indexing="ij")
+    along, height, turn = np.meshgrid(ALONG[dimension], HEIGHT[dimension], _turns(dimension), indexing="ij")
     sideways = (np.cos(turn), np.sin(turn))[: dimension - 1]
     vias = np.stack([along, *(height * side for side in sideways)], axis=-1).reshape(-1, dimension)
     vias = np.concatenate((np.zeros((1, dimension)), vias))

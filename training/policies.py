@@ -71,7 +71,7 @@ class ViaCritic(BaseModel):
         known = foresee(arrays(observation), actions.detach().cpu().numpy(), self.task)
 
         def tensor(part: Any) -> Tensor:
-            return torch.as_tensor(part, device=self.device)
+            return torch.as_tensor(part, dtype=torch.float32, device=self.device)
 
         return Foresight(
             Sight(*map(tensor, known.seen)), tensor(known.log_jerk), KnownReward(*map(tensor, known.reward))
