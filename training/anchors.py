@@ -15,7 +15,7 @@ Float = NDArray[np.float32]
 
 ALONG = {2: (-0.32, -0.16, 0.0, 0.16, 0.32), 3: (-0.25, 0.0, 0.25)}
 HEIGHT = {2: (0.12, 0.25, 0.40, 0.55, 0.70, 0.85), 3: (0.20, 0.45, 0.75)}
-"""Where anchors' via-points lie from the middle of the straight line, relative to its length, by the dimension of space."""
+"""Where anchors' via-points lie from the middle of the straight line, relative to its length, in plane and space."""
 
 
 class Anchors:
