@@ -16,13 +16,17 @@ from viapoint.envs.scenes import Scenes
 Float = NDArray[np.float64]
 
 
+TOUCHING = 0.01
+"""Clearance up to which an obstacle is what was touched, [m]."""
+
+
 class Touch(NamedTuple):
     """What touched what, and when."""
 
     step: int
     """Physics step of the first contact: the index into a rollout of the state in which they touched."""
     obstacle: int
-    """Row of the obstacle."""
+    """Row of the obstacle; -1 where the arm touched itself or the table."""
     link: int | None
     """Index of the link; None is the hand."""
     place: Float
@@ -71,6 +75,8 @@ def first_touch(
         links = np.asarray(arm.links(posture))
         for i, radius in enumerate(arm.link_radii):
             parts.append(arm_clearance(links[..., i : i + 1, :, :], (radius,), rows, present))
+    if not rows.shape[1] or min(float(each.min()) for each in parts) > TOUCHING:
+        return Touch(step, -1, None, np.asarray(arm.hand(posture))[0, 0])
     part, obstacle = np.unravel_index(np.argmin(np.stack(parts)[:, 0]), (len(parts), rows.shape[1]))
     link = int(part) - 1 if part else None
     ends = np.asarray(arm.hand(posture))[0] if link is None else np.asarray(arm.links(posture))[0, 0, link]

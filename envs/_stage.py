@@ -158,8 +158,10 @@ class Stage:
             centre, radius = in_space(numbers[:dimension], self._floor), float(numbers[-1])
             half_axis = in_space(numbers[dimension : 2 * dimension], 0.0)
             colour: Colour = PALETTE.contact if row == touched else PALETTE.obstacle
-            if dimension == 3:
+            if dimension == 3 and half_axis.any():
                 pencil.rod(centre - half_axis, centre + half_axis, radius, colour)
+            elif dimension == 3:
+                pencil.ball(centre, radius, colour)
             elif half_axis.any():
                 pencil.wall(centre, half_axis, top, radius, colour)
             else:

@@ -25,6 +25,12 @@ TASKS: dict[str, dict[str, Any]] = {
 }
 """Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.reach.ReachVectorEnv`."""
 
+OWN_ARM_TASKS: dict[str, str] = {
+    "viapoint/Reach-v0": "viapoint/PandaReach-v0",
+    "viapoint/Obstacles-v0": "viapoint/PandaObstacles-v0",
+}
+"""Every id that is meant for an arm of one's own, `gym.make(id, arm=...)`, and the task whose arguments it has."""
+
 STEP_TASKS: dict[str, str] = {
     "viapoint/PlanarObstaclesStep-v0": "viapoint/PlanarObstacles-v0",
     "viapoint/PlanarWholeArmStep-v0": "viapoint/PlanarWholeArm-v0",
@@ -39,6 +45,8 @@ def register_all() -> None:
     """Make every id known to Gymnasium; a second call changes nothing."""
     for name, kwargs in TASKS.items():
         _register(name, "viapoint.envs.reach:ReachEnv", "viapoint.envs.reach:ReachVectorEnv", kwargs)
+    for name, like in OWN_ARM_TASKS.items():
+        _register(name, "viapoint.envs.reach:ReachEnv", "viapoint.envs.reach:ReachVectorEnv", TASKS[like])
     for name, twin in STEP_TASKS.items():
         module = "viapoint.envs.reach_step"
         _register(name, f"{module}:StepReachEnv", f"{module}:StepReachVectorEnv", TASKS[twin])

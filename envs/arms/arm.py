@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol, _ProtocolMeta
 
 import mujoco
 
 from viapoint.envs._arrays import Array
 
 
-class Arm(Protocol):
+class _Makes(_ProtocolMeta):
+    """What can be asked of :class:`Arm` itself; an arm need not have it."""
+
+    def from_mjcf(self, path: str | Path, *, hand_site: str, joints: Sequence[str], **options: Any) -> Arm:
+        """The record of the arm in an MJCF file: see :func:`viapoint.envs.arms.own_arm.from_mjcf`."""
+        from viapoint.envs.arms.own_arm import from_mjcf
+
+        return from_mjcf(path, hand_site=hand_site, joints=joints, **options)
+
+
+class Arm(Protocol, metaclass=_Makes):
     """An arm: its size, its reach, its two kinematic directions and its inverse side.
 
     The kinematic functions are batched over leading dimensions and accept NumPy arrays and torch tensors.

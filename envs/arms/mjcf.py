@@ -13,7 +13,9 @@ from viapoint.envs.arms.serial import Link, Posture, SerialArm
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 BANDWIDTH = 20.0
-"""Natural frequency of the joints' springs, critically damped, [rad/s]: weak beside the hand's, of about 50 rad/s."""
+"""Natural frequency of the joints' springs, critically damped, [rad/s]: weak beside the hand's."""
+HAND_BANDWIDTH, HAND_DAMPING = 50.0, 0.75
+"""Natural frequency of the hand's servo, [rad/s], and its damping relative to the critical."""
 
 
 def serial_arm(
@@ -24,6 +26,7 @@ def serial_arm(
     hand_site: str,
     place: Posture,
     workspace: Box,
+    hand_gains: tuple[float, float] | None = None,
 ) -> SerialArm:
     """The record of an arm whose file has everything: capsules for links, a sphere `hand`, and limits.
 
@@ -34,12 +37,15 @@ def serial_arm(
         hand_site: Where the hand is.
         place: The posture for a place of the hand.
         workspace: Two opposite corners of the box in which movements start and end, [m].
+        hand_gains: Stiffness [N/m] and damping [N s/m] of the hand; by default for its inertia in the middle.
     """
     model = read_spec(model_file).compile()
     data = at_zero(model)
     joints = [model.joint(joint) for joint in joint_names]
     middle = np.asarray(place(np.array(workspace).mean(axis=0)))
-    moved = _inertia_at(model, joint_names, middle)
+    moved, carried = _inertia_at(model, joint_names, hand_site, middle)
+    if hand_gains is None:
+        hand_gains = carried * HAND_BANDWIDTH**2, 2.0 * HAND_DAMPING * carried * HAND_BANDWIDTH
     return SerialArm(
         name=name,
         model_file=model_file,
@@ -56,6 +62,8 @@ def serial_arm(
         workspace=workspace,
         joint_stiffness=tuple(float(m) * BANDWIDTH**2 for m in moved),
         joint_damping=tuple(2.0 * float(m) * BANDWIDTH for m in moved),
+        hand_stiffness=hand_gains[0],
+        hand_damping=hand_gains[1],
     )
 
 
@@ -78,8 +86,10 @@ def _capsules(model: mujoco.MjModel, data: mujoco.MjData, joint_names: tuple[str
     return tuple(links)
 
 
-def _inertia_at(model: mujoco.MjModel, joint_names: tuple[str, ...], joints: Any) -> Any:
-    """What each joint alone would have to turn, [kg m^2]: the diagonal of the mass matrix."""
+def _inertia_at(
+    model: mujoco.MjModel, joint_names: tuple[str, ...], hand_site: str, joints: Any
+) -> tuple[Any, float]:
+    """What each joint alone would have to turn, [kg m^2], and the hand's inertia, the mean of all directions, [kg]."""
     data = mujoco.MjData(model)
     address = [int(model.joint(name).qposadr[0]) for name in joint_names]
     freedom = [int(model.joint(name).dofadr[0]) for name in joint_names]
@@ -87,4 +97,7 @@ def _inertia_at(model: mujoco.MjModel, joint_names: tuple[str, ...], joints: Any
     mujoco.mj_fwdPosition(model, data)
     full = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
-    return np.diag(full)[freedom]
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, model.site(hand_site).id)
+    mobility = jacobian @ np.linalg.solve(full, jacobian.T)
+    return np.diag(full)[freedom], float(3.0 / np.trace(mobility))

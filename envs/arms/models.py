@@ -19,7 +19,9 @@ DIGITS = 12
 
 
 def read_spec(model_file: str) -> mujoco.MjSpec:
-    """An MJCF file: one of the package's `assets` by its name, or any other by its path."""
+    """An MJCF file: one of the package's `assets` by its name, any other by its path, or its text."""
+    if model_file.lstrip().startswith("<"):
+        return mujoco.MjSpec.from_string(model_file)
     own = files("viapoint.envs") / "assets" / model_file
     if Path(model_file).name == model_file and own.is_file():
         return mujoco.MjSpec.from_string(own.read_text(encoding="utf-8"))

@@ -113,5 +113,6 @@ PANDA = serial_arm(
     hand_site="hand",
     place=PandaPosture(),
     workspace=((0.36, -0.36, 0.06), (0.64, 0.36, 0.50)),
+    hand_gains=(10000.0, 300.0),
 )
 """A Franka Emika Panda on a table, its base at the origin, x forwards and z up."""

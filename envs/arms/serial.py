@@ -78,7 +78,7 @@ class SerialArm:
 
     name: str
     model_file: str
-    """The MJCF file."""
+    """The MJCF file among the package's assets, or its text."""
     joint_names: tuple[str, ...]
     hand_site: str
     chain: Chain
@@ -99,9 +99,9 @@ class SerialArm:
     """Of the springs to the posture, [N m/rad]."""
     joint_damping: tuple[float, ...]
     """[N m s/rad]."""
-    hand_stiffness: float = 10000.0
+    hand_stiffness: float
     """[N/m]."""
-    hand_damping: float = 300.0
+    hand_damping: float
     """[N s/m]."""
     dimension: int = 3
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs import _gl, _stage, rendering
-from viapoint.envs._movement import Movement
+from viapoint.envs._movement import Movement, first_touch
 from viapoint.envs.rendering import GLUnavailableError, check_render_mode, frame_steps
 
 OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
@@ -360,3 +360,31 @@ def frames_of(path):
     reader = pytest.importorskip("imageio_ffmpeg").read_frames(str(path))
     next(reader)
     return sum(1 for _ in reader)
+
+
+PANDA_SCENE = {
+    "start": [0.45, -0.2, 0.2],
+    "goal": [0.45, 0.2, 0.2],
+    "obstacles": [[0.45, 0.0, 0.21, 0.0, 0.0, 0.0, 0.05], [0.7, 0.3, 0.1, 0.0, 0.0, 0.05, 0.02]],
+}
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_in_space_spheres_are_seen_and_turn_red_with_the_link_that_touches_them(make, around):
+    env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=160)
+    env.reset(options={name: np.array(value) for name, value in PANDA_SCENE.items()})
+    before = env.render().astype(int)
+    sphere = (before[..., 0] - before[..., 2] > 40).sum()
+    *_, info = env.step(np.array([0.0, 0.0, 0.9 if around else 0.0, 0.0], np.float32))
+    assert info["collision"] == (not around)
+    assert sphere > 150
+    assert (red(env.render()) > 150) == (not around)
+
+
+def test_a_contact_that_is_with_no_obstacle_is_drawn_as_such():
+    env = gym.make("viapoint.envs:viapoint/PandaReach-v0").unwrapped
+    env.reset(seed=0)
+    scene = env.batch.scenes
+    joints = np.repeat(env.task.arm.posture(scene.start), 3, axis=0)
+    touch = first_touch(env.task.arm, scene, joints, np.array([False, True, True]), whole_arm=True)
+    assert (touch.step, touch.obstacle, touch.link) == (1, -1, None)

@@ -1,0 +1,177 @@
+"""What is in somebody else's MJCF file, and whether it suffices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+VELOCITY = 2.0
+"""Limit of the joints where nothing is said, [rad/s]."""
+
+
+class Foreign(NamedTuple):
+    """An arm as its file has it."""
+
+    model: mujoco.MjModel
+    """With the arm's joints alone; all others are held still."""
+    joints: tuple[str, ...]
+    hand_site: str
+    home: Float
+    """Shape (J,), [rad]."""
+    joint_range: Float
+    """Shape (J, 2), [rad]."""
+    torque_limit: Float
+    """Shape (J,), [N m]."""
+    velocity_limit: Float
+    """Shape (J,), [rad/s]."""
+
+
+def read_foreign(
+    path: Path,
+    hand_site: str,
+    joints: tuple[str, ...],
+    *,
+    home: Any,
+    joint_range: Any,
+    torque_limit: Any,
+    velocity_limit: Any,
+) -> Foreign:
+    """Read and check a file; see :func:`~viapoint.envs.arms.own_arm.from_mjcf`."""
+    if not path.is_file():
+        raise ValueError(f"there is no file {str(path)!r}")
+    spec = mujoco.MjSpec.from_file(str(path))
+    _known("site", (hand_site,), [site.name for site in spec.sites])
+    _known("joint", joints, [joint.name for joint in spec.joints])
+    whole = spec.compile()
+    ranges = _ranges(whole, joints, joint_range)
+    torque = (
+        _torques(whole, joints) if torque_limit is None else _numbers("torque_limit", torque_limit, joints)
+    )
+    if (
+        velocity_limit is None
+        and mujoco.mj_name2id(whole, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0
+    ):
+        velocity_limit = whole.numeric("velocity_limit").data
+    velocity = _numbers("velocity_limit", VELOCITY if velocity_limit is None else velocity_limit, joints)
+    for name, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
+        if not (np.isfinite(limit).all() and (limit > 0.0).all()):
+            raise ValueError(f"{name} must be positive and finite, got {limit}")
+    if home is None:
+        address = [int(whole.joint(joint).qposadr[0]) for joint in joints]
+        home = whole.key_qpos[0, address] if whole.nkey else ranges.mean(axis=1)
+    home = _numbers("home", home, joints)
+    outside = [
+        joint for joint, q, (low, high) in zip(joints, home, ranges, strict=True) if not low <= q <= high
+    ]
+    if outside:
+        raise ValueError(f"home is outside the range of {', '.join(outside)}")
+    model = _alone(spec, joints)
+    _check_order(model, joints, hand_site)
+    return Foreign(model, joints, hand_site, home, ranges, torque, velocity)
+
+
+def _known(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
+    missing = [name for name in wanted if name not in there]
+    if missing:
+        named = ", ".join(filter(None, there)) or "none"
+        raise ValueError(
+            f"there is no {kind} {', '.join(map(repr, missing))} in the file; there are: {named}"
+        )
+
+
+def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
+    if len(joints) < 5:
+        raise ValueError(f"joints must be five or more, got {joints}")
+    for name in joints:
+        joint = model.joint(name)
+        if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ValueError(f"joint {name!r} is no hinge; leave it out to hold it still")
+        if given is None and not model.jnt_limited[joint.id]:
+            raise ValueError(
+                f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
+            )
+    if given is not None:
+        ranges = np.asarray(given, dtype=np.float64)
+        if ranges.shape != (len(joints), 2) or not (ranges[:, 0] < ranges[:, 1]).all():
+            raise ValueError(f"joint_range must be {len(joints)} pairs in increasing order, got {given!r}")
+        return ranges
+    return np.array([model.joint(name).range for name in joints])
+
+
+def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
+    """Of each joint: its own limit, or that of the actuator that drives it."""
+    found = []
+    for name in joints:
+        joint = model.joint(name).id
+        if model.jnt_actfrclimited[joint]:
+            found.append(float(np.abs(model.jnt_actfrcrange[joint]).min()))
+            continue
+        driven = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+        limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(driven)]
+        found.append(max(limits, default=np.nan))
+    missing = [name for name, limit in zip(joints, found, strict=True) if not np.isfinite(limit)]
+    if missing:
+        raise ValueError(
+            f"no actuator with a limited force drives {', '.join(missing)}; add one, or give torque_limit"
+        )
+    return np.array(found)
+
+
+def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
+    gear = abs(float(model.actuator_gear[index, 0]))
+    if model.actuator_forcelimited[index]:
+        return gear * float(np.abs(model.actuator_forcerange[index]).min())
+    plain = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
+    if plain and model.actuator_ctrllimited[index]:
+        gain = abs(float(model.actuator_gainprm[index, 0]))
+        return gear * gain * float(np.abs(model.actuator_ctrlrange[index]).min())
+    return np.nan
+
+
+def _numbers(name: str, values: Any, joints: tuple[str, ...]) -> Float:
+    try:
+        return np.array(np.broadcast_to(np.asarray(values, dtype=np.float64), (len(joints),)))
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} must be {len(joints)} numbers, one for each joint, got {values!r}"
+        ) from None
+
+
+def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjModel:
+    """The model without what drives, couples or measures, and without any other joint."""
+    for part in (
+        *spec.actuators, *spec.equalities, *spec.sensors, *spec.tendons, *spec.keys, *spec.excludes, *spec.pairs,
+    ):  # fmt: skip
+        spec.delete(part)
+    for joint in [joint for joint in spec.joints if joint.name not in joints]:
+        spec.delete(joint)
+    for body in spec.bodies:
+        body.mocap = False
+    return spec.compile()
+
+
+def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> None:
+    """Whether each joint carries the next, and the last the hand."""
+    bodies = [int(model.joint(name).bodyid[0]) for name in joints]
+    for (before, carrier), (after, body) in zip(
+        zip(joints, bodies, strict=True), zip(joints[1:], bodies[1:], strict=True), strict=False
+    ):
+        if carrier == body or carrier not in _ancestors(model, body):
+            raise ValueError(f"joints must be in order from the base: {before!r} does not carry {after!r}")
+    last = int(model.site(hand_site).bodyid[0])
+    if model.body_weldid[last] != bodies[-1]:
+        raise ValueError(f"site {hand_site!r} does not move with the last joint, {joints[-1]!r}")
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+    found = []
+    while body:
+        body = int(model.body_parentid[body])
+        found.append(body)
+    return found

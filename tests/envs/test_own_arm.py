@@ -1,0 +1,201 @@
+"""An arm of one's own, from an MJCF file."""
+
+import pickle
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import viapoint.envs
+from viapoint.envs.arms import PANDA, Arm
+from viapoint.envs.arms.capsule_fit import around_points, surface
+from viapoint.envs.registration import OWN_ARM_TASKS
+
+assert viapoint.envs, "importing it registers the environments"
+
+DOCS = Path(__file__).parents[2] / "docs"
+UR5E = DOCS / "ur5e.xml"
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+FETCH = {
+    "hand_site": "robot0:grip",
+    "joints": [
+        f"robot0:{name}_joint"
+        for name in (
+            "shoulder_pan", "shoulder_lift", "upperarm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll",
+        )
+    ],
+    "joint_range": [(-1.6, 1.6), (-1.2, 1.5), (-3.1, 3.1), (-2.2, 2.2), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)],
+    "torque_limit": (33.8, 131.7, 76.9, 66.1, 29.3, 25.7, 7.3),
+    "home": (0.0, -0.5, 0.0, 1.3, 0.0, 0.77, 0.0),
+}  # fmt: skip
+
+
+def ur5e(**changes):
+    return Arm.from_mjcf(UR5E, **{"hand_site": "hand", "joints": JOINTS, "home": HOME, **changes})
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ur5e(velocity_limit=np.pi)
+
+
+def places(arm, number=300):
+    low, high = np.array(arm.place.box)
+    return np.random.default_rng(0).uniform(low, high, (number, 3))
+
+
+def test_it_is_the_arm_of_the_file(arm):
+    """The hand is where the file's model has it, for any posture, and so are mass and inertia."""
+    model, data = (m := mujoco.MjModel.from_xml_path(str(UR5E))), mujoco.MjData(m)
+    rng, full = np.random.default_rng(1), np.zeros((6, 6))
+    for joints in rng.uniform(-3.0, 3.0, (20, 6)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = joints, 0.0, rng.uniform(-1, 1, 6)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(arm.hand(joints), data.site("hand").xpos, atol=1e-5)
+        mujoco.mj_fullM(model, data, full)
+        gain = rng.uniform(-1.0, 1.0, 6)
+        moving, holding = arm.chain.torques(joints, 0.0 * joints, gain)
+        np.testing.assert_allclose(moving, full @ gain, atol=1e-3)
+        np.testing.assert_allclose(holding, data.qfrc_bias, atol=1e-2)
+
+
+def test_everywhere_in_its_reach_the_hand_gets_there_turned_as_at_home(arm):
+    hand = places(arm)
+    joints = arm.posture(hand)
+    np.testing.assert_allclose(arm.hand(joints), hand, atol=1e-6)
+    low, high = np.array(arm.joint_range).T
+    assert ((joints > low) & (joints < high)).all()
+    model = arm.compile(0, whole_arm=True)
+    data, turns = mujoco.MjData(model), []
+    for posture in (np.array(HOME), *joints):
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        assert data.ncon == 0
+        turns.append(data.site("hand").xmat.reshape(3, 3).copy())
+    turned = np.arccos(np.clip((np.einsum("nij,ij->n", turns, turns[0]) - 1.0) / 2.0, -1.0, 1.0))
+    assert turned.max() < 0.4
+    assert (arm.reach_margin(hand) >= 0.0).all()
+    assert arm.reach_margin(np.array(arm.place.box[1]) + 0.01) < 0.0
+
+
+def test_capsules_contain_the_links():
+    model = mujoco.MjModel.from_xml_path(str(UR5E))
+    data, rng = mujoco.MjData(model), np.random.default_rng(2)
+    mujoco.mj_kinematics(model, data)
+    for geom in range(model.ngeom):
+        points, around = surface(model, data, geom)
+        ends, radius = around_points(points, np.full(len(points), around), rng.normal(size=(3, 3)))
+        along = np.clip((points - ends[0]) @ (ends[1] - ends[0]) / ((ends[1] - ends[0]) ** 2).sum(), 0.0, 1.0)
+        away = np.linalg.norm(points - ends[0] - along[:, None] * (ends[1] - ends[0]), axis=-1)
+        assert (away + around <= radius + 1e-9).all()
+
+
+@pytest.mark.parametrize("env_id", OWN_ARM_TASKS)
+def test_environments_take_it_and_it_moves_as_planned(arm, env_id):
+    env = gym.make_vec(env_id, num_envs=24, arm=arm, threads=1)
+    env.reset(seed=0)
+    inner = pickle.loads(pickle.dumps(env.unwrapped))
+    inner.reset(seed=0)
+    _, _, info = inner.decide(np.zeros((24, 4)))
+    free = env_id == "viapoint/Reach-v0"
+    assert (info["is_success"] if free else info["collision"]).all()
+    if free:
+        assert info["tracking_error"].max() < 1e-3
+        np.testing.assert_array_equal(info["stretch"], 1.0)
+
+
+@pytest.mark.parametrize(("env_id", "like"), OWN_ARM_TASKS.items())
+def test_without_one_they_are_the_pandas(env_id, like):
+    one, other = gym.make(env_id), gym.make(like)
+    assert one.unwrapped.task == other.unwrapped.task
+    assert one.unwrapped.task.arm is PANDA
+    assert env_id in (DOCS / "bring-your-arm.md").read_text(encoding="utf-8")
+
+
+def test_posture_in_torch_is_the_same_and_differentiable(arm):
+    hand = torch.as_tensor(places(arm, 40)).requires_grad_()
+    joints = arm.posture(hand)
+    np.testing.assert_allclose(joints.detach().numpy(), arm.posture(places(arm, 40)), atol=1e-9)
+    jacobian = torch.autograd.grad(arm.hand(joints).sum(), hand)[0]
+    np.testing.assert_allclose(jacobian.numpy(), 1.0, atol=1e-4)  # the hand goes where it is sent
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hand_site": "tool"}, "no site 'tool' in the file; there are: hand"),
+        ({"joints": (*JOINTS[:5], "wrist_4")}, "no joint 'wrist_4'.* there are: shoulder_pan"),
+        ({"joints": JOINTS[:4]}, "five or more"),
+        ({"joints": (JOINTS[1], JOINTS[0], *JOINTS[2:])}, "'shoulder_lift' does not carry 'shoulder_pan'"),
+        ({"joints": JOINTS[:5], "home": HOME[:5], "hand_site": "hand"}, None),
+        ({"home": HOME[:3]}, "home must be 6 numbers"),
+        ({"home": (7.0, *HOME[1:])}, "home is outside the range of shoulder_pan"),
+        ({"torque_limit": -1.0}, "torque_limit must be positive"),
+        ({"workspace": ((0.3, -0.2, 0.1), (1.2, 0.2, 0.3))}, r"does not get to \("),
+        ({"home": (0.0, -1.57, 0.0, 0.0, 0.0, 0.0)}, "give another home"),
+    ],
+)
+def test_what_is_missing_is_named(changes, message):
+    if message is None:
+        assert ur5e(**changes).dimension == 3  # the last joint is held still
+        return
+    with pytest.raises(ValueError, match=message):
+        ur5e(**changes)
+
+
+def test_joints_need_limits_and_torques(tmp_path):
+    text = UR5E.read_text(encoding="utf-8")
+    for change, message in (
+        (lambda t: re.sub(r' range="-6.2832 6.2832"', "", t), "'shoulder_pan' has no limits"),
+        (
+            lambda t: re.sub(r' actuatorfrcrange="[^"]*"', "", t),
+            "no actuator with a limited force drives shoulder_pan",
+        ),
+        (
+            lambda t: re.sub(r"<joint name=\"elbow\" range", '<joint name="elbow" type="slide" range', t),
+            "is no hinge",
+        ),
+    ):
+        path = tmp_path / "arm.xml"
+        path.write_text(change(text), encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
+    with pytest.raises(ValueError, match="no file"):
+        Arm.from_mjcf(tmp_path / "none.xml", hand_site="hand", joints=JOINTS)
+
+
+def test_goals_out_of_reach_and_obstacles_at_the_start_are_refused_with_the_reason(arm):
+    env = gym.make("viapoint/Obstacles-v0", arm=arm)
+    start, goal = np.array(arm.workspace)
+    with pytest.raises(ValueError, match="out of the arm's reach"):
+        env.reset(options={"start": start, "goal": goal + 0.3, "obstacles": []})
+    touching = np.concatenate((start + 0.01, np.zeros(3), [0.03]))
+    with pytest.raises(ValueError, match=r"obstacle 0 .* touches the arm at the start"):
+        env.reset(options={"start": start, "goal": goal, "obstacles": touching[None]})
+
+
+@pytest.mark.skipif(find_spec("gymnasium_robotics") is None, reason="gymnasium-robotics is not installed")
+def test_the_fetch_of_gymnasium_robotics():
+    assets = Path(find_spec("gymnasium_robotics").submodule_search_locations[0]) / "envs" / "assets"
+    path = assets / "fetch" / "reach.xml"
+    with pytest.raises(ValueError, match="'robot0:upperarm_roll_joint' has no limits"):
+        Arm.from_mjcf(path, **{**FETCH, "joint_range": None})
+    with pytest.raises(ValueError, match="no actuator with a limited force drives robot0:shoulder_pan_joint"):
+        Arm.from_mjcf(path, **{**FETCH, "torque_limit": None})
+    fetch = Arm.from_mjcf(path, **FETCH)
+    env = gym.make_vec("viapoint/Obstacles-v0", num_envs=16, arm=fetch, threads=1)
+    env.reset(seed=0)
+    _, _, info = env.unwrapped.decide(np.zeros((16, 4)))
+    assert info["collision"].all()
+    env = gym.make_vec("viapoint/Reach-v0", num_envs=16, arm=fetch, threads=1)
+    env.reset(seed=0)
+    _, _, info = env.unwrapped.decide(np.zeros((16, 4)))
+    assert info["is_success"].all()
+    assert info["tracking_error"].max() < 2e-3
