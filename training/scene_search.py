@@ -24,7 +24,7 @@ SPARE, SAFE = 1.2, 1.1
 AT_ONCE = 64
 """Scenes measured together."""
 MOST_DRAWN, MOST_ROUNDS = 1 << 18, 20
-"""Scenes drawn, and how often more are measured, before giving up."""
+"""Scenes drawn, and how often more are measured or planned, before giving up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,9 @@ class Found(NamedTuple):
     """What the planner found, shape (N, m)."""
 
 
-def search(trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str) -> Found:
+def search(
+    trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str, most_drawn: int = MOST_DRAWN
+) -> Found:
     """As many scenes of each kind as asked for: the first ones that random actions and the planner solve.
 
     Args:
@@ -69,11 +71,12 @@ def search(trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str)
         kinds: Looked for.
         seed: Of the random actions.
         label: Shown beside the progress.
+        most_drawn: Scenes drawn before giving up.
 
     Raises:
         RuntimeError: One kind is too rare.
     """
-    pool = _Pool(trial, source, kinds)
+    pool = _Pool(trial, source, kinds, most_drawn)
     scenes, share = pool.empty, np.zeros(0)
     solution, tried, failed = np.zeros((0, trial.task.action.size)), np.zeros(0, bool), np.zeros(0, bool)
     for _ in range(MOST_ROUNDS):
@@ -101,8 +104,8 @@ def search(trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str)
 class _Pool:
     """Scenes that are drawn but not measured, with their estimated kinds."""
 
-    def __init__(self, trial: Trial, source: Source, kinds: Kinds) -> None:
-        self._trial, self._source, self._kinds = trial, source, kinds
+    def __init__(self, trial: Trial, source: Source, kinds: Kinds, most_drawn: int) -> None:
+        self._trial, self._source, self._kinds, self._most_drawn = trial, source, kinds, most_drawn
         self._scenes = self.empty = source.draw(0)
         self._kind = np.zeros(0, dtype=np.int64)
         self._drawn = 0
@@ -111,11 +114,9 @@ class _Pool:
         """Some of each kind that is missing, by the estimate, in turn, a few to spare; they leave the pool."""
         wanted = np.ceil(SPARE * missing).astype(np.int64)
         while (_counts(self._kind, self._kinds) < wanted).any():
-            if self._drawn >= MOST_DRAWN:
-                raise RuntimeError(
-                    f"there lack {_named(wanted - _counts(self._kind, self._kinds), self._kinds)} "
-                    f"scenes by estimate after {self._drawn} drawn"
-                )
+            if self._drawn >= self._most_drawn:
+                lacking = _named(wanted - _counts(self._kind, self._kinds), self._kinds)
+                raise RuntimeError(f"there lack {lacking} scenes by estimate after {self._drawn} drawn")
             block = self._source.draw(self._source.block)
             self._drawn += self._source.block
             kind = self._kinds.of_share(SAFE * self._estimate(block))
