@@ -168,7 +168,7 @@ def _engine(
 
     def rollout() -> None:
         simulator.batch.state[:] = state
-        simulator.batch.rollout(steps, controls, record=("qpos", "ncon"))
+        simulator.batch.rollout(steps, controls, record=simulator.recorded)
 
     return rollout
 
