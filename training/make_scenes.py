@@ -55,7 +55,7 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
     size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
     names = list(FAMILIES) if name == "hard" else [""]
     parts = [
-        _of_family(trial, family, size // len(names)) if family else _drawn(trial, name, size)
+        of_family(trial, family, size // len(names)) if family else _drawn(trial, name, size)
         for family in names
     ]
     trial.close()
@@ -88,7 +88,7 @@ def _drawn(trial: Trial, name: str, size: int) -> Found:
     return search(trial, source, kinds, seed=seed, label=f"{trial.env_id} {name}")
 
 
-def _of_family(trial: Trial, family: str, size: int) -> Found:
+def of_family(trial: Trial, family: str, size: int) -> Found:
     """Hard scenes of one family."""
     seed = SEEDS["hard"] + 101 * list(FAMILIES).index(family)
     kinds = Kinds(of_share=lambda share: np.where(share < HARDEST, 0, -1), names=("share < 5 %",), quota=size)
