@@ -20,7 +20,7 @@ from viapoint.envs.arms.chain import Chain, Constants
 Float = NDArray[np.float64]
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 
-DEGREE = 6
+DEGREE = 5
 """Of the polynomials along each axis."""
 NEWTON = 3
 """Steps that put the hand where it belongs."""
@@ -48,10 +48,17 @@ class PostureMap:
         xp = namespace_of(hand)
         low, high = (xp.asarray(corner, dtype=hand.dtype) for corner in self.box)
         inside = xp.minimum(xp.maximum(hand, low), high)
-        along = [_chebyshev(inside[..., i], self.box[0][i], self.box[1][i]) for i in range(3)]
-        basis = along[0][..., :, None, None] * along[1][..., None, :, None] * along[2][..., None, None, :]
-        flat = xp.reshape(basis, (*hand.shape[:-1], (DEGREE + 1) ** 3))
-        joints = flat @ xp.asarray(self._table, dtype=hand.dtype)
+        joints = xp.asarray(self._table, dtype=hand.dtype)  # of shape (DEGREE + 1,) * 3 + (J,) to begin with
+        for i in range(3):
+            terms = _chebyshev(inside[..., i], self.box[0][i], self.box[1][i])
+            # Term by term: the order of a matrix product, and so its last bit, depends on the size of the batch.
+            rest = (None,) * (3 - i)
+            parts = [
+                joints[k] if i == 0 else joints[..., k, *[slice(None)] * (3 - i)] for k in range(DEGREE + 1)
+            ]
+            joints = terms[0][(..., *rest)] * parts[0]
+            for term, part in zip(terms[1:], parts[1:], strict=True):
+                joints = joints + term[(..., *rest)] * part
         for _ in range(NEWTON):
             joints = joints + self._step(joints, inside)
         return joints
@@ -64,7 +71,7 @@ class PostureMap:
 
     @functools.cached_property
     def _table(self) -> Float:
-        return np.array(self.coefficients)
+        return np.array(self.coefficients).reshape((DEGREE + 1,) * 3 + (-1,))
 
     def _step(self, joints: Array, hand: Array) -> Array:
         """The least change of the joints that brings the hand nearer, as if it moved in proportion."""
@@ -144,14 +151,14 @@ def _improvement(
     return np.asarray(step * np.minimum(1.0, 0.5 / np.maximum(np.abs(step).max(axis=-1), 1e-9))[..., None])
 
 
-def _chebyshev(values: Array, low: float, high: float) -> Array:
-    """Chebyshev polynomials of degree 0 to DEGREE over an interval, shape (..., DEGREE + 1)."""
+def _chebyshev(values: Array, low: float, high: float) -> list[Array]:
+    """Chebyshev polynomials of degree 0 to DEGREE over an interval."""
     xp = namespace_of(values)
     x = clamp((values - low) * (2.0 / (high - low)) - 1.0, -1.0, 1.0)
     terms = [xp.ones_like(x), x]
     while len(terms) <= DEGREE:
         terms.append(2.0 * x * terms[-1] - terms[-2])
-    return xp.stack(terms, axis=-1)
+    return terms
 
 
 def _solved(m: list[list[Array]], v: list[Array]) -> list[Array]:

@@ -111,6 +111,20 @@ def test_environments_take_it_and_it_moves_as_planned(arm, env_id):
         np.testing.assert_array_equal(info["stretch"], 1.0)
 
 
+def test_single_equals_batch_bit_for_bit(arm):
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)).astype(np.float32)
+    env, single = (
+        gym.make_vec("viapoint/Obstacles-v0", num_envs=12, arm=arm),
+        gym.make("viapoint/Obstacles-v0", arm=arm),
+    )
+    env.reset(seed=5)
+    *_, together = env.step(actions)
+    for i in range(12):
+        single.reset(seed=5 + i)
+        *_, alone = single.step(actions[i])
+        assert alone == {name: together[name][i].item() for name in alone}
+
+
 @pytest.mark.parametrize(("env_id", "like"), OWN_ARM_TASKS.items())
 def test_without_one_they_are_the_pandas(env_id, like):
     one, other = gym.make(env_id), gym.make(like)
