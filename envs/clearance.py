@@ -139,7 +139,10 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> A
 
 
 def _dot(first: list[Array], second: list[Array]) -> Array:
-    return sum(u * v for u, v in zip(first, second, strict=True))
+    total = first[0] * second[0]
+    for u, v in zip(first[1:], second[1:], strict=True):
+        total = total + u * v
+    return total
 
 
 def _clearance(squared: Array, radii: Array, present: Array) -> Array:

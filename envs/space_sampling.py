@@ -25,7 +25,8 @@ Bool = NDArray[np.bool_]
 ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 14
 """How many pairs of ends, witnesses, structures and other obstacles are drawn at once, and at how many times a
 movement is looked at."""
-ATTEMPTS = 400
+ATTEMPTS = (1, 2, 4, *[8] * 50)
+"""How many attempts are made at once, one time after the other: few are left after the first."""
 GIVE_WAY = 1.3
 """How far what is in the witness's way moves, relative to what it lacks in clearance."""
 IN_THE_WAY = 0.004
@@ -58,16 +59,17 @@ class SpaceSampler:
         number = len(generators)
         scenes = Scenes(np.zeros((number, 3)), np.zeros((number, 3)), np.zeros((number, self._rows, 7)))
         pending = np.arange(number)
-        for _ in range(ATTEMPTS):
-            u = np.stack([generators[int(i)].random(self._size) for i in pending])
-            given = None if ends is None else (ends[0][pending], ends[1][pending])
-            found, attempt = self._attempt(u, given)
-            scenes.put(pending[found], attempt)
-            pending = pending[~found]
+        for attempts in ATTEMPTS:
+            u = np.concatenate([generators[int(i)].random((attempts, self._size)) for i in pending])
+            each = np.repeat(pending, attempts)
+            found, attempt = self._attempt(u, None if ends is None else (ends[0][each], ends[1][each]))
+            solved, first = np.unique(each[found], return_index=True)
+            scenes.put(solved, attempt.take(first))
+            pending = np.setdiff1d(pending, solved)
             if not len(pending):
                 return scenes
         raise RuntimeError(
-            f"no scene with {self.distribution.n_obstacles} obstacles was found in {ATTEMPTS} attempts"
+            f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(ATTEMPTS)} attempts"
             + ("" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}")
         )
 

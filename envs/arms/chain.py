@@ -7,6 +7,7 @@ and what is constant and zero in a robot's dimensions is never multiplied. NumPy
 from __future__ import annotations
 
 import functools
+import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -158,7 +159,9 @@ def _swept(spin: Vector, turn: Vector, arm: Vector) -> Vector:
 def _combined(axes: tuple[Vector, Vector, Vector], weights: Constants) -> Vector:
     """Axes times constant weights, where these are not zero."""
     used = [(axis, weight) for axis, weight in zip(axes, weights, strict=True) if weight != 0.0]
-    return [sum(axis[k] if weight == 1.0 else weight * axis[k] for axis, weight in used) for k in range(3)]
+    return [
+        _added([axis[k] if weight == 1.0 else weight * axis[k] for axis, weight in used]) for k in range(3)
+    ]
 
 
 def _sum(first: Vector, second: Vector) -> Vector:
@@ -170,7 +173,12 @@ def _less(first: Vector, second: Vector) -> Vector:
 
 
 def _dot(first: Vector, second: Vector) -> Array:
-    return sum(a * b for a, b in zip(first, second, strict=True))
+    return _added([a * b for a, b in zip(first, second, strict=True)])
+
+
+def _added(parts: list[Array]) -> Array:
+    """Their sum; that of none is 0."""
+    return functools.reduce(operator.add, parts) if parts else 0.0
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
