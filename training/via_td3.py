@@ -1,9 +1,9 @@
 """TD3 for decisions that are whole movements.
 
 It differs from :class:`stable_baselines3.TD3` in what a movement allows. The critic sees the features of the planned
-movement and learns only the part of the reward that no formula gives. The actor proposes several ways round and learns
-on scenes that are drawn but never simulated: each proposal climbs the critic's judgement, and its score regresses it.
-An episode is one decision, so nothing is bootstrapped.
+movement and learns only the part of the reward that no formula gives. The actor improves movements and learns on scenes
+that are drawn but never simulated: what it makes of a movement climbs the critic's judgement, and what it foretells of
+it regresses that. An episode is one decision, so nothing is bootstrapped.
 """
 
 from __future__ import annotations
