@@ -21,7 +21,14 @@ from viapoint.envs.outcome import (
     least_clearance,
     norm,
 )
-from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT, RewardTerms, RewardWeights, reward_terms
+from viapoint.envs.reward import (
+    CLEARANCE_RANGE,
+    CLEARANCE_UNIT,
+    GOAL_ERROR_UNIT,
+    RewardTerms,
+    RewardWeights,
+    reward_terms,
+)
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record
 from viapoint.envs.steering import Motion
@@ -216,8 +223,8 @@ def step_rewards(
     """The weighted terms of one control step of N episodes, and that of its progress.
 
     Over an episode the terms of a success sum to those of a whole movement with the same outcome, and the progress to
-    its weight. The clearance term is given when it is lost, the others at the end; smoothness and duration count where
-    the hand arrived only, as a movement that ends early would seem the smoothest and quickest.
+    its weight. Clearance and goal error are given when they change, the others at the end; smoothness and duration
+    count where the hand arrived only, as a movement that ends early would seem the smoothest and quickest.
 
     Args:
         before: The step.
@@ -231,12 +238,13 @@ def step_rewards(
     whole = reward_terms(after, centre_duration, weights)
     low, high = CLEARANCE_RANGE
     lost = weights.clearance * np.clip(before.planned_clearance, low, high) / CLEARANCE_UNIT
+    far = -weights.goal_error * np.minimum(before.goal_error / GOAL_ERROR_UNIT, 1.0)
     arrived = after.is_success
     terms = RewardTerms(
         success=np.where(ended, whole.success, 0.0),
         collision=np.where(ended, whole.collision, 0.0),
         clearance=whole.clearance - np.where(begun, 0.0, lost),
-        goal_error=np.where(ended, whole.goal_error, 0.0),
+        goal_error=whole.goal_error - np.where(begun, 0.0, far),
         smoothness=np.where(ended & arrived, whole.smoothness, 0.0),
         duration=np.where(ended & arrived, whole.duration, 0.0),
     )

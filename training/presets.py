@@ -66,6 +66,8 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 16,
     "policy_kwargs": _NETWORK,
 }
+_LITTLE_ENTROPY = "auto_0.02"
+"""Rewards are of size one: begun at 1, as it is otherwise, entropy outweighs them for ten thousand decisions."""
 _STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
@@ -76,9 +78,9 @@ PRESETS: dict[str, Preset] = {
         "ViaPolicy",  # its defaults are its settings
         learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
     ),
-    "sac": _preset(64, 40_000, **_OFF_POLICY),
+    "sac": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
     "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(64, 40_000, **_OFF_POLICY),
+    "tqc": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
     "ppo": _preset(
         64,
         400_000,
@@ -94,9 +96,9 @@ PRESETS: dict[str, Preset] = {
 """By the name the command line knows them by; the comments and units are those of Stable-Baselines3."""
 
 STEP_PRESETS: dict[str, Preset] = {
-    "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE),
+    "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
     "td3": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(64, 200_000, **_SELDOM, **_STEP_WISE),
+    "tqc": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
     "ppo": _preset(
         64,
         2_000_000,
