@@ -44,11 +44,14 @@ class FrozenScenes:
     """An action that the planner found and the simulation confirmed, shape (N, m)."""
     family: Any = DRAWN
     """Name of each scene's family, shape (N,), or one for all; DRAWN for the training distribution."""
+    number: Any = -1
+    """Which scene it is of those drawn for the set, shape (N,); -1 where nobody counted."""
 
     def __post_init__(self) -> None:
-        """One name for each scene."""
-        names = np.broadcast_to(np.asarray(self.family, dtype=np.str_), self.share.shape)
-        object.__setattr__(self, "family", names)
+        """One name and one number for each scene."""
+        for name, kind in (("family", np.str_), ("number", np.int64)):
+            values = np.broadcast_to(np.asarray(getattr(self, name), dtype=kind), self.share.shape)
+            object.__setattr__(self, name, values)
 
     @property
     def band(self) -> NDArray[np.int64]:
@@ -74,8 +77,9 @@ class FrozenScenes:
 
     def save(self, path: Path) -> None:
         """Write the set with its hash."""
-        words = {"env_id": self.env_id, "sha256": self.sha256, "family": self.family}
-        np.savez_compressed(path, **{k: np.array(v) for k, v in words.items()}, **self.arrays())  # type: ignore[arg-type]
+        names = ("env_id", "sha256", "family", "number")
+        rest = {name: np.array(getattr(self, name)) for name in names}
+        np.savez_compressed(path, **rest, **self.arrays())  # type: ignore[arg-type]
 
     def take(self, rows: Any) -> FrozenScenes:
         """The scenes at `rows`, an index array, slice or mask."""
@@ -86,6 +90,7 @@ class FrozenScenes:
             share=self.share[rows],
             solution=self.solution[rows],
             family=self.family[rows],
+            number=self.number[rows],
         )
 
 
@@ -116,7 +121,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256", "family")}
+            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256", "family", "number")}
     except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
         raise ValueError(f"{path} is not a file of scenes: {error}") from None
     frozen = FrozenScenes(
@@ -126,6 +131,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         share=content["share"],
         solution=content["solution"],
         family=content["family"],
+        number=content["number"],
     )
     if frozen.sha256 != str(content["sha256"]):
         raise ValueError(f"{path} is damaged: its content does not have the hash that it states")

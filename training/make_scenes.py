@@ -4,21 +4,27 @@
 set in each band of the solution share. `hard` holds scenes of families that are never trained on, as many of each, all
 with a share below 5 %. Every scene was solved in simulation by some of at most 4,096 random actions, so that its
 difficulty is known, and by the planner.
+
+Searching for scenes takes estimates of their shares, which change with the program. So each scene of a file knows which
+of the drawn scenes it is: what is made again are these, and the hash tells whether scenes and shares are the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.scene_families import FAMILIES, family_sampler
 from viapoint.envs.scenes import Scenes
-from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, FrozenScenes, bands, shipped_path
-from viapoint.training.scene_search import Found, Kinds, Source, search
+from viapoint.envs.task import Task
+from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands, load, shipped_path
+from viapoint.training.scene_search import Kinds, Source, measured, redrawn, search
 from viapoint.training.trial import Trial
 
 Float = NDArray[np.float64]
@@ -39,8 +45,46 @@ SETS = {
 """Environments with shipped scenes, and their sets."""
 
 
+class Lot(NamedTuple):
+    """Scenes of a set that come from one source."""
+
+    family: str
+    source: Source
+    kinds: Kinds
+    seed: int
+
+
+def lots(task: Task, name: str, size: int) -> list[Lot]:
+    """Where the scenes of a set come from.
+
+    Args:
+        task: They are for.
+        name: `validation`, `test` or `hard`.
+        size: Number of scenes, a multiple of the bands or families.
+    """
+    seed = SEEDS[name]
+    if name == "hard":
+        seeds = {family: seed + 101 * i for i, family in enumerate(FAMILIES)}
+        hard = Kinds(
+            of_share=lambda share: np.where(share < HARDEST, 0, -1),
+            names=("share < 5 %",),
+            quota=size // len(FAMILIES),
+        )
+        return [
+            Lot(family, _source(family_sampler(task, family), seeds[family], block=64), hard, seeds[family])
+            for family in FAMILIES
+        ]
+    if task.scenes.n_obstacles[1] == 0:
+        any_ = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
+        return [Lot(DRAWN, _source(task.sampler(), seed, block=WITHOUT_OBSTACLES), any_, seed)]
+    rare = not task.whole_arm  # few scenes are hard where the hand alone must clear
+    levels = ((0.03, 2048), (0.013, 16384)) if rare else ((0.03, 1024),)
+    source = _source(task.sampler(), seed, block=2048 if rare else 512, levels=levels)
+    return [Lot(DRAWN, source, Kinds(of_share=bands, names=BANDS, quota=size // len(BANDS)), seed)]
+
+
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:
-    """Draw, measure and certify a set of scenes.
+    """Search for the scenes of a set, measure and certify them.
 
     Args:
         env_id: The environment they are for.
@@ -53,47 +97,50 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
     """
     trial = Trial(env_id, threads=threads)
     size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
-    names = list(FAMILIES) if name == "hard" else [""]
-    parts = [
-        of_family(trial, family, size // len(names)) if family else _drawn(trial, name, size)
-        for family in names
+    parts = lots(trial.task, name, size)
+    found = [
+        search(trial, lot.source, lot.kinds, seed=lot.seed, label=f"{env_id} {name} {lot.family}".strip())
+        for lot in parts
     ]
     trial.close()
-    order = np.arange(size).reshape(len(names), -1).T.ravel()  # families in turn
+    order = np.arange(size).reshape(len(parts), -1).T.ravel()  # families in turn
     return FrozenScenes(
         name=name,
         env_id=env_id,
-        scenes=Scenes(*(np.concatenate(f) for f in zip(*(part.scenes for part in parts), strict=True))),
-        share=np.concatenate([part.share for part in parts]),
-        solution=np.concatenate([part.solution for part in parts]),
-        family=np.repeat(names, size // len(names)),
+        scenes=Scenes(*(np.concatenate(f) for f in zip(*(part.scenes for part in found), strict=True))),
+        share=np.concatenate([part.share for part in found]),
+        solution=np.concatenate([part.solution for part in found]),
+        family=np.repeat([lot.family for lot in parts], size // len(parts)),
+        number=np.concatenate([part.number for part in found]),
     ).take(order)
 
 
-def _drawn(trial: Trial, name: str, size: int) -> Found:
-    """Scenes of the training distribution, as many in each band."""
-    seed, task = SEEDS[name], trial.task
-    if task.scenes.n_obstacles[1] == 0:
-        source = _source(task.sampler(), seed, block=size)
-        kinds = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
-    else:
-        rare = not task.whole_arm  # few scenes are hard where the hand alone must clear
-        source = _source(
-            task.sampler(),
-            seed,
-            block=2048 if rare else 512,
-            levels=((0.03, 2048), (0.013, 16384)) if rare else ((0.03, 1024),),
+def remake(frozen: FrozenScenes, threads: int = 0) -> FrozenScenes:
+    """Draw the scenes of a set again by their numbers, measure them again, and try their solutions.
+
+    Args:
+        frozen: The set.
+        threads: Of the simulation, 0 for one per core; the result does not depend on it.
+
+    Raises:
+        RuntimeError: A solution is none.
+    """
+    trial = Trial(frozen.env_id, threads=threads)
+    starts, goals, obstacles, share = (array.copy() for array in (*frozen.scenes, frozen.share))
+    for lot in lots(trial.task, frozen.name, len(frozen.share)):
+        rows = np.flatnonzero(frozen.family == lot.family)
+        scenes = redrawn(lot.source, frozen.number[rows])
+        Scenes(starts, goals, obstacles).put(rows, scenes)
+        label = f"{frozen.env_id} {frozen.name} {lot.family}".strip()
+        share[rows] = measured(trial, scenes, lot.seed, label)
+    again = dataclasses.replace(frozen, scenes=Scenes(starts, goals, obstacles), share=share)
+    solved = trial(again.scenes, again.solution).success
+    trial.close()
+    if not solved.all():
+        raise RuntimeError(
+            f"{frozen.env_id} {frozen.name}: the solution of scene {int((~solved).argmax())} is none"
         )
-        kinds = Kinds(of_share=bands, names=BANDS, quota=size // len(BANDS))
-    return search(trial, source, kinds, seed=seed, label=f"{trial.env_id} {name}")
-
-
-def of_family(trial: Trial, family: str, size: int) -> Found:
-    """Hard scenes of one family."""
-    seed = SEEDS["hard"] + 101 * list(FAMILIES).index(family)
-    kinds = Kinds(of_share=lambda share: np.where(share < HARDEST, 0, -1), names=("share < 5 %",), quota=size)
-    source = _source(family_sampler(trial.task, family), seed, block=64)
-    return search(trial, source, kinds, seed=seed, label=f"{trial.env_id} hard, {family}")
+    return again
 
 
 def _source(
@@ -110,31 +157,34 @@ def _source(
 def main() -> None:
     """Make the sets named on the command line, or all, and say whether they are as they were."""
     parser = argparse.ArgumentParser(
-        description="Make the frozen scenes and compare their hashes with those shipped."
+        description="Make the frozen scenes again and compare their hashes with those shipped."
     )
     parser.add_argument("--env", nargs="*", default=list(SETS), choices=list(SETS), help="environment ids")
     parser.add_argument("--sets", nargs="*", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
+    parser.add_argument(
+        "--search", action="store_true", help="choose scenes anew, as for a set not there yet"
+    )
     parser.add_argument("--out", type=Path, default=None, help="folder to write to instead of the package's")
     parser.add_argument("--threads", type=int, default=0, help="of the simulation, 0 for one per core")
     arguments = parser.parse_args()
     for env_id in arguments.env:
         for name in (name for name in SETS[env_id] if name in arguments.sets):
-            frozen, shipped = make(env_id, name, threads=arguments.threads), shipped_path(name, env_id)
-            before = "new" if not shipped.exists() else _sha256(shipped)
+            shipped = shipped_path(name, env_id)
+            before = load(name, env_id) if shipped.is_file() else None
+            if before is None or arguments.search:
+                frozen = make(env_id, name, threads=arguments.threads)
+            else:
+                frozen = remake(before, threads=arguments.threads)
             path = shipped if arguments.out is None else arguments.out / shipped.name
             path.parent.mkdir(parents=True, exist_ok=True)
             frozen.save(path)
             counts = ", ".join(f"{label}: {(frozen.band == i).sum()}" for i, label in enumerate(BANDS))
-            verdict = "unchanged" if before == frozen.sha256 else f"was {before}"
+            same = before is not None and before.sha256 == frozen.sha256
+            verdict = "unchanged" if same else "new" if before is None else f"was {before.sha256}"
             print(
                 f"{path.name}: {len(frozen.share)} scenes ({counts}) sha256 {frozen.sha256} ({verdict})",
                 flush=True,
             )
-
-
-def _sha256(path: Path) -> str:
-    with np.load(path, allow_pickle=False) as archive:
-        return str(archive["sha256"])
 
 
 if __name__ == "__main__":

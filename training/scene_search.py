@@ -34,7 +34,7 @@ class Source:
     draw: Callable[[int], Scenes]
     """The next so many."""
     block: int
-    """Scenes drawn between two looks at what is missing."""
+    """Scenes drawn together, before the next look at what is missing."""
     levels: tuple[tuple[float, int], ...] = ()
     """Where the estimated share is below the first number, it is estimated again from so many plans."""
 
@@ -58,6 +58,8 @@ class Found(NamedTuple):
     """Solution shares, shape (N,)."""
     solution: Float
     """What the planner found, shape (N, m)."""
+    number: Index
+    """Which of the drawn scenes they are, shape (N,)."""
 
 
 def search(
@@ -77,7 +79,7 @@ def search(
         RuntimeError: One kind is too rare.
     """
     pool = _Pool(trial, source, kinds, most_drawn)
-    scenes, share = pool.empty, np.zeros(0)
+    scenes, share, number = pool.empty, np.zeros(0), np.zeros(0, dtype=np.int64)
     solution, tried, failed = np.zeros((0, trial.task.action.size)), np.zeros(0, bool), np.zeros(0, bool)
     for _ in range(MOST_ROUNDS):
         good = np.where((share > 0.0) & ~failed, kinds.of_share(share), -1)
@@ -85,14 +87,14 @@ def search(
         untried = chosen[~tried[chosen]]
         if len(chosen) == kinds.quota * len(kinds.names):
             if not len(untried):
-                return Found(scenes.take(chosen), share[chosen], solution[chosen])
+                return Found(scenes.take(chosen), share[chosen], solution[chosen], number[chosen])
             tried[untried] = True
             solution[untried], solved = _planned(trial, scenes.take(untried), label)
             failed[untried] = ~solved
             continue
-        more = pool.more(kinds.quota - _counts(good, kinds))
-        scenes = _joined(scenes, more)
-        share = np.concatenate((share, _measured(trial, more, seed, label)))
+        more, numbers = pool.more(kinds.quota - _counts(good, kinds))
+        scenes, number = _joined(scenes, more), np.concatenate((number, numbers))
+        share = np.concatenate((share, measured(trial, more, seed, label)))
         solution = np.concatenate((solution, np.zeros((len(more.start), solution.shape[1]))))
         tried, failed = (np.concatenate((each, np.zeros(len(more.start), bool))) for each in (tried, failed))
     missing = kinds.quota - _counts(good, kinds)
@@ -101,32 +103,49 @@ def search(
     )
 
 
+def redrawn(source: Source, number: Index) -> Scenes:
+    """The scenes of given numbers, drawn again."""
+    kept = []
+    for first in range(0, int(number.max()) + 1, source.block):
+        block, rows = source.draw(source.block), number - first
+        here = (rows >= 0) & (rows < source.block)
+        kept.append((np.flatnonzero(here), block.take(rows[here])))
+    order = np.argsort(np.concatenate([rows for rows, _ in kept]))
+    scenes = Scenes(*(np.concatenate(f) for f in zip(*(block for _, block in kept), strict=True)))
+    return scenes.take(order)
+
+
 class _Pool:
     """Scenes that are drawn but not measured, with their estimated kinds."""
 
     def __init__(self, trial: Trial, source: Source, kinds: Kinds, most_drawn: int) -> None:
         self._trial, self._source, self._kinds, self._most_drawn = trial, source, kinds, most_drawn
         self._scenes = self.empty = source.draw(0)
-        self._kind = np.zeros(0, dtype=np.int64)
+        self._kind = self._number = np.zeros(0, dtype=np.int64)
         self._drawn = 0
 
-    def more(self, missing: Index) -> Scenes:
-        """Some of each kind that is missing, by the estimate, in turn, a few to spare; they leave the pool."""
+    def more(self, missing: Index) -> tuple[Scenes, Index]:
+        """Some of each kind that is missing, by the estimate, in turn, a few to spare, and their numbers.
+
+        They leave the pool.
+        """
         wanted = np.ceil(SPARE * missing).astype(np.int64)
         while (_counts(self._kind, self._kinds) < wanted).any():
             if self._drawn >= self._most_drawn:
                 lacking = _named(wanted - _counts(self._kind, self._kinds), self._kinds)
                 raise RuntimeError(f"there lack {lacking} scenes by estimate after {self._drawn} drawn")
             block = self._source.draw(self._source.block)
+            numbers = self._drawn + np.arange(self._source.block)
             self._drawn += self._source.block
             kind = self._kinds.of_share(SAFE * self._estimate(block))
             self._scenes, self._kind = _joined(self._scenes, block), np.concatenate((self._kind, kind))
+            self._number = np.concatenate((self._number, numbers))
         rank = _ranks(self._kind, self._kinds)
         taken = np.flatnonzero((self._kind >= 0) & (rank < wanted[self._kind]))
         taken = taken[np.lexsort((-self._kind[taken], rank[taken]))]
-        some = self._scenes.take(taken)
+        some = self._scenes.take(taken), self._number[taken]
         rest = np.setdiff1d(np.flatnonzero(self._kind >= 0), taken)
-        self._scenes, self._kind = self._scenes.take(rest), self._kind[rest]
+        self._scenes, self._kind, self._number = self._scenes.take(rest), self._kind[rest], self._number[rest]
         return some
 
     def _estimate(self, scenes: Scenes) -> Float:
@@ -138,7 +157,7 @@ class _Pool:
         return share
 
 
-def _measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
+def measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
     """Solution shares, shape (N,)."""
     return np.concatenate(
         [solution_share(trial, scenes.take(rows), seed=seed) for rows in _lots(scenes, f"{label}: shares")]

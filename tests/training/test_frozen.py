@@ -1,16 +1,23 @@
 """Frozen scenes are what their files say, planners certify them, and difficulty is measured right."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from viapoint.envs.scene_families import FAMILIES
 from viapoint.envs.scenes import check_scenes
 from viapoint.training.baselines import METHODS, make_method
-from viapoint.training.difficulty import solution_share
+from viapoint.training.difficulty import planned_share, solution_share
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, load, shipped_path
+from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, remake
 from viapoint.training.planner import Planner, PlannerBudget
+from viapoint.training.scene_search import Kinds, Source, search
 from viapoint.training.screening import screen
 from viapoint.training.trial import Trial
 
+PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 ENV_ID = "viapoint/PlanarObstacles-v0"
 
 
@@ -21,27 +28,94 @@ def trial():
     trial.close()
 
 
+SHIPPED = [(env_id, name) for env_id, names in SETS.items() for name in names]
+
+
 @pytest.fixture(params=["test", "validation"])
 def frozen(request):
     return load(request.param, ENV_ID)
 
 
-def test_shipped_sets_are_whole_distinct_and_of_all_bands(frozen):
-    assert len(frozen.share) == {"test": 1000, "validation": 500}[frozen.name]
-    assert ((frozen.share > 0.0) & (frozen.share <= 1.0)).all()
-    assert (np.bincount(frozen.band, minlength=len(BANDS)) > 0.1 * len(frozen.share)).all()
-    assert len(np.unique(frozen.scenes.start, axis=0)) == len(frozen.share)
+@pytest.fixture(params=SHIPPED, ids=lambda pair: f"{pair[0][9:-3]} {pair[1]}")
+def shipped(request):
+    """Every set there is; loading one compares its hash."""
+    return load(request.param[1], request.param[0])
 
 
-def test_no_scene_is_in_both_sets():
-    one, other = load("test", ENV_ID).scenes.start, load("validation", ENV_ID).scenes.start
-    assert not set(map(tuple, one)) & set(map(tuple, other))
+@pytest.fixture(scope="module")
+def trials():
+    made = {}
+    yield lambda env_id: made.setdefault(env_id, Trial(env_id, 128, threads=1))
+    for each in made.values():
+        each.close()
 
 
-def test_every_scene_is_certified_and_the_straight_line_solves_none(frozen, trial):
-    check_scenes(frozen.scenes, trial.task.arm, whole_arm=False)
-    assert trial(frozen.scenes, frozen.solution).success.all()
-    assert not trial(frozen.scenes, np.zeros_like(frozen.solution)).success.any()
+def test_shipped_sets_are_whole_and_distinct_and_every_share_is_known(shipped):
+    size = WITHOUT_OBSTACLES if "Reach" in shipped.env_id else SIZES[shipped.name]
+    assert len(shipped.share) == len(shipped.family) == size
+    assert ((shipped.share > 0.0) & (shipped.share <= 1.0)).all()
+    assert len(np.unique(shipped.scenes.start, axis=0)) == size
+
+
+def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_family(shipped):
+    if shipped.name == "hard":
+        names, counts = np.unique(shipped.family, return_counts=True)
+        assert set(names) == set(FAMILIES)
+        assert set(counts) == {len(shipped.share) // len(FAMILIES)}
+        assert set(shipped.family[: len(FAMILIES)]) == set(FAMILIES)  # in turn, so that any part is mixed
+        assert (shipped.share < 0.05).all()
+    else:
+        assert (shipped.family == "").all()
+        if "Reach" not in shipped.env_id:
+            assert (np.bincount(shipped.band, minlength=len(BANDS)) == len(shipped.share) / len(BANDS)).all()
+
+
+@pytest.mark.parametrize("env_id", SETS)
+def test_no_scene_is_in_two_sets(env_id):
+    starts = [tuple(start) for name in SETS[env_id] for start in load(name, env_id).scenes.start]
+    assert len(set(starts)) == len(starts)
+
+
+def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, trials):
+    """The first of each set, and those that the straight line may solve, which is only where nothing is in the way."""
+    trial = trials(shipped.env_id)
+    check_scenes(shipped.scenes, trial.task.arm, whole_arm=trial.task.whole_arm)
+    some = shipped.take(slice(0, 120))
+    assert trial(some.scenes, some.solution).success.all()
+    straight = trial(some.scenes, np.zeros_like(some.solution)).success
+    assert straight.all() if "Reach" in shipped.env_id else not straight.any()
+
+
+def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads():
+    some = load("hard", ENV_ID).take(slice(0, 5))
+    assert remake(some, threads=1).sha256 == some.sha256
+
+
+def test_what_is_too_rare_is_said_to_be_missing(trial):
+    impossible = Kinds(
+        of_share=lambda share: np.where(share > 2.0, 1, 0), names=("any", "more than all"), quota=1
+    )
+    sampler, generator = trial.task.sampler(), np.random.default_rng(0)
+    source = Source(draw=lambda number: sampler([generator] * number), block=64)
+    with pytest.raises(RuntimeError, match="2 more than all scenes by estimate after 128 drawn"):
+        search(trial, source, impossible, seed=0, label="some", most_drawn=128)
+
+
+@pytest.mark.parametrize("env_id", [ENV_ID, "viapoint/PlanarWholeArm-v0"])
+def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, trials):
+    """With estimated shares, a little too high."""
+    task = trials(env_id).task
+    scenes = task.sampler()([np.random.default_rng(1_000 + i) for i in range(300)])
+    share = planned_share(trials(env_id), scenes, draws=128)
+    found = np.bincount(bands(share), minlength=len(BANDS)) / 300
+    (row,) = re.findall(rf"^\| `{env_id}` \|((?: [0-9]+ % \|)+)$", PAGE, flags=re.MULTILINE)
+    stated = np.array([float(part) for part in re.findall(r"[0-9]+", row)]) / 100.0
+    assert (found > 0.0).all()
+    assert (np.abs(found - stated) < 0.09).all(), (found, stated)
+
+
+def test_the_families_are_documented():
+    assert all(f"`{name}` (" in PAGE.replace("\n", " ") for name in FAMILIES)
 
 
 def test_the_stated_share_is_what_one_measures(frozen, trial):
@@ -89,10 +163,10 @@ def test_a_file_comes_back_as_it_was_and_damage_is_noticed(frozen, tmp_path):
     assert again.sha256 == some.sha256
     with np.load(path) as archive:
         content = dict(archive)
-    content["share"] = content["share"] * 0.5
-    np.savez(path, **content)
-    with pytest.raises(ValueError, match="damaged"):
-        load(path, ENV_ID)
+    for name, other in (("share", content["share"] * 0.5), ("family", np.full(5, "gate"))):
+        np.savez(path, **{**content, name: other})
+        with pytest.raises(ValueError, match="damaged"):
+            load(path, ENV_ID)
 
 
 def test_what_is_no_set_is_refused(tmp_path):
