@@ -157,7 +157,7 @@ def test_ranking_takes_the_best_of_what_it_judges(trial):
 def test_the_task_survives_json(trial):
     record = json.loads(json.dumps(trial.task.as_dict()))
     assert Task.from_dict(record, ARMS) == trial.task
-    with pytest.raises(ValueError, match="arm must be one of planar.*, got 'octopus'"):
+    with pytest.raises(ValueError, match=r"arm must be one of planar.*, got 'octopus'"):
         Task.from_dict({**record, "arm": "octopus"}, ARMS)
 
 
