@@ -1,5 +1,6 @@
 """Frozen scenes are what their files say, planners certify them, and difficulty is measured right."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -11,9 +12,9 @@ from viapoint.envs.scenes import check_scenes
 from viapoint.training.baselines import METHODS, make_method
 from viapoint.training.difficulty import planned_share, solution_share
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, load, shipped_path
-from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, remake
+from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, lots, remake
 from viapoint.training.planner import Planner, PlannerBudget
-from viapoint.training.scene_search import Kinds, Source, search
+from viapoint.training.scene_search import Kinds, Source, redrawn, search
 from viapoint.training.screening import screen
 from viapoint.training.trial import Trial
 
@@ -89,6 +90,19 @@ def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, trials):
 def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads():
     some = load("hard", ENV_ID).take(slice(0, 5))
     assert remake(some, threads=1).sha256 == some.sha256
+
+
+def test_scenes_that_are_searched_for_are_of_the_kind_asked_for_and_solved_and_can_be_drawn_again(trial):
+    def gates():
+        return next(lot for lot in lots(trial.task, "hard", 500) if lot.family == "gate")
+
+    lot = gates()
+    found = search(trial, lot.source, dataclasses.replace(lot.kinds, quota=2), seed=1, label="gates")
+    assert len(found.share) == 2
+    assert ((found.share > 0.0) & (found.share < 0.05)).all()
+    assert trial(found.scenes, found.solution).success.all()
+    for one, other in zip(redrawn(gates().source, found.number), found.scenes, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_what_is_too_rare_is_said_to_be_missing(trial):
