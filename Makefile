@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 RUN    := runs/demo
 
-.PHONY: help demo test check format scenes hashes bench clean
+.PHONY: help demo test check format scenes hashes versions bench clean
 
 help:            ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -37,6 +37,9 @@ scenes: $(READY) ## make the frozen scenes again and compare their hashes
 
 hashes: $(READY) ## hash a thousand episodes of every environment anew
 	@$(BIN)/python benchmarks/reliability_determinism.py --write
+
+versions: $(READY) ## the suite with the oldest versions that are allowed, in an environment of its own
+	@$(BIN)/python benchmarks/versions.py oldest
 
 bench: $(READY)  ## throughput as ratios
 	@$(BIN)/viapoint bench

@@ -1,7 +1,7 @@
 """Whether memory and speed stay as they are: a million decisions, and ten thousand environments made and closed.
 
-    python benchmarks/reliability_long.py decisions --json decisions.json   # about fifteen minutes of one core
-    python benchmarks/reliability_long.py cycles    --json cycles.json      # likewise
+    python benchmarks/reliability_long.py decisions --json decisions.json   # about half an hour of one core
+    python benchmarks/reliability_long.py cycles    --json cycles.json      # about a quarter of an hour
     python benchmarks/reliability_long.py picture decisions.json cycles.json --out docs/images/reliability_memory.png
 
 Memory is the resident set of this process. Speed is decisions per second of processor time, so that other work on the
@@ -17,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ import viapoint.envs
 from viapoint.envs import rendering
 
 MEGABYTE = 1 << 20
+LEAST = 10
+"""Points before anything can be said."""
 SAMPLES = 200
 """Points of a curve."""
 WARM = 0.1
@@ -49,8 +52,8 @@ def state() -> dict[str, float]:
     }
 
 
-def decisions(env_id: str, number: int, num_envs: int = 500) -> dict[str, Any]:
-    """Random decisions in the vector environment."""
+def decisions(env_id: str, number: int, num_envs: int = 500) -> Iterator[dict[str, Any]]:
+    """Random decisions in the vector environment; what was found so far, again and again."""
     env = gym.make_vec(env_id, num_envs=num_envs, threads=1)
     env.reset(seed=0)
     generator = np.random.default_rng(0)
@@ -59,29 +62,35 @@ def decisions(env_id: str, number: int, num_envs: int = 500) -> dict[str, Any]:
     for step in range(number // num_envs + 1):
         if step % every == 0:
             curve.append({"count": step * num_envs, "seconds": time.process_time() - began, **state()})
+            if len(curve) > LEAST:
+                yield {
+                    **speeds(curve),
+                    "what": f"decisions in {env_id}, {num_envs} at a time",
+                    **growth(curve),
+                }
         _, reward, *_ = env.step(generator.uniform(-1.0, 1.0, env.action_space.shape))
         assert np.isfinite(reward).all()
     env.close()
-    seconds = np.diff([point["seconds"] for point in curve])
-    fifth = len(seconds) // 5
-    speed = every * num_envs / np.array([np.median(seconds[:fifth]), np.median(seconds[-fifth:])])
-    return {
-        "what": f"decisions in {env_id}, {num_envs} at a time",
-        "curve": curve,
-        "first_speed": speed[0],
-        "last_speed": speed[1],
-        **growth(curve),
-    }
 
 
-def cycles(number: int, size: int = 64) -> dict[str, Any]:
+def speeds(curve: list[dict[str, float]]) -> dict[str, float]:
+    """Speed in the first fifth and in the last, [1/s of processor time]."""
+    rate = np.diff([point["count"] for point in curve]) / np.diff([point["seconds"] for point in curve])
+    fifth = len(rate) // 5
+    return {"first_speed": float(np.median(rate[:fifth])), "last_speed": float(np.median(rate[-fifth:]))}
+
+
+def cycles(number: int, size: int = 64) -> Iterator[dict[str, Any]]:
     """Environments of every id made, used and closed: single ones, every fifth rendered, every fifth a vector."""
+    what = f"environments made, used and closed, one in {RENDERED} rendered"
     rendering.STILL_PASSES = 1  # it is contexts that could leak, not the passes of one picture
     ids, curve, began = sorted(viapoint.envs.TASKS), [], time.process_time()
     every = max(1, number // SAMPLES)
     for cycle in range(number + 1):
         if cycle % every == 0:
             curve.append({"count": cycle, "seconds": time.process_time() - began, **state()})
+            if len(curve) > LEAST:
+                yield {"what": what, **growth(curve)}
         env_id, turn = ids[cycle % len(ids)], cycle // len(ids) % RENDERED
         kwargs = {"render_mode": "rgb_array", "width": size, "height": size, "threads": 2}
         env = gym.make_vec(env_id, num_envs=3, **kwargs) if turn == 1 else gym.make(env_id, **kwargs)
@@ -90,16 +99,15 @@ def cycles(number: int, size: int = 64) -> dict[str, Any]:
         if turn == 0:
             assert np.ptp(env.render()) > 0
         env.close()
-    what = f"environments made, used and closed, one in {RENDERED} rendered"
-    return {"what": what, "curve": curve, **growth(curve)}
 
 
-def growth(curve: list[dict[str, float]]) -> dict[str, float]:
-    """What grew from the end of the warm-up to the end, by a straight line through all points between."""
+def growth(curve: list[dict[str, float]]) -> dict[str, Any]:
+    """The curve, and what grew after the warm-up, by a straight line through all points."""
     kept = curve[int(WARM * len(curve)) :]
     count = [point["count"] for point in kept]
     slope = np.polyfit(count, [point["memory"] for point in kept], 1)[0]
     return {
+        "curve": curve,
         "memory_growth": slope * (count[-1] - count[0]),
         "files_growth": kept[-1]["files"] - kept[0]["files"],
         "threads_growth": kept[-1]["threads"] - kept[0]["threads"],
@@ -152,11 +160,13 @@ def main() -> None:
         picture([json.loads(path.read_text()) for path in arguments.results], arguments.out)
         return
     if arguments.part == "decisions":
-        result = decisions(arguments.env, arguments.number or 1_000_000)
+        results = decisions(arguments.env, arguments.number or 1_000_000)
     else:
-        result = cycles(arguments.number or 10_000)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=1))
+        results = cycles(arguments.number or 10_000)
+    result: dict[str, Any] = {}
+    for result in results:
+        if arguments.json is not None:
+            arguments.json.write_text(json.dumps(result, indent=1))
     raise SystemExit(0 if verdict(result) else 1)
 
 
