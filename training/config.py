@@ -248,7 +248,7 @@ class DemoConfig:
     seed: int = 0
     """Of the training."""
     n_timesteps: int | None = None
-    """Decisions to train for; as the preset says if not given."""
+    """Decisions to train for; three quarters of the preset's if not given, so that nobody waits for long."""
     n_scenes: int | None = None
     """Test scenes to evaluate on; all if not given."""
     candidates: int = 80
@@ -263,6 +263,11 @@ class DemoConfig:
         for name in ("n_timesteps", "n_scenes"):
             if getattr(self, name) is not None:
                 _check_whole(name, getattr(self, name), 1)
+
+    @property
+    def total_timesteps(self) -> int:
+        """Decisions of a training that begins."""
+        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps * 3 // 4
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ from viapoint.training.video import film
 BASELINES = ("straight", "random")
 PICTURES = 12
 """In the gallery."""
-MOVEMENTS = 8
+MOVEMENTS = 6
 """In the film."""
 
 
@@ -116,7 +116,7 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
 
 def _trained(config: DemoConfig) -> Run:
     """The run in the folder, trained to its end."""
-    asked = TrainConfig(env=config.env, seed=config.seed, n_timesteps=config.n_timesteps, out=config.out)
+    asked = TrainConfig(env=config.env, seed=config.seed, n_timesteps=config.total_timesteps, out=config.out)
     if not (config.out / "config.json").exists():
         print(f"training for {asked.total_timesteps} decisions; Ctrl-C saves, and the same command goes on")
         return train(asked)
