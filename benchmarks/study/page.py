@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from study.plan import FREEDOM_LABELS, WHOLE, short
-from study.prose import FREEDOM, INTRODUCTION, KNOWLEDGE, TAGS
+from study.prose import FAILURES, FREEDOM, INTRODUCTION, KNOWLEDGE, TAGS
 from study.work import ALONE, PLANNED, RANKED
 from viapoint.training import monitor
 from viapoint.training.frozen_scenes import BANDS
@@ -20,6 +20,7 @@ def page(record: Numbers) -> str:
     """The whole document."""
     parts = [INTRODUCTION.format(seeds=_seeds(record), cores=_cores(record)), KNOWLEDGE]
     parts += [_environment(env, each) for env, each in record["environments"].items()]
+    parts.append(FAILURES)
     parts += [_ablations(env, each) for env, each in record["ablations"].items() if len(each) > 1]
     parts += [
         _freedom(env, each, record)

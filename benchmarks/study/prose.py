@@ -38,6 +38,17 @@ a critic is close to planning with a model. What was learnt shows in the policy 
 distance to the best of equally many random actions that were tried out in the simulation itself.
 """
 
+FAILURES = """## Failures, drawn
+
+The shipped agent's in the `hard` scenes of PlanarObstacles-v0, policy alone, from the deepest of a kind to its mildest
+(`viapoint evaluate --pretrained viapoint/PlanarObstacles-v0 --methods agent --scenes hard --failures
+docs/images/failures`). Most are mouths of rings that are entered a few millimetres off; ranking mends them.
+
+![The plan enters an obstacle by 5 mm or less](images/failures/graze.png)
+
+![A clear collision, and no other proposal would have succeeded](images/failures/collision.png)
+"""
+
 FREEDOM = """## When does more freedom pay?
 
 K via-points, passage times of least jerk (*optimal*) or chosen by the agent (*learned*). The scenes are the same;
