@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import EzPickle
@@ -18,8 +17,8 @@ from viapoint.envs.arguments import checked_actions, refuse_unknown
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.execution import SETTLING, Rollout
+from viapoint.envs.many_steps import ManyStepEnv, ManyStepVectorEnv
 from viapoint.envs.observation import FARTHEST, ObservationLayout
-from viapoint.envs.reach import ReachEnv
 from viapoint.envs.reach_vector import Decision, Float, Observation, ReachVectorEnv
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record
@@ -63,7 +62,7 @@ class StepObservationLayout(ObservationLayout):
         return {**observation, **{name: part.astype(np.float32) for name, part in parts.items()}}
 
 
-class StepReachVectorEnv(ReachVectorEnv):
+class StepReachVectorEnv(ManyStepVectorEnv):
     """Reaching around obstacles by a velocity in every control step, `num_envs` times.
 
     Arm, scenes, physics, success and reward are those of :class:`~viapoint.envs.reach.ReachVectorEnv`. An episode ends
@@ -135,8 +134,6 @@ class StepReachVectorEnv(ReachVectorEnv):
         self._episodes = StepEpisodes(
             arm, self.num_envs, whole_arm=self.task.whole_arm, timestep=timestep, most=most
         )
-        self.terminated, self.truncated = np.zeros((2, self.num_envs), dtype=bool)
-        """Which episodes ended in the last control step, shape (num_envs,)."""
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
@@ -152,30 +149,6 @@ class StepReachVectorEnv(ReachVectorEnv):
             return None
         waypoints = np.stack((self.scenes.start, self.scenes.goal), axis=-2)
         return Plan(waypoints, np.full((self.num_envs, 1), self.observation_layout.time_limit))
-
-    def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Move for one control step in each environment; where an episode ended, start the next.
-
-        Args:
-            actions: Shape (num_envs, D), in [-1, 1]; components beyond are clipped.
-        """
-        observation, reward, info = self.decide(actions)
-        terminated, truncated = self.terminated, self.truncated
-        ended = terminated | truncated
-        everyone = np.ones(self.num_envs, dtype=bool)
-        infos = {**info, **{f"_{name}": everyone.copy() for name in info}}
-        rows = np.flatnonzero(ended)
-        if rows.size:
-            final = np.full(self.num_envs, None, dtype=object)
-            for i in rows:
-                final[i] = {name: part[i].copy() for name, part in observation.items()}
-            kept = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
-            masks = {f"_{name}": ended.copy() for name in info}
-            infos |= {"final_obs": final, "_final_obs": ended.copy()}
-            infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
-            self._start(rows, self._draw(self._generators, rows, {}))
-            observation = self._observe_start()
-        return observation, reward, terminated, truncated, infos
 
     def decide(self, actions: Any) -> Decision:
         """Move for one control step in each environment, without a reset.
@@ -248,7 +221,7 @@ class StepReachVectorEnv(ReachVectorEnv):
         return self._renderer.movement(sim, scene, plan.take([sim]), self._episodes.rollout(sim, scene))
 
 
-class StepReachEnv(ReachEnv):
+class StepReachEnv(ManyStepEnv):
     """A batch of one of :class:`StepReachVectorEnv`, with the same keyword arguments."""
 
     batch_kind: ClassVar[type[ReachVectorEnv]] = StepReachVectorEnv
@@ -257,25 +230,3 @@ class StepReachEnv(ReachEnv):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.steering = self.batch.steering
-        self._over = True
-
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode; see :meth:`StepReachVectorEnv.reset`."""
-        result = super().reset(seed=seed, options=options)
-        self._over = False
-        return result
-
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move for one control step.
-
-        Args:
-            action: Shape (D,), in [-1, 1]; components beyond are clipped.
-        """
-        if self._over:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        observation, reward, _, _, info = super().step(action)
-        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
-        self._over = terminated or truncated
-        return observation, reward, terminated, truncated, info
