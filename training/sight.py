@@ -15,6 +15,7 @@ from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.clearance import FAR, clearance_profile
 from viapoint.envs.observation import ObstacleRows
 from viapoint.envs.task import Task
+from viapoint.training.approaches import Approaches, Obstacles, approaches
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -48,6 +49,8 @@ def see(observation: Observation, hand: Array, task: Task) -> Sight:
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
         return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
+    if _among_links(task):
+        return Sight(_seen_of_links(observation, hand, task), margin)
     nearest, pairs = _nearest(observation, hand, task)
     return Sight(_lowest(_clearance(nearest, *pairs, task)[..., 0, :]), margin)
 
@@ -63,14 +66,45 @@ def push(observation: Observation, hand: Array, task: Task) -> tuple[Sight, Arra
     if "obstacles" not in observation:
         at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
         return Sight(xp.full_like(at_ends[..., 0], FAR), margin), xp.zeros_like(at_ends)
+    if _among_links(task):
+        near = _approaches(observation, hand, task, NEAR)
+        return Sight(near.clearance, margin), near.gradient * _nearness(near.clearance)
     nearest, pairs = _nearest(observation, hand, task)
     moves = xp.asarray(_STEP * np.eye(hand.shape[-1]), dtype=hand.dtype)
     around = xp.concat((nearest, nearest[..., 1:2, :] + moves), axis=-2)
     clearance = _clearance(around, *pairs, task)[..., 0, :]
     gradient = (clearance[..., 3:] - clearance[..., 1:2]) / _STEP
     lowest = _lowest(clearance[..., :3])
-    nearness = clamp(1.0 - lowest / NEAR, 0.0, 1.5)
-    return Sight(lowest, margin), gradient * nearness[..., None]
+    return Sight(lowest, margin), gradient * _nearness(lowest)
+
+
+def _nearness(clearance: Array) -> Array:
+    """How much an obstacle matters, shape (..., 1)."""
+    return clamp(1.0 - clearance / NEAR, 0.0, 1.5)[..., None]
+
+
+def _among_links(task: Task) -> bool:
+    """Whether all links of an arm in space must clear: then looking everywhere would take too long."""
+    return task.whole_arm and task.arm.dimension == 3
+
+
+def _seen_of_links(observation: Observation, hand: Array, task: Task) -> Array:
+    """Clearance in each stretch; with respect to the hand it is differentiated as if it changed in proportion."""
+    if namespace_of(hand) is np:
+        return _approaches(observation, hand, task, 0.0).clearance
+    middle = hand[..., LOOKS // 2 :: LOOKS, :]
+    near = _approaches(observation, hand, task, NEAR if middle.requires_grad else 0.0)
+    clearance, gradient = (middle.new_tensor(part) for part in near)
+    return clearance + (gradient * (middle - middle.detach())).sum(-1)
+
+
+def _approaches(observation: Observation, hand: Array, task: Task, within: float) -> Approaches:
+    parts = (observation["obstacles"], hand)
+    flat, still = (np.asarray(part if type(part) is np.ndarray else part.detach().cpu()) for part in parts)
+    rows: ObstacleRows = task.observation.obstacles(flat)
+    together = np.concatenate((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
+    obstacles = Obstacles.packed(together, rows.present > 0.5)
+    return approaches(task.arm, still, obstacles, STRETCHES, within)
 
 
 def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, tuple[Array, Array]]:

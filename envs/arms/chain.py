@@ -81,7 +81,10 @@ class Chain:
         xp = namespace_of(joints)
         frames, nothing = self.frames(joints), 0.0 * joints[..., 0]
         placed = [frames[index].place(point) for index, point in places]
-        return xp.stack([xp.stack([part + nothing for part in point], axis=-1) for point in placed], axis=-2)
+        # Components apart in memory: they are written, and mostly read, one after the other.
+        parts = xp.stack([part + nothing for point in placed for part in point], axis=0)
+        apart = xp.reshape(parts, (len(places), 3, *joints.shape[:-1]))
+        return xp.moveaxis(apart, (0, 1), (-2, -1))
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
         """What moves the chain, and what only holds it against gravity, shape (..., J) each, [N m].

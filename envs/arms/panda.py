@@ -87,7 +87,7 @@ class PandaPosture:
 def _elbow(square: Array) -> tuple[Array, Array, Array]:
     """Angle of joint 4 for a squared distance of shoulder and wrist, its cosine and sine."""
     xp = namespace_of(square)
-    upper, fore = np.hypot(UPPER, ELBOW), np.hypot(FORE, ELBOW)
+    upper, fore = float(np.hypot(UPPER, ELBOW)), float(np.hypot(FORE, ELBOW))
     cosine = (upper**2 + fore**2 - square) * (0.5 / (upper * fore))
     offset = float(np.arctan2(UPPER, ELBOW) + np.arctan2(FORE, ELBOW) - 2.0 * np.pi)
     angle = xp.acos(clamp(cosine, -0.9999, 0.9999)) + offset
