@@ -79,7 +79,7 @@ def approaches(arm: Arm, hand: Float, obstacles: Obstacles, stretches: int, with
         hand: Paths, shape (B, H, T, 3), [m].
         obstacles: Of the B scenes.
         stretches: S, of T / S instants each.
-        within: Clearance below which the gradient is wanted, [m]; 0 or less for none.
+        within: Clearance below which the gradient is wanted, [m]; minus infinity for none.
     """
     shape = (*hand.shape[:2], stretches)
     found = Approaches(np.full(shape, FAR, np.float32), np.zeros((*shape, 3), np.float32))

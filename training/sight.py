@@ -91,9 +91,9 @@ def _among_links(task: Task) -> bool:
 def _seen_of_links(observation: Observation, hand: Array, task: Task) -> Array:
     """Clearance in each stretch; with respect to the hand it is differentiated as if it changed in proportion."""
     if namespace_of(hand) is np:
-        return _approaches(observation, hand, task, 0.0).clearance
+        return _approaches(observation, hand, task, -np.inf).clearance
     middle = hand[..., LOOKS // 2 :: LOOKS, :]
-    near = _approaches(observation, hand, task, NEAR if middle.requires_grad else 0.0)
+    near = _approaches(observation, hand, task, NEAR if middle.requires_grad else -np.inf)
     clearance, gradient = (middle.new_tensor(part) for part in near)
     return clearance + (gradient * (middle - middle.detach())).sum(-1)
 
