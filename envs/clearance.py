@@ -58,6 +58,7 @@ def clearance_profile(
     present: Array,
     links: Array = None,
     link_radii: tuple[float, ...] = (),
+    drift: Array = None,
 ) -> Array:
     """Clearance of the hand and, where given, the links from each obstacle at each time.
 
@@ -68,25 +69,27 @@ def clearance_profile(
         present: Whether a row is an obstacle, shape (..., n), bool.
         links: End points of the links' axes, shape (..., T, L, 2, D), [m].
         link_radii: Of the L links, [m].
+        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
 
     Returns:
         Shape (..., n, T), [m].
     """
     xp = namespace_of(hand)
     radii, shown = obstacles[..., :, None, -1], present[..., :, None]
-    least = _clearance(point_distance_squared(hand, obstacles), radii + hand_radius, shown)
+    least = _clearance(point_distance_squared(hand, obstacles, drift), radii + hand_radius, shown)
     for i, radius in enumerate(link_radii if links is not None else ()):
-        squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
+        squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles, drift)
         least = xp.minimum(least, _clearance(squared, radii + radius, shown))
     return least
 
 
-def point_distance_squared(points: Array, obstacles: Array) -> Array:
+def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:
     """Squared distance of points from the obstacles' axes.
 
     Args:
         points: Shape (..., T, D), [m].
         obstacles: Shape (..., n, 2 D + 1), [m].
+        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
 
     Returns:
         Shape (..., n, T), [m^2].
@@ -94,6 +97,7 @@ def point_distance_squared(points: Array, obstacles: Array) -> Array:
     xp = namespace_of(points)
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
+    offset = offset if drift is None else [o - drift[..., i] for i, o in enumerate(offset)]
     axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
     square = sum(a * a for a in axis)
     along = sum(o * a for o, a in zip(offset, axis, strict=True)) / xp.where(square > _TINY, square, 1.0)
@@ -102,7 +106,7 @@ def point_distance_squared(points: Array, obstacles: Array) -> Array:
     return sum(r * r for r in rest)
 
 
-def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> Array:
+def segment_distance_squared(first: Array, second: Array, obstacles: Array, drift: Array = None) -> Array:
     """Squared distance of segments from the obstacles' axes, which are segments too.
 
     The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
@@ -112,6 +116,7 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> A
         first: One end of each segment, shape (..., T, D), [m].
         second: The other end, likewise; the segment has a length.
         obstacles: Shape (..., n, 2 D + 1), [m].
+        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
 
     Returns:
         Shape (..., n, T), [m^2].
@@ -124,6 +129,7 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array) -> A
         first[..., None, :, i] - (obstacles[..., :, None, i] - obstacles[..., :, None, dimension + i])
         for i in range(dimension)
     ]
+    gap = gap if drift is None else [g - drift[..., i] for i, g in enumerate(gap)]
     a, e, b = _dot(link, link), _dot(axis, axis), _dot(link, axis)
     c, f = _dot(link, gap), _dot(axis, gap)
     e = xp.where(e > _TINY, e, xp.full_like(e, _TINY))

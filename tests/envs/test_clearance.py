@@ -100,3 +100,22 @@ def test_torch_gives_the_same_and_finite_gradients_even_inside_an_obstacle():
     )
     profile.sum().backward()
     assert torch.isfinite(tensor.grad).all()
+
+
+def test_what_an_obstacle_has_drifted_counts_as_if_it_stood_there():
+    generator = np.random.default_rng(5)
+    hand = generator.uniform(-0.5, 0.5, (4, 7, 2))
+    links = generator.uniform(-0.5, 0.5, (4, 7, 2, 2, 2))
+    rows = generator.uniform(-0.5, 0.5, (4, 3, 5)) * [1.0, 1.0, 0.2, 0.2, 0.1] + [0.0, 0.0, 0.0, 0.0, 0.06]
+    present, drift = (
+        np.array([True, True, False]) & np.ones((4, 1), bool),
+        generator.normal(size=(4, 3, 7, 2)),
+    )
+    drifted = clearance_profile(hand, 0.015, rows, present, links, (0.03, 0.02), drift)
+    for t in range(7):
+        there = rows.copy()
+        there[..., :2] += drift[:, :, t]
+        still = clearance_profile(
+            hand[:, t : t + 1], 0.015, there, present, links[:, t : t + 1], (0.03, 0.02)
+        )
+        np.testing.assert_allclose(drifted[..., t], still[..., 0], atol=1e-12)
