@@ -14,6 +14,7 @@ import tyro
 
 import viapoint.envs
 from viapoint.envs.registration import STEP_TASKS, TASKS
+from viapoint.training.discount import check_discount_unit
 from viapoint.training.presets import PRESETS, REACH_PRESETS, STEP_PRESETS, Algorithm, Preset
 
 C = TypeVar("C")
@@ -77,6 +78,9 @@ class TrainConfig:
     """Of the environment, for example n_via=2 timing=learned."""
     hyperparameters: NamedValues = field(default_factory=dict)
     """Of the algorithm, instead of its preset's, for example batch_size=256."""
+    discount_unit: float | None = None
+    """Seconds that count the discount gamma, where decisions take different time and the environment tells it;
+    as the preset says if not given."""
     progress: bool = True
     """Whether to show a progress bar."""
 
@@ -95,6 +99,8 @@ class TrainConfig:
         for name, least in (("n_timesteps", 1), ("n_envs", 1), ("eval_every", 0), ("checkpoint_every", 1)):
             if getattr(self, name) is not None:
                 _check_whole(name, getattr(self, name), least)
+        if self.discount_unit is not None:
+            check_discount_unit(self.algo, self.discount_unit)
 
     @property
     def preset(self) -> Preset:
@@ -123,6 +129,11 @@ class TrainConfig:
     def checkpoint_interval(self) -> int:
         """Decisions between two checkpoints."""
         return self.checkpoint_every or self.preset.checkpoint_every
+
+    @property
+    def time_unit(self) -> float | None:
+        """Seconds that count gamma; None where each decision does, whatever it takes."""
+        return self.preset.discount_unit if self.discount_unit is None else self.discount_unit
 
     @property
     def folder(self) -> Path:

@@ -23,6 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from viapoint.training.discount import check_discount_unit
 from viapoint.training.extractors import EXTRACTORS
 from viapoint.training.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.limits import (
@@ -31,6 +32,7 @@ from viapoint.training.limits import (
     check_env_arguments,
     parameter_budget,
 )
+from viapoint.training.timed_buffers import timed, unit_of
 from viapoint.training.vec_env import ViaVecEnv
 from viapoint.training.via_td3 import ViaTD3
 
@@ -104,7 +106,8 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
                 "ignore", UserWarning
             )  # PPO finds that its batches do not fill one environment
             chosen = env or _own_environment(record["env"])
-            model = build(record["algorithm"], record["policy"], chosen, hyperparameters)
+            unit = record.get("discount_unit")
+            model = build(record["algorithm"], record["policy"], chosen, hyperparameters, discount_unit=unit)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
         raise
@@ -123,6 +126,7 @@ def build(
     env: ViaVecEnv,
     hyperparameters: Mapping[str, Any],
     *,
+    discount_unit: float | None = None,
     seed: int | None = None,
 ) -> BaseAlgorithm:
     """A new model from plain values.
@@ -133,10 +137,11 @@ def build(
         env: To learn on.
         hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
             writes them.
+        discount_unit: Time that counts gamma [s]; None where a decision does, whatever it takes.
         seed: Of the algorithm.
 
     Raises:
-        ValueError: There is no such algorithm or policy.
+        ValueError: There is no such algorithm or policy, or it cannot discount by time.
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
@@ -153,6 +158,8 @@ def build(
         )
     size = int(np.prod(env.action_space.shape or ()))
     arguments = {name: _decode(value, size) for name, value in hyperparameters.items()}
+    if discount_unit is not None:
+        arguments |= _by_time(algorithm, env, arguments, discount_unit)
     return kind(policy, env, seed=seed, device="cpu", **arguments)
 
 
@@ -174,6 +181,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         "policy": policies[model.policy_class],
         "env": {"id": env.env_id, "kwargs": _encode(env.env_kwargs)},
         "num_timesteps": model.num_timesteps,
+        "discount_unit": unit_of(model),
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
     }
 
@@ -214,6 +222,16 @@ def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
         raise ValueError(f"environment {record['id']!r} is not known")
     check_env_arguments(record["kwargs"])
     return ViaVecEnv(record["id"], 1, **record["kwargs"])
+
+
+def _by_time(algorithm: str, env: ViaVecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
+    """Arguments that make an algorithm discount by time."""
+    check_discount_unit(algorithm, unit)
+    if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
+        raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
+    kind = ALGORITHMS[algorithm]
+    gamma = arguments.get("gamma", inspect.signature(kind).parameters["gamma"].default)
+    return timed(kind, env.observation_space, gamma=gamma, unit=unit)
 
 
 def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:

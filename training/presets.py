@@ -24,6 +24,8 @@ class Preset:
     """Decisions between two evaluations on the validation scenes."""
     checkpoint_every: int = 5_000
     """Decisions between two checkpoints."""
+    discount_unit: float | None = None
+    """Seconds that count gamma; None where each decision does, whatever it takes."""
     hyperparameters: tuple[tuple[str, Any], ...]
     """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.model_files` writes them."""
 
@@ -39,6 +41,7 @@ def _preset(
     *,
     eval_every: int = 1_000,
     checkpoint_every: int = 5_000,
+    discount_unit: float | None = None,
     **hyperparameters: Any,
 ) -> Preset:
     return Preset(
@@ -47,6 +50,7 @@ def _preset(
         n_timesteps=n_timesteps,
         eval_every=eval_every,
         checkpoint_every=checkpoint_every,
+        discount_unit=discount_unit,
         hyperparameters=tuple(hyperparameters.items()),
     )
 

@@ -15,6 +15,7 @@ from viapoint.training.config import TrainConfig
 from viapoint.training.model_files import build
 from viapoint.training.monitor import Monitor, TrainingStoppedError
 from viapoint.training.runs import Run, versions
+from viapoint.training.timed_buffers import TellElapsed
 from viapoint.training.vec_env import ViaVecEnv
 
 __all__ = ["TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train"]
@@ -62,13 +63,21 @@ def resolved(config: TrainConfig) -> TrainConfig:
         n_envs=config.copies,
         eval_every=config.evaluation_interval,
         checkpoint_every=config.checkpoint_interval,
+        discount_unit=config.time_unit,
         hyperparameters={**config.preset.arguments(), **config.hyperparameters},
     )
 
 
 def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     """The untrained model that a resolved configuration asks for."""
-    return build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
+    return build(
+        config.algo,
+        config.preset.policy,
+        env,
+        config.hyperparameters,
+        discount_unit=config.discount_unit,
+        seed=config.seed,
+    )
 
 
 @contextmanager
@@ -108,7 +117,8 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:
     run.write_curve(monitor.curve)
     remaining = run.config.total_timesteps - model.num_timesteps
     if remaining > 0:
-        model.learn(remaining, monitor, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
+        callbacks = [monitor, TellElapsed()]
+        model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
     run.save("final", model)
 
 

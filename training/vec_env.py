@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
+from viapoint.training.discount import ELAPSED
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -92,7 +93,8 @@ class ViaVecEnv(VecEnv):
         """Step; where an episode ended, the observation is the next one's first.
 
         Returns:
-            Observation, reward (N,), done (N,) and N info dictionaries. At the end of an episode these hold
+            Observation, reward (N,), done (N,) and N info dictionaries. These hold `elapsed` [s], how long the
+            decision took, where the environment tells it. At the end of an episode they hold besides
             `terminal_observation`, `TimeLimit.truncated`, `episode` (return r, length l, seconds t since the
             start) and what of :data:`REPORTED` the environment tells.
         """
@@ -100,12 +102,19 @@ class ViaVecEnv(VecEnv):
         done = terminated | truncated
         self._returns += reward
         self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = self._began_infos(info, done)
         self.last_outcome = {}
         rows = np.flatnonzero(done)
         if rows.size:
             self._close_episodes(rows, infos, info, truncated & ~terminated)
         return observation, np.asarray(reward, dtype=np.float32), done, infos
+
+    def _began_infos(self, info: Mapping[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
+        """One info per copy, with the time that its decision took where that is told."""
+        told = [part[ELAPSED] for part in (info, info.get("final_info", {})) if ELAPSED in part]
+        if not told:
+            return [{} for _ in range(self.num_envs)]
+        return [{ELAPSED: seconds} for seconds in np.where(done, told[-1], told[0]).tolist()]
 
     def _close_episodes(
         self,
@@ -122,7 +131,7 @@ class ViaVecEnv(VecEnv):
         statistics = zip(self._returns[rows].tolist(), self._lengths[rows].tolist(), strict=True)
         values = zip(*columns, strict=True) if names else iter([()] * len(rows))
         for row, (r, length), value in zip(rows.tolist(), statistics, values, strict=True):
-            infos[row] = dict(zip(names, value, strict=True))
+            infos[row].update(zip(names, value, strict=True))
             infos[row]["terminal_observation"] = info["final_obs"][row]
             infos[row]["TimeLimit.truncated"] = bool(cut[row])
             infos[row]["episode"] = {"r": r, "l": length, "t": seconds}

@@ -1,0 +1,71 @@
+"""How much counts what comes after a decision of so many seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ELAPSED = "elapsed"
+"""Where an info tells how long its decision took, [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeDiscount:
+    """How much counts what comes after a decision.
+
+    Raises:
+        ValueError: gamma is not in (0, 1], or the unit is not positive.
+    """
+
+    gamma: float
+    """Discount of one unit of time."""
+    unit: float
+    """[s]."""
+    key: str = ELAPSED
+    """Of the infos, where they tell the elapsed time [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        if not 0.0 < self.gamma <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1] to be a discount by time, got {self.gamma!r}")
+        _check_unit("unit", self.unit)
+
+    def of(self, infos: Sequence[Mapping[str, Any]]) -> NDArray[np.float32]:
+        """gamma^(elapsed / unit) for N infos, shape (N,).
+
+        Raises:
+            ValueError: An info does not tell the elapsed time, or tells one that is negative or not finite.
+        """
+        try:
+            elapsed = np.array([info[self.key] for info in infos], dtype=np.float64)
+        except KeyError:
+            row, there = next((i, sorted(info)) for i, info in enumerate(infos) if self.key not in info)
+            raise ValueError(
+                f"to discount by time, info must tell how long a decision took, in seconds, as {self.key!r}; "
+                f"that of environment {row} has {', '.join(there) or 'nothing'}"
+            ) from None
+        if not (np.isfinite(elapsed) & (elapsed >= 0.0)).all():
+            raise ValueError(f"{self.key!r} must be finite and not negative, got {elapsed.min()!r} s")
+        return np.asarray(self.gamma ** (elapsed / self.unit), dtype=np.float32)
+
+
+def check_discount_unit(algorithm: str, unit: float) -> None:
+    """Refuse what cannot be a setting of an algorithm by its name on the command line.
+
+    Raises:
+        ValueError: The unit is no positive number, or the algorithm's episodes are one decision.
+    """
+    _check_unit("discount_unit", unit)
+    if algorithm == "viatd3":
+        raise ValueError("discount_unit must be None for viatd3: its episodes are one decision")
+
+
+def _check_unit(name: str, unit: float) -> None:
+    number = isinstance(unit, int | float) and not isinstance(unit, bool)
+    if not (number and 0.0 < unit < math.inf):
+        raise ValueError(f"{name} must be a positive number of seconds, got {unit!r}")
