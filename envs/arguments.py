@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any, cast
 
 import numpy as np
@@ -18,16 +19,21 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return int(value)
 
 
-def fewest_and_most(n_obstacles: Any) -> tuple[int, int]:
+def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
     """An exact number or (fewest, most) as the pair."""
-    pair = (n_obstacles, n_obstacles) if isinstance(n_obstacles, int | np.integer) else n_obstacles
+    pair = (number, number) if isinstance(number, int | np.integer) else number
     try:
         fewest, most = pair
-        return whole_number("n_obstacles", fewest, 0), whole_number("n_obstacles", most, 0)
+        return whole_number(name, fewest, 0), whole_number(name, most, 0)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"n_obstacles must be a whole number or (fewest, most), got {n_obstacles!r}"
-        ) from None
+        raise ValueError(f"{name} must be a whole number or (fewest, most), got {number!r}") from None
+
+
+def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> float:
+    """A finite real number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < np.inf:
+        raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
+    return float(value)
 
 
 def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:

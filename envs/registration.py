@@ -40,6 +40,23 @@ STEP_TASKS: dict[str, str] = {
 They are :class:`~viapoint.envs.reach_step.StepReachVectorEnv`.
 """
 
+ONLINE_TASKS: dict[str, dict[str, Any]] = {
+    "viapoint/PlanarTargetJump-v0": {"n_jumps": (1, 2)},
+    "viapoint/PlanarMovingObstacles-v0": {"n_obstacles": (1, 4), "moving_obstacles": True},
+    "viapoint/PandaMovingObstacles-v0": {
+        "arm": "panda",
+        "whole_arm": True,
+        "n_obstacles": (1, 4),
+        "moving_obstacles": True,
+        "duration_range": (1.0, 2.0),
+        "horizon": 0.5,
+    },
+}
+"""Every id of a task whose plans are revised on the way, with what it sets of the keyword arguments.
+
+They are those of :class:`~viapoint.envs.reach_online.OnlineReachVectorEnv`.
+"""
+
 
 def register_all() -> None:
     """Make every id known to Gymnasium; a second call changes nothing."""
@@ -50,6 +67,9 @@ def register_all() -> None:
     for name, twin in STEP_TASKS.items():
         module = "viapoint.envs.reach_step"
         _register(name, f"{module}:StepReachEnv", f"{module}:StepReachVectorEnv", TASKS[twin])
+    for name, kwargs in ONLINE_TASKS.items():
+        module = "viapoint.envs.reach_online"
+        _register(name, f"{module}:OnlineReachEnv", f"{module}:OnlineReachVectorEnv", kwargs)
 
 
 def twin_of(env_id: str) -> str:

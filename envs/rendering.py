@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,8 @@ class MovementRenderer:
     `rgb_array_list` comes the film of the movement as a list of such pictures, `human` plays it in a window.
     """
 
+    stage_kind: ClassVar[type[Stage]] = Stage
+
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
         for name, size in (("width", width), ("height", height)):
             if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
@@ -97,7 +99,7 @@ class MovementRenderer:
     def _ready(self) -> Stage:
         """The stage, with a canvas or a window to show it on."""
         if self._stage is None:
-            stage = Stage(self._simulator, *self._size)
+            stage = self.stage_kind(self._simulator, *self._size)
             if self.mode == "human":
                 self._window = Window(stage.model, *self._size, title="Viapoint")
             else:

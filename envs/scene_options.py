@@ -104,7 +104,7 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
         if name in options:
             fields[name][:] = _broadcast(name, options[name], (number, arm.dimension))
     if "obstacles" in options:
-        given = _numbers("obstacles", options["obstacles"])
+        given = numbers("obstacles", options["obstacles"])
         given = given.reshape((0, 2 * arm.dimension + 1)) if given.size == 0 else given
         count = given.shape[-2] if given.ndim >= 2 else -1
         if not 0 <= count <= rows:
@@ -120,7 +120,7 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
 
 
 def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> Float:
-    array = _numbers(name, value)
+    array = numbers(name, value)
     try:
         result = np.broadcast_to(array, shape)
     except ValueError:
@@ -132,7 +132,8 @@ def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> Float:
     return result
 
 
-def _numbers(name: str, value: Any) -> Float:
+def numbers(name: str, value: Any) -> Float:
+    """Real numbers, or a reason why not."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":

@@ -19,6 +19,8 @@ LARGEST_HALF_AXIS = 0.3
 """Greatest half length of a bar, [m]."""
 LARGEST_RADIUS = 0.1
 """Greatest radius of an obstacle, [m]."""
+FARTHEST_CENTRE = 1.0
+"""Greatest coordinate of an obstacle's centre, [m]."""
 
 TARGETS = {
     "T1": (-0.32, 0.42),
@@ -143,7 +145,7 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
         (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
         (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
         (
-            (np.abs(scenes.obstacles[..., :dimension]) > 1.0).any(axis=-1),
+            (np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE).any(axis=-1),
             "has its centre over 1 m from the origin",
         ),
     ):

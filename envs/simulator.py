@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
 """Where an absent obstacle waits, [m]."""
 
+MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+"""What a control sequence holds where obstacles move: controls, then the obstacles' centres."""
+
 
 class Record(NamedTuple):
     """What a rollout of n simulations over T physics steps left behind."""
@@ -96,6 +99,37 @@ class Simulator:
         unstable = (self._warnings(sims) > warnings) | ~_finite(out["qpos"])
         traced = Traced(out["site_xpos"], *self._traced) if self._traced else None
         return Record(out["qpos"], out["ncon"] > 0, unstable, traced)
+
+    def rollout_among_moving(
+        self, sims: NDArray[np.int64], controls: Float, places: Float, steps: NDArray[np.int64]
+    ) -> Record:
+        """Run simulations under controls while their obstacles move, each for a number of steps of its own.
+
+        Those of a call run together for the greatest number, and then stand where they were after their own.
+
+        Args:
+            sims: The simulations in increasing order, shape (n,).
+            controls: Shape (n, T, U).
+            places: Of the obstacles' centres before each step, NaN where there is none, shape (n, T, rows, D), [m].
+            steps: Of each, 1 to T, shape (n,).
+        """
+        number = controls.shape[1]
+        warnings = self._warnings(sims)
+        absent = np.isnan(places[..., :1])
+        where = np.where(absent, OUT_OF_THE_WAY, _in_space(places)).reshape(*controls.shape[:2], -1)
+        kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ()))
+        out = self.batch.rollout(
+            number, np.concatenate((controls, where), axis=-1), MOVING, record=(*kept, "ncon"), ids=sims
+        )
+        self.physics_steps += number * len(sims)
+        each, last = np.arange(len(sims)), steps - 1
+        for name in kept:
+            self.batch.bind(name)[sims] = out[name][each, last]
+        joints, contact = out["qpos"], out["ncon"] > 0
+        # A simulation that stops repeats its record; one that went on after its own steps was sound in them.
+        stopped = (joints[each, last] == joints[:, -1]).all(axis=-1)
+        unstable = (self._warnings(sims) > warnings) & stopped | ~np.isfinite(joints[each, last]).all(axis=-1)
+        return Record(joints, contact, unstable, None)
 
     def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of one simulation with the arm at `joints`, to draw them."""

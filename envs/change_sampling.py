@@ -1,0 +1,240 @@
+"""Drawing what will become of scenes: when targets jump and where to, how obstacles move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint import primitives
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.courses import MOST_JUMPS, ChangingScenes
+from viapoint.envs.scene_draws import Uniforms, between
+from viapoint.envs.scenes import FARTHEST_CENTRE, Scenes, rest_clearance
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+CANDIDATES, ATTEMPTS = 8, 40
+"""Jumps and courses that are drawn at once, and how often jumps are drawn until some fit."""
+LOOKS = 10
+"""At how many times it is looked whether start and goal are free."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeDistribution:
+    """What becomes of scenes. Times are relative to the centre duration of a movement."""
+
+    n_jumps: tuple[int, int] = (0, 0)
+    """Fewest and most jumps of the target."""
+    moving: bool = False
+    """Whether obstacles move."""
+    first_jump: tuple[float, float] = (0.1, 0.7)
+    """After the start."""
+    next_jump: tuple[float, float] = (0.4, 0.9)
+    """After the one before."""
+    jump_distance: tuple[float, float] = (0.10, 0.30)
+    """From one target to the next, [m]."""
+    steepness: float = 0.5
+    """Greatest height gained by a jump in space, relative to its distance."""
+    speed: tuple[float, float] = (0.05, 0.30)
+    """Of the obstacles, [m/s]; in space they move horizontally."""
+    turning: float = 0.5
+    """Share of the obstacles that change their course."""
+    turn: tuple[float, float] = (0.2, 0.7)
+    """When they do so."""
+    meeting: tuple[float, float] = (0.25, 0.6)
+    """When an obstacle is where it would stand if it did not move: in the way of the straight movement, say."""
+    end_margin: float = 0.015
+    """Least clearance of the arm at the start, and at the goal while movements may end, [m]."""
+    reach_margin: float = 0.03
+    """How far inside the arm's reach targets stay, [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be sampled."""
+        fewest, most = self.n_jumps
+        if not 0 <= fewest <= most <= MOST_JUMPS:
+            raise ValueError(
+                f"n_jumps must be (fewest, most), 0 <= fewest <= most <= {MOST_JUMPS}, got {self.n_jumps}"
+            )
+
+
+class ChangeSampler:
+    """Draws what will become of scenes, each from a generator of its own.
+
+    Args:
+        arm: Whose hand moves.
+        distribution: What becomes of scenes.
+        whole_arm: Whether the links count.
+        durations: Shortest, centre and longest duration of a movement, [s].
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        distribution: ChangeDistribution,
+        *,
+        whole_arm: bool,
+        durations: tuple[float, float, float],
+    ) -> None:
+        self.arm, self.distribution, self.whole_arm = arm, distribution, whole_arm
+        self._shortest, self._centre, self._longest = durations
+
+    def __call__(
+        self,
+        generators: Sequence[np.random.Generator],
+        scenes: Scenes,
+        jumps: Float | None = None,
+        courses: Float | None = None,
+    ) -> ChangingScenes:
+        """What will become of N scenes.
+
+        Args:
+            generators: N random generators.
+            scenes: N scenes; obstacles whose courses are drawn will be there when a movement may meet them.
+            jumps: Given ones, shape (N, MOST_JUMPS, D + 1).
+            courses: Given ones, shape (N, n, 2 D + 1).
+
+        Raises:
+            RuntimeError: No jump that fits was found in many attempts.
+        """
+        number, dimension = scenes.start.shape
+        still = np.zeros((number, scenes.obstacles.shape[1], 2 * dimension + 1))
+        none = np.zeros((number, MOST_JUMPS, dimension + 1))
+        obstacles, moving = scenes.obstacles, still if courses is None else courses
+        if courses is None and self.distribution.moving and still.size:
+            obstacles, moving = self._courses(generators, scenes)
+        changing = ChangingScenes(scenes.start, scenes.goal, obstacles, none, moving)
+        if jumps is not None:
+            return changing._replace(jumps=jumps)
+        if self.distribution.n_jumps[1]:
+            self._jump(generators, changing)
+        return changing
+
+    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> None:
+        """Draw jumps into scenes, all of an episode at once, until all fit."""
+        fewest, most = self.distribution.n_jumps
+        pending = np.arange(len(scenes.start))
+        size = 1 + most * (1 + 3 * CANDIDATES)
+        for _ in range(ATTEMPTS):
+            u = Uniforms(np.stack([generators[int(i)].random(size) for i in pending]))
+            number = fewest + np.floor((most - fewest + 1) * u.take(1)[:, 0])
+            good, jumps = self._attempt(u, number, scenes.take(pending))
+            scenes.jumps[pending[good]] = jumps[good]
+            pending = pending[~good]
+            if not len(pending):
+                return
+        start, goal = scenes.start[pending[0]], scenes.goal[pending[0]]
+        raise RuntimeError(
+            f"no jump of the target was found in {ATTEMPTS} attempts from start {start}, goal {goal}"
+        )
+
+    def _attempt(self, u: Uniforms, number: Float, scenes: ChangingScenes) -> tuple[Bool, Float]:
+        """Which of N episodes got all their jumps, and the jumps; the hand is thought to follow without detours."""
+        d, centre = self.distribution, self._centre
+        jumps, good = np.zeros_like(scenes.jumps), np.ones(len(number), dtype=bool)
+        target, each = scenes.goal, np.arange(len(number))
+        movement = primitives.point_to_point(scenes.start, target, centre)
+        before = np.zeros(len(number))
+        for k in range(d.n_jumps[1]):
+            wait = centre * between(d.next_jump if k else d.first_jump, u.take(1)[:, 0])
+            time = before + wait
+            targets = self._targets(u, target)
+            state = [part[:, 0] for part in movement.sample(wait[:, None])]
+            position, velocity, acceleration = (np.repeat(part[:, None], CANDIDATES, 1) for part in state)
+            revised = primitives.point_to_point(
+                position, targets, centre, start_velocity=velocity, start_acceleration=acceleration
+            )
+            fits = self._fits(scenes, time, targets, revised(np.linspace(0.0, centre, LOOKS)))
+            chosen, some = fits.argmax(axis=-1), number > k
+            target = np.where(some[:, None], targets[each, chosen], target)
+            good &= fits.any(axis=-1) | ~some
+            jumps[some, k] = np.concatenate((time[:, None], target), axis=-1)[some]
+            movement = primitives.point_to_point(
+                state[0], target, centre, start_velocity=state[1], start_acceleration=state[2]
+            )
+            before = time
+        return good, jumps
+
+    def _targets(self, u: Uniforms, target: Float) -> Float:
+        """Candidates for the next target, shape (N, CANDIDATES, D)."""
+        d = self.distribution
+        angle, length = 2.0 * np.pi * u.take(CANDIDATES), between(d.jump_distance, u.take(CANDIDATES))
+        height = d.steepness * (2.0 * u.take(CANDIDATES) - 1.0)
+        level = np.sqrt(1.0 - height**2) if target.shape[-1] == 3 else np.ones_like(height)
+        step = np.stack((level * np.cos(angle), level * np.sin(angle), height), axis=-1)
+        return np.asarray(target[:, None] + length[..., None] * step[..., : target.shape[-1]])
+
+    def _fits(self, scenes: ChangingScenes, time: Float, targets: Float, paths: Float) -> Bool:
+        """Which candidates are inside the workspace, free when they appear, and reached without detours."""
+        low, high = (np.array(corner) for corner in self.arm.workspace)
+        inside = ((targets >= low) & (targets <= high)).all(axis=-1)
+        inside &= np.asarray(self.arm.reach_margin(targets)) > self.distribution.reach_margin
+        inside &= (np.asarray(self.arm.reach_margin(paths)) > 0.5 * self.distribution.reach_margin).all(
+            axis=-1
+        )
+        then = scenes.at(time)
+        many = Scenes(*(np.repeat(field, CANDIDATES, axis=0) for field in then))
+        clearance = rest_clearance(
+            many, targets.reshape(-1, targets.shape[-1]), self.arm, whole_arm=self.whole_arm
+        )
+        free: Bool = inside & (clearance.min(axis=-1).reshape(inside.shape) > self.distribution.end_margin)
+        return free
+
+    def _courses(self, generators: Sequence[np.random.Generator], scenes: Scenes) -> tuple[Float, Float]:
+        """Where obstacles are at the start, and their courses; where none fits an obstacle stands still."""
+        d, (number, rows) = self.distribution, scenes.obstacles.shape[:2]
+        size, dimension = rows * CANDIDATES, scenes.start.shape[-1]
+        u = Uniforms(np.stack([generator.random(7 * size) for generator in generators]))
+        velocities = [self._velocity(u, size, dimension) for _ in range(2)]
+        turns = u.take(size) < d.turning
+        turn = np.where(turns, self._centre * between(d.turn, u.take(size)), 0.0)
+        velocities[1] = np.where(turns[..., None], velocities[1], velocities[0])
+        meeting = self._centre * between(d.meeting, u.take(size))
+        courses = np.concatenate((velocities[0], turn[..., None], velocities[1]), axis=-1)
+        at_rest = np.repeat(scenes.obstacles, CANDIDATES, axis=1)
+        many = ChangingScenes(
+            scenes.start, scenes.goal, at_rest, np.zeros((number, 0, dimension + 1)), courses
+        )
+        ahead = _moved(many, meeting)[..., :dimension] - at_rest[..., :dimension]
+        many.obstacles[..., :dimension] -= np.where(many.present[..., None], ahead, 0.0)
+        fits = self._free(many).reshape(number, rows, CANDIDATES)
+        first = fits.argmax(axis=-1) + CANDIDATES * np.arange(rows)
+        some = (fits.any(axis=-1) & scenes.present)[..., None]
+        each = np.arange(number)[:, None]
+        return np.where(some, many.obstacles[each, first], scenes.obstacles), np.where(
+            some, courses[each, first], 0.0
+        )
+
+    def _velocity(self, u: Uniforms, size: int, dimension: int) -> Float:
+        angle, speed = 2.0 * np.pi * u.take(size), between(self.distribution.speed, u.take(size))
+        level = speed[..., None] * np.stack((np.cos(angle), np.sin(angle), np.zeros_like(angle)), axis=-1)
+        return np.asarray(level[..., :dimension])
+
+    def _free(self, many: ChangingScenes) -> Bool:
+        """Which obstacles leave start and goal free at first, and the goal while movements may end."""
+        d, dimension = self.distribution, many.start.shape[-1]
+        good = (np.abs(many.obstacles[..., :dimension]) < FARTHEST_CENTRE).all(axis=-1)
+        at_first = np.linspace(0.0, 0.2 * self._centre, 3)
+        at_last = np.append(0.0, np.linspace(self._shortest, 1.2 * self._longest, LOOKS))
+        for point, times in ((many.start, at_first), (many.goal, at_last)):
+            rows = many.places(np.repeat(times[None], len(point), axis=0))
+            scenes = Scenes(many.start, many.goal, rows.reshape(len(rows), -1, rows.shape[-1]))
+            clearance = rest_clearance(scenes, point, self.arm, whole_arm=self.whole_arm)[:, :-1]
+            good &= (clearance.reshape(rows.shape[:3]) > d.end_margin).all(axis=1)
+        return np.asarray(good)
+
+
+def _moved(many: ChangingScenes, time: Float) -> Float:
+    """Every obstacle at a time of its own, shape (N, n), [s]: rows of shape (N, n, 2 D + 1)."""
+    number, rows = time.shape
+    each = ChangingScenes(
+        np.repeat(many.start, rows, axis=0),
+        np.repeat(many.goal, rows, axis=0),
+        many.obstacles.reshape(-1, 1, many.obstacles.shape[-1]),
+        np.zeros((number * rows, *many.jumps.shape[1:])),
+        many.courses.reshape(-1, 1, many.courses.shape[-1]),
+    )
+    return each.places(time.reshape(-1, 1)).reshape(number, rows, -1)

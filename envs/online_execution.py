@@ -1,0 +1,140 @@
+"""Carrying out what decisions of different length make of plans, in groups of similar length."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.serial import EVERY
+from viapoint.envs.beside import Beside
+from viapoint.envs.clearance import FAR
+from viapoint.envs.courses import ChangingScenes, clearance_over_time
+from viapoint.envs.execution import GROUP, LOOK_EVERY, PACED
+from viapoint.envs.online_episodes import Carried, jerk_cost_between
+from viapoint.envs.revision import MovingPlan, timed
+from viapoint.envs.simulator import Simulator
+from viapoint.envs.steering import Motion
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+SIMILAR, SLACK = 1.15, 4
+"""A group's longest decision takes at most that many times the steps of its shortest, and so many more."""
+
+
+def groups_of(steps: Int) -> list[Int]:
+    """Indices of decisions of similar length, at most GROUP each and in increasing order.
+
+    Args:
+        steps: Physics steps of each, shape (n,).
+    """
+    groups: list[list[int]] = []
+    for index in np.argsort(steps, kind="stable"):
+        shortest = steps[groups[-1][0]] if groups else 0
+        if not groups or len(groups[-1]) == GROUP or steps[index] > SIMILAR * shortest + SLACK:
+            groups.append([])
+        groups[-1].append(int(index))
+    return [np.sort(np.array(group)) for group in groups]
+
+
+class OnlineExecutor:
+    """Carries out parts of plans in a simulator.
+
+    Args:
+        simulator: Of the arm.
+        beside: For the work that need not wait for the physics.
+        whole_arm: Whether the links count.
+    """
+
+    def __init__(self, simulator: Simulator, beside: Beside, *, whole_arm: bool) -> None:
+        self.simulator, self.arm, self.whole_arm = simulator, simulator.arm, whole_arm
+        self._beside = beside
+
+    def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float]:
+        """Plans made as slow as the arm's limits ask for, and by which factor, shape (N,).
+
+        One that begins in motion cannot be stretched without a jump of its velocity: its whole time is prolonged.
+        """
+        stretch = np.ones(len(plan.durations))
+        if not self.arm.velocity_limit:
+            return plan, stretch
+        for first in range(0, len(stretch), GROUP):
+            some = plan.take(slice(first, first + GROUP))
+            times = some.duration[:, None] * np.linspace(0.0, 1.0, PACED)
+            position, velocity, acceleration = some.trajectory().sample(times)
+            reachable = (np.asarray(self.arm.reach_margin(position)) >= 0.0).all(axis=-1)
+            factor = np.asarray(self.arm.pace(position, velocity, acceleration))
+            stretch[first : first + GROUP] = np.where(reachable, factor, 1.0)
+        slower = MovingPlan(plan.waypoints, plan.durations * stretch[:, None], *plan[2:])
+        moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
+        rows = np.flatnonzero(moving & (stretch > 1.0))
+        if rows.size:
+            state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
+            slower.put(rows, timed(plan.waypoints[rows], slower.duration[rows], state))
+        return slower, stretch
+
+    def reachable(self, plan: MovingPlan) -> Bool:
+        """Which plans stay within the arm's reach, shape (N,)."""
+        every = np.arange(int(np.ceil(plan.duration.max() / LOOK_EVERY)) + 1) * LOOK_EVERY
+        return np.asarray((np.asarray(self.arm.reach_margin(plan.trajectory()(every))) >= 0.0).all(axis=-1))
+
+    def __call__(
+        self, plan: MovingPlan, began: Int, now: Int, until: Int, scenes: ChangingScenes
+    ) -> list[Carried]:
+        """Carry out plans from one physics step of the episode to another, in each of N simulations.
+
+        Those with nothing to do, `until` being `now`, are left alone.
+
+        Args:
+            plan: Under way, N of them.
+            began: Physics step at which each began, shape (N,).
+            now: Physics step at present, shape (N,).
+            until: Before which physics step the decision ends, shape (N,).
+            scenes: N of them.
+        """
+        rows = np.flatnonzero(until > now)
+        groups = [rows[group] for group in groups_of((until - now)[rows])]
+        beside = self._beside.submit if len(groups) > 1 else Beside(threaded=False).submit
+        referred = [
+            beside(self._refer, plan.take(g), (now - began)[g], now[g], (until - now)[g], scenes.take(g))
+            for g in groups
+        ]
+        return [self._simulated(g, *each.result()) for g, each in zip(groups, referred, strict=True)]
+
+    def _refer(
+        self, plan: MovingPlan, since: Int, now: Int, steps: Int, scenes: ChangingScenes
+    ) -> tuple[Int, Float, Float, Float, Float, Float]:
+        """Steps, positions, controls, places of obstacles, clearance and jerk cost of one group."""
+        timestep, number = self.simulator.timestep, int(steps.max())
+        # A few steps more than needed, so that the controls of the last ones do not depend on the group's longest.
+        index = np.arange(number + EVERY + 1)
+        position, velocity, acceleration = plan.trajectory().sample(timestep * (since[:, None] + index))
+        controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])[:, :number]
+        rows = scenes.places(np.asarray(timestep * (now[:, None] + np.arange(number + 1))))
+        looks = np.arange(0, number + 1, max(round(LOOK_EVERY / timestep), 1))
+        profile = clearance_over_time(
+            self.arm, position[:, looks], rows[:, looks], scenes.present, whole_arm=self.whole_arm
+        ).min(axis=-1, initial=FAR)
+        clearance = np.where(looks <= steps[:, None], profile, FAR).min(axis=-1)
+        cost = jerk_cost_between(plan, np.asarray(timestep * since), np.asarray(timestep * (since + steps)))
+        present = scenes.present[:, None, :, None]
+        places = np.where(present, rows[:, :number, :, : self.arm.dimension], np.nan)
+        return steps, position[:, 1 : number + 1], controls, places, clearance, cost
+
+    def _simulated(
+        self,
+        sims: Int,
+        steps: Int,
+        planned: Float,
+        controls: Float,
+        places: Float,
+        clearance: Float,
+        cost: Float,
+    ) -> Carried:
+        record: Any = self.simulator.rollout_among_moving(sims, controls, places, steps)
+        touched = record.contact & (np.arange(planned.shape[1]) < steps[:, None])
+        until = np.where(touched.any(axis=-1), touched.argmax(axis=-1) + 1, steps)
+        return Carried(sims, until, planned, clearance, cost, record)
