@@ -315,14 +315,28 @@ def test_every_info_of_the_vector_environment_tells_the_time(uneven):
     env.close()
 
 
-def test_single_environments_tell_the_time_in_their_last_step_too(monkeypatch):
-    gym.register("test/Chain-v0", entry_point=Chain)
-    env = ViaVecEnv("test/Chain-v0", 2)
-    env.reset()
-    for seconds in np.tile(SECONDS, 2):
-        assert [info["elapsed"] for info in env.step(np.zeros((2, 1)))[3]] == [seconds, seconds]
+class Midway(Chain):
+    """Begins anywhere but at the end, so that copies end at different times."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = int(self.np_random.integers(3))
+        return self._observed(), {}
+
+
+def test_single_environments_tell_the_time_of_their_last_step_too():
+    gym.register("test/Midway-v0", entry_point=Midway)
+    env = ViaVecEnv("test/Midway-v0", 5, seed=0)
+    observed = env.reset()
+    mixed = 0
+    for _ in range(20):
+        expected = SECONDS[observed.argmax(axis=-1)]
+        observed, _, done, infos = env.step(np.zeros((5, 1)))
+        assert [info["elapsed"] for info in infos] == expected.tolist()
+        mixed += 0 < done.sum() < 5
+    assert mixed
     env.close()
-    del gym.registry["test/Chain-v0"]
+    del gym.registry["test/Midway-v0"]
 
 
 @pytest.mark.parametrize("algo", ["sac", "ppo"])
