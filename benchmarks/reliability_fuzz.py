@@ -26,9 +26,9 @@ import gymnasium as gym
 import numpy as np
 
 import viapoint.envs
-from viapoint.envs.registration import STEP_TASKS, TASKS
+from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
 
-IDS = sorted({*TASKS, *STEP_TASKS})
+IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
 DOCUMENTED = (ValueError, gym.error.ResetNeeded)
 """What a call may raise."""
 ALLOWED = 8.0

@@ -38,9 +38,9 @@ class ChangeDistribution:
     jump_distance: tuple[float, float] = (0.10, 0.30)
     """From one target to the next, [m]."""
     steepness: float = 0.5
-    """Greatest height gained by a jump in space, relative to its distance."""
+    """Greatest height gained by a jump or an obstacle in space, relative to the distance."""
     speed: tuple[float, float] = (0.05, 0.30)
-    """Of the obstacles, [m/s]; in space they move horizontally."""
+    """Of the obstacles, [m/s]."""
     turning: float = 0.5
     """Share of the obstacles that change their course."""
     turn: tuple[float, float] = (0.2, 0.7)
@@ -160,12 +160,11 @@ class ChangeSampler:
 
     def _targets(self, u: Uniforms, target: Float) -> Float:
         """Candidates for the next target, shape (N, CANDIDATES, D)."""
-        d = self.distribution
-        angle, length = 2.0 * np.pi * u.take(CANDIDATES), between(d.jump_distance, u.take(CANDIDATES))
-        height = d.steepness * (2.0 * u.take(CANDIDATES) - 1.0)
-        level = np.sqrt(1.0 - height**2) if target.shape[-1] == 3 else np.ones_like(height)
-        step = np.stack((level * np.cos(angle), level * np.sin(angle), height), axis=-1)
-        return np.asarray(target[:, None] + length[..., None] * step[..., : target.shape[-1]])
+        angle, length = 2.0 * np.pi * u.take(CANDIDATES), u.take(CANDIDATES)
+        step = self._direction(angle, u.take(CANDIDATES), target.shape[-1])
+        return np.asarray(
+            target[:, None] + between(self.distribution.jump_distance, length)[..., None] * step
+        )
 
     def _fits(self, scenes: ChangingScenes, time: Float, targets: Float, paths: Float) -> Bool:
         """Which candidates are inside the workspace, free when they appear, and reached without detours."""
@@ -187,7 +186,7 @@ class ChangeSampler:
         """Where obstacles are at the start, and their courses; where none fits an obstacle stands still."""
         d, (number, rows) = self.distribution, scenes.obstacles.shape[:2]
         size, dimension = rows * CANDIDATES, scenes.start.shape[-1]
-        u = Uniforms(np.stack([generator.random(7 * size) for generator in generators]))
+        u = Uniforms(np.stack([generator.random(9 * size) for generator in generators]))
         velocities = [self._velocity(u, size, dimension) for _ in range(2)]
         turns = u.take(size) < d.turning
         turn = np.where(turns, self._centre * between(d.turn, u.take(size)), 0.0)
@@ -210,8 +209,15 @@ class ChangeSampler:
 
     def _velocity(self, u: Uniforms, size: int, dimension: int) -> Float:
         angle, speed = 2.0 * np.pi * u.take(size), between(self.distribution.speed, u.take(size))
-        level = speed[..., None] * np.stack((np.cos(angle), np.sin(angle), np.zeros_like(angle)), axis=-1)
-        return np.asarray(level[..., :dimension])
+        return np.asarray(speed[..., None] * self._direction(angle, u.take(size), dimension))
+
+    def _direction(self, angle: Float, height: Float, dimension: int) -> Float:
+        """Unit vectors; in space they climb or fall by as much as a number from 0 to 1 says."""
+        if dimension == 2:
+            return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+        rise = self.distribution.steepness * (2.0 * height - 1.0)
+        level = np.sqrt(1.0 - rise**2)
+        return np.stack((level * np.cos(angle), level * np.sin(angle), rise), axis=-1)
 
     def _free(self, many: ChangingScenes) -> Bool:
         """Which obstacles leave start and goal free at first, and the goal while movements may end."""

@@ -109,33 +109,36 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         """What becomes of scenes."""
         self.reviser = Reviser(self.action_layout)
         """What the components of an action mean on the way."""
-        shortest, longest = self.action_layout.duration_range
-        self.time_limit = (2 + self.changes.n_jumps[1]) * longest + SETTLING
-        """Of an episode, [s]."""
+        limit = (2 + self.changes.n_jumps[1]) * self.action_layout.duration_range[1] + SETTLING
         self._ends = DecisionEnds(
             self.arm, whole_arm=self.task.whole_arm, timestep=self._simulator.timestep, triggers=decide_at,
-            horizon=horizon, margin=margin, time_limit=self.time_limit,
+            horizon=horizon, margin=margin, time_limit=limit,
         )  # fmt: skip
         self.time_limit = float(self._ends.limit * self._simulator.timestep)
-        base = self.observation_layout
+        """Of an episode, [s]."""
+        self._renderer: EpisodeRenderer = EpisodeRenderer(
+            self._simulator, self.render_mode, width, height, METADATA["render_fps"]
+        )
+        self._build()
+
+    def _build(self) -> None:
+        """Make what follows from the arguments: the observation, and what draws and carries out episodes."""
+        base, action, whole_arm = self.observation_layout, self.action_layout, self.task.whole_arm
         self.observation_layout = OnlineObservationLayout(
-            dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, n_via=n_via,
+            dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, n_via=action.n_via,
             time_limit=self.time_limit,
         )  # fmt: skip
         self.single_observation_space = self.observation_layout.space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        shortest, longest = action.duration_range
         self._change_sampler = ChangeSampler(
-            self.arm, self.changes, whole_arm=self.task.whole_arm,
-            durations=(shortest, self.action_layout.centre_duration, longest),
-        )  # fmt: skip
-        self._online = OnlineExecutor(self._simulator, self._beside, whole_arm=self.task.whole_arm)
+            self.arm, self.changes, whole_arm=whole_arm, durations=(shortest, action.centre_duration, longest)
+        )
+        self._online = OnlineExecutor(self._simulator, self._beside, whole_arm=whole_arm)
         self._episodes = OnlineEpisodes(
-            self.arm, self.num_envs, n_via=n_via, whole_arm=self.task.whole_arm,
+            self.arm, self.num_envs, n_via=action.n_via, whole_arm=whole_arm,
             timestep=self._simulator.timestep, most=self._ends.limit + 1,
         )  # fmt: skip
-        self._renderer: EpisodeRenderer = EpisodeRenderer(
-            self._simulator, self.render_mode, width, height, METADATA["render_fps"]
-        )
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
