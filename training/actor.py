@@ -11,8 +11,8 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from torch import Tensor, nn
 
 from viapoint.envs.task import Task
-from viapoint.training.anchors import Anchors
-from viapoint.training.features import Look, fares_size, look_at, scene_view
+from viapoint.training.anchors import anchors_of
+from viapoint.training.features import Look, fares_size, look_at, scene_sizes, scene_view
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation
 
@@ -49,9 +49,9 @@ class ViaActor(BaseModel):
         trajectory_features: bool = True,
     ) -> None:
         super().__init__(observation_space, action_space)
-        self.task, self.anchors = task, Anchors(task, heads)
+        self.task, self.anchors = task, anchors_of(task, observation_space.spaces, heads)
         self.rounds, self.kept, self.sighted = rounds, kept, trajectory_features
-        self.encoder = SetEncoder(task.arm.dimension, width // 4)
+        self.encoder = SetEncoder(*scene_sizes(observation_space.spaces, task), width // 4)
         self.size = get_action_dim(action_space)
         self.scene = nn.Linear(self.encoder.size, width)
         self.movement = nn.Linear(fares_size(task) + self.size, width, bias=False)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs._arrays import clamp
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.task import Task
-from viapoint.training.features import Look, look_along
+from viapoint.training.features import Look, look_along, look_at
+from viapoint.training.movements import Movements, direction, effort_of, on_the_way
 from viapoint.training.sight import INSTANTS
 
 Float = NDArray[np.float32]
@@ -16,6 +19,12 @@ Float = NDArray[np.float32]
 ALONG = {2: (-0.32, -0.16, 0.0, 0.16, 0.32), 3: (-0.25, 0.0, 0.25)}
 HEIGHT = {2: (0.12, 0.25, 0.40, 0.55, 0.70, 0.85), 3: (0.20, 0.45, 0.75)}
 """Where anchors' via-points lie from the middle of the straight line, relative to its length, in plane and space."""
+DETOURS = (0.2, 0.4, 0.7)
+"""How far a detour goes aside, relative to the distance that is left."""
+PACES = (0.0, -0.8, 0.8)
+"""Durations that are tried without a detour; the first changes nothing."""
+NARROW = 0.12
+"""Distances are not taken for shorter than this, [m]: obstacles are as wide near the goal as elsewhere."""
 
 
 class Anchors:
@@ -63,13 +72,64 @@ class Anchors:
         hand = start[:, None, None] + self.paths @ scaled[:, None]
         actions = self._actions(distance)
         log_jerk = np.broadcast_to(self.log_jerk, actions.shape[:2])
-        return look_along(observation, actions, self.task, hand, log_jerk, np.ones_like(log_jerk))
+        duration = np.full_like(log_jerk, self.task.action.centre_duration)
+        moves = Movements(hand, duration, log_jerk, effort_of(log_jerk, duration, self.task))
+        return look_along(observation, actions, moves, self.task)
 
     def _actions(self, distance: Float) -> Float:
         """Shape (B, A, m), inside (-1, 1)."""
         vias = self.vias * distance
         rest = np.zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]), dtype=vias.dtype)
         return np.asarray(clamp(np.concatenate((vias, rest), axis=-1), -0.97, 0.97))
+
+
+class AnchorsOnTheWay:
+    """Changes of a movement that is under way: none, detours to all sides, and other durations.
+
+    Args:
+        task: The environment's.
+        count: Only so many of them, evenly spread.
+    """
+
+    def __init__(self, task: Task, count: int | None = None) -> None:
+        self.task, d = task, task.arm.dimension
+        along, height, turn = np.meshgrid((-0.2, 0.2), DETOURS, _turns(d), indexing="ij")
+        sideways = (np.cos(turn), np.sin(turn))[: d - 1]
+        offsets = np.stack([along, *(height * side for side in sideways)], axis=-1).reshape(-1, d)
+        slower = np.zeros((len(offsets), 1))
+        quiet = np.zeros((len(PACES), d))
+        every = np.concatenate(
+            (
+                np.concatenate((quiet, np.array(PACES)[:, None]), axis=1),
+                np.concatenate((offsets, slower), axis=1),
+            )
+        )
+        every = every if count is None else every[np.linspace(0, len(every) - 1, count).round().astype(int)]
+        vias = np.tile(every[:, :d] / np.array(task.action.via_scale[:d]), task.action.n_via)
+        self.vias = vias.astype(np.float32)
+        """Via components of their actions, shape (A, K D), for a distance of 1 m."""
+        self.pace = every[:, d:].astype(np.float32)
+        """Duration components of their actions, shape (A, 1)."""
+
+    def __len__(self) -> int:
+        return len(self.vias)
+
+    def actions(self, observation: dict[str, Float]) -> Float:
+        """In each of B scenes, shape (B, A, m), inside (-1, 1)."""
+        line = direction(observation)
+        distance = np.maximum(np.sqrt((line * line).sum(axis=-1)), NARROW)[:, None, None]
+        vias = self.vias * distance
+        pace = np.broadcast_to(self.pace, (*vias.shape[:2], 1))
+        return np.asarray(clamp(np.concatenate((vias, pace), axis=-1), -0.97, 0.97))
+
+    def look(self, observation: dict[str, Float]) -> Look:
+        """See how they would fare in each of B scenes; the observation is of NumPy arrays."""
+        return look_at(observation, self.actions(observation), self.task)
+
+
+def anchors_of(task: Task, parts: Container[str], count: int | None = None) -> Anchors | AnchorsOnTheWay:
+    """The anchors for observations with these parts."""
+    return AnchorsOnTheWay(task, count) if on_the_way(parts) else Anchors(task, count)
 
 
 def _vias(dimension: int, count: int | None) -> NDArray[np.float64]:

@@ -7,13 +7,15 @@ the physics adds is left to learning.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import NamedTuple
 
 from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.action import frame
 from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.task import Task
-from viapoint.training.sight import INSTANTS, STRETCHES, Array, Observation, Sight, push, see
+from viapoint.training.movements import Movements, direction, movements, on_the_way
+from viapoint.training.sight import STRETCHES, Array, Observation, Sight, push, see, velocities
 
 GEOMETRY = STRETCHES + 4
 """Numbers that tell clearance and reach of a movement."""
@@ -83,22 +85,42 @@ def fares_size(task: Task) -> int:
 
 
 def scene_view(observation: Observation, task: Task) -> SceneView:
-    """The scene of an observation, seen along its straight line; `hand` is the start."""
+    """The scene of an observation, seen along the line from `hand` to `goal`."""
     start, goal = observation["hand"], observation["goal"]
     xp = namespace_of(start)
-    line = goal - start
+    line = direction(observation)
     distance = xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
-    ends = 2.0 * xp.concat((start, goal, distance), axis=-1)
-    if "obstacles" not in observation:
-        empty = xp.zeros((len(start), 1, 2 * task.arm.dimension + 1), dtype=start.dtype)
-        return SceneView(ends, empty, empty[..., 0] > 0.0)
-    rows = task.observation.obstacles(observation["obstacles"])
     axes = xp.stack(frame(line), axis=-1)
+    ends = [2.0 * xp.concat((start, goal, distance), axis=-1)]
+    if on_the_way(observation):
+        ends += _motion(observation, axes, task)
+    together = xp.concat(ends, axis=-1)
+    if "obstacles" not in observation:
+        empty = xp.zeros((len(start), 1, scene_sizes(observation, task)[1]), dtype=start.dtype)
+        return SceneView(together, empty, empty[..., 0] > 0.0)
+    rows = task.observation.obstacles(observation["obstacles"])
     centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
     half = rows.half_axis @ axes
     half = xp.where(half[..., 1:2] < 0.0, -half, half)  # a bar has no sense of direction
-    seen = xp.concat((centre, half, rows.radius[..., None]), axis=-1) * 5.0
-    return SceneView(ends, seen, rows.present > 0.5)
+    seen = [xp.concat((centre, half, rows.radius[..., None]), axis=-1) * 5.0]
+    if on_the_way(observation):
+        seen.append(3.0 * velocities(observation, rows.centre) @ axes)
+    return SceneView(together, xp.concat(seen, axis=-1), rows.present > 0.5)
+
+
+def _motion(observation: Observation, axes: Array, task: Task) -> list[Array]:
+    """How the hand moves, in the frame, and how long it would go on, of size one."""
+    velocity, acceleration = (
+        (observation[name][:, None] @ axes)[:, 0] * scale
+        for name, scale in (("velocity", 1.0), ("acceleration", 0.1))
+    )
+    return [velocity, acceleration, observation["remaining"], observation["time_left"]]
+
+
+def scene_sizes(parts: Container[str], task: Task) -> tuple[int, int]:
+    """Numbers of :attr:`SceneView.ends` and of each obstacle, for observations with these parts."""
+    d = task.arm.dimension
+    return (4 * d + 3, 3 * d + 1) if on_the_way(parts) else (2 * d + 1, 2 * d + 1)
 
 
 def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
@@ -109,73 +131,35 @@ def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
         actions: Shape (B, H, m), in [-1, 1].
         task: The environment's.
     """
-    hand, log_jerk, relative = _planned(observation, actions, task)
-    seen = see(observation, hand, task)
-    return Foresight(seen, log_jerk, known_reward(seen, log_jerk, relative, task))
+    moves = movements(observation, actions, task)
+    seen = see(observation, moves.path, task, moves.duration)
+    return Foresight(seen, moves.log_jerk, known_reward(seen, moves, task))
 
 
 def look_at(observation: Observation, actions: Array, task: Task) -> Look:
     """See how actions of shape (B, A, m) would fare."""
-    hand, log_jerk, relative = _planned(observation, actions, task)
-    return look_along(observation, actions, task, hand, log_jerk, relative)
+    return look_along(observation, actions, movements(observation, actions, task), task)
 
 
-def look_along(
-    observation: Observation, actions: Array, task: Task, hand: Array, log_jerk: Array, relative: Array
-) -> Look:
-    """See how actions would fare whose paths, jerk and duration are known already.
-
-    Args:
-        observation: Of B scenes.
-        actions: Shape (B, A, m).
-        task: The environment's.
-        hand: Their paths, shape (B, A, PHASES, D), [m].
-        log_jerk: Log of their jerk cost relative to the straight movement's, shape (B, A).
-        relative: Their duration relative to the zero action's, shape (B, A).
-    """
-    xp = namespace_of(hand)
-    seen, pushed = push(observation, hand, task)
-    axes = xp.stack(frame(observation["goal"] - observation["hand"]), axis=-1)
+def look_along(observation: Observation, actions: Array, moves: Movements, task: Task) -> Look:
+    """See how actions would fare whose movements are known already."""
+    xp = namespace_of(actions)
+    seen, pushed = push(observation, moves.path, task, moves.duration)
+    axes = xp.stack(frame(direction(observation)), axis=-1)
     in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
-    known = known_reward(seen, log_jerk, relative, task).total()
+    known = known_reward(seen, moves, task).total()
     return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known)
 
 
-def known_reward(seen: Sight, log_jerk: Array, relative: Array, task: Task) -> KnownReward:
+def known_reward(seen: Sight, moves: Movements, task: Task) -> KnownReward:
     """As :func:`viapoint.envs.reward.reward_terms` has it."""
-    xp = namespace_of(log_jerk)
-    least = clamp(xp.min(seen.clearance, axis=-1), *CLEARANCE_RANGE)
+    least = clamp(namespace_of(seen.clearance).min(seen.clearance, axis=-1), *CLEARANCE_RANGE)
+    relative = moves.duration / task.action.centre_duration
     return KnownReward(
         task.weights.clearance * least / CLEARANCE_UNIT,
-        -task.weights.smoothness * (log_jerk - 5.0 * xp.log(relative)),
+        -task.weights.smoothness * moves.effort,
         -task.weights.duration * (relative - 1.0),
     )
-
-
-def _planned(observation: Observation, actions: Array, task: Task) -> tuple[Array, Array, Array]:
-    """Hand paths, log of the relative jerk cost, and duration relative to the zero action's."""
-    xp = namespace_of(actions)
-    start, goal = _ends(observation, actions)
-    plan = task.action.decode(actions, start, goal)
-    trajectory, duration = plan.trajectory(), xp.sum(plan.durations, axis=-1)
-    line = goal - start
-    ratio = trajectory.cost() * duration**5 / (360.0 * xp.sum(line * line, axis=-1))
-    log_jerk = xp.log(xp.maximum(ratio, xp.ones_like(ratio)))
-    return trajectory(_times(duration)), log_jerk, duration / task.action.centre_duration
-
-
-def _ends(observation: Observation, actions: Array) -> tuple[Array, Array]:
-    """Start and goal for each action."""
-    xp = namespace_of(actions)
-    shape = (*actions.shape[:2], observation["hand"].shape[-1])
-    start, goal = (xp.broadcast_to(observation[name][:, None], shape) for name in ("hand", "goal"))
-    return start, goal
-
-
-def _times(duration: Array) -> Array:
-    """When movements are looked at, shape (..., PHASES), [s]."""
-    xp = namespace_of(duration)
-    return duration[..., None] * xp.asarray(INSTANTS, dtype=duration.dtype)
 
 
 def _sized(seen: Sight) -> Array:

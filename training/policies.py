@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
 from viapoint.training.actor import Improved, ViaActor, arrays, best
-from viapoint.training.features import GEOMETRY, Foresight, KnownReward, foresee, scene_view
+from viapoint.training.features import GEOMETRY, Foresight, KnownReward, foresee, scene_sizes, scene_view
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation, Sight
 
@@ -48,7 +48,7 @@ class ViaCritic(BaseModel):
     ) -> None:
         super().__init__(observation_space, action_space)
         self.task, self.sighted = task, trajectory_features
-        self.encoder = SetEncoder(task.arm.dimension, width // 4)
+        self.encoder = SetEncoder(*scene_sizes(observation_space.spaces, task), width // 4)
         self.scene = nn.Linear(self.encoder.size, width)
         self.movement = nn.Linear(GEOMETRY + 1 + get_action_dim(action_space), width, bias=False)
         self.value = nn.Sequential(nn.ReLU(), layers(width, width), nn.Linear(width, 1))

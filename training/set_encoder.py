@@ -28,10 +28,11 @@ class SetEncoder(nn.Module):
     Sets, arXiv 1703.06114).
     """
 
-    def __init__(self, dimension: int, width: int) -> None:
+    def __init__(self, ends: int, row: int, width: int) -> None:
+        """For scenes whose ends and whose obstacles are told by so many numbers."""
         super().__init__()
-        self.each = layers(4 * dimension + 2, width, width)
-        self.size = 2 * width + 2 * dimension + 1
+        self.each = layers(ends + row, width, width)
+        self.size = 2 * width + ends
 
     def forward(self, scene: SceneView) -> Tensor:
         """Shape (B, size)."""

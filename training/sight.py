@@ -43,19 +43,26 @@ class Sight(NamedTuple):
     """Least over the movement, shape (B, H), [m]."""
 
 
-def see(observation: Observation, hand: Array, task: Task) -> Sight:
-    """Clearance and reach of hand paths, shape (B, H, PHASES, D), [m]."""
+def see(observation: Observation, hand: Array, task: Task, duration: Array = None) -> Sight:
+    """Clearance and reach of hand paths.
+
+    Args:
+        observation: Of B scenes.
+        hand: Shape (B, H, PHASES, D), [m].
+        task: The environment's.
+        duration: Of the movements, shape (B, H), [s]; where obstacles move it must be known.
+    """
     xp = namespace_of(hand)
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
         return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
     if _among_links(task):
         return Sight(_seen_of_links(observation, hand, task), margin)
-    nearest, pairs = _nearest(observation, hand, task)
-    return Sight(_lowest(_clearance(nearest, *pairs, task)[..., 0, :]), margin)
+    nearest, pairs = _nearest(observation, hand, task, duration)
+    return Sight(_lowest(_clearance(nearest, pairs, task)[..., 0, :]), margin)
 
 
-def push(observation: Observation, hand: Array, task: Task) -> tuple[Sight, Array]:
+def push(observation: Observation, hand: Array, task: Task, duration: Array = None) -> tuple[Sight, Array]:
     """What is seen of hand paths, and where the nearest obstacle of each stretch pushes the hand.
 
     The push is the gradient of the clearance by difference quotients, the weaker the farther the obstacle, shape
@@ -69,10 +76,13 @@ def push(observation: Observation, hand: Array, task: Task) -> tuple[Sight, Arra
     if _among_links(task):
         near = _approaches(observation, hand, task, NEAR)
         return Sight(near.clearance, margin), near.gradient * _nearness(near.clearance)
-    nearest, pairs = _nearest(observation, hand, task)
+    nearest, pairs = _nearest(observation, hand, task, duration)
     moves = xp.asarray(_STEP * np.eye(hand.shape[-1]), dtype=hand.dtype)
     around = xp.concat((nearest, nearest[..., 1:2, :] + moves), axis=-2)
-    clearance = _clearance(around, *pairs, task)[..., 0, :]
+    if pairs.drift is not None:
+        same = xp.broadcast_to(pairs.drift[..., 1:2, :], (*pairs.drift.shape[:-2], *moves.shape))
+        pairs = pairs._replace(drift=xp.concat((pairs.drift, same), axis=-2))
+    clearance = _clearance(around, pairs, task)[..., 0, :]
     gradient = (clearance[..., 3:] - clearance[..., 1:2]) / _STEP
     lowest = _lowest(clearance[..., :3])
     return Sight(lowest, margin), gradient * _nearness(lowest)
@@ -107,17 +117,32 @@ def _approaches(observation: Observation, hand: Array, task: Task, within: float
     return approaches(task.arm, still, obstacles, STRETCHES, within)
 
 
-def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, tuple[Array, Array]]:
+class _Others(NamedTuple):
+    """n obstacles."""
+
+    rows: Array
+    """Shape (..., n, 2 D + 1), [m]."""
+    present: Array
+    """Shape (..., n)."""
+    drift: Array
+    """How far each has moved at each time, shape (..., n, T, D), [m]; None where they stand."""
+
+
+def _nearest(observation: Observation, hand: Array, task: Task, duration: Array) -> tuple[Array, _Others]:
     """Nearest approach of each stretch: the hand just before, at and after it, and the obstacle it is to.
 
-    Shapes (B, H, STRETCHES, 3, D), (B, H, STRETCHES, 1, 2 D + 1) and (B, H, STRETCHES, 1).
+    Shapes (B, H, STRETCHES, 3, D), and of obstacles (B, H, STRETCHES, 1, .).
     """
     xp = namespace_of(hand)
     rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
     obstacles = xp.concat((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
-    present = rows.present > 0.5
-    still = hand if xp is np or not hasattr(hand, "detach") else hand.detach()
-    profile = _clearance(still, obstacles[:, None], present[:, None], task)
+    present, moving = rows.present > 0.5, "obstacle_velocities" in observation
+    every = _Others(obstacles[:, None], present[:, None], None)
+    if moving:
+        velocity = velocities(observation, rows.centre)
+        times = _still(duration)[..., None] * xp.asarray(INSTANTS, dtype=hand.dtype)
+        every = every._replace(drift=velocity[:, None, :, None] * times[:, :, None, :, None])
+    profile = _clearance(_still(hand), every, task)
     profile = xp.reshape(profile, (*profile.shape[:3], STRETCHES, LOOKS))
     which = xp.argmin(xp.min(profile, axis=-1), axis=2)
     look = xp.argmin(xp.min(profile, axis=2), axis=-1)
@@ -127,7 +152,23 @@ def _nearest(observation: Observation, hand: Array, task: Task) -> tuple[Array, 
     nearest = xp.take_along_axis(hand, xp.reshape(around, shape), axis=2)
     nearest = xp.reshape(nearest, (*around.shape, hand.shape[-1]))
     scene = xp.arange(len(hand))[:, None, None]
-    return nearest, (obstacles[scene, which][..., None, :], present[scene, which][..., None])
+    pairs = _Others(obstacles[scene, which][..., None, :], present[scene, which][..., None], None)
+    if moving:
+        times = duration[..., None, None] * xp.asarray(INSTANTS, dtype=hand.dtype)[around]
+        pairs = pairs._replace(
+            drift=(velocity[scene, which][..., None, :] * times[..., None])[..., None, :, :]
+        )
+    return nearest, pairs
+
+
+def velocities(observation: Observation, like: Array) -> Array:
+    """Of the obstacles, shape (B, n, D), [m/s]: as `like`."""
+    return namespace_of(like).reshape(observation["obstacle_velocities"], like.shape)
+
+
+def _still(values: Array) -> Array:
+    """Values without gradients."""
+    return values.detach() if hasattr(values, "detach") else values
 
 
 def _lowest(three: Array) -> Array:
@@ -140,9 +181,10 @@ def _lowest(three: Array) -> Array:
     return xp.where(between, at - drop, at)
 
 
-def _clearance(hand: Array, obstacles: Array, present: Array, task: Task) -> Array:
+def _clearance(hand: Array, others: _Others, task: Task) -> Array:
     """Of the hand and, where they count, the links, from each obstacle at each time, shape (..., n, T)."""
+    arm, (rows, present, drift) = task.arm, others
     if not task.whole_arm:
-        return clearance_profile(hand, task.arm.hand_radius, obstacles, present)
-    links = task.arm.links(task.arm.posture(hand))
-    return clearance_profile(hand, task.arm.hand_radius, obstacles, present, links, task.arm.link_radii)
+        return clearance_profile(hand, arm.hand_radius, rows, present, drift=drift)
+    links = arm.links(arm.posture(hand))
+    return clearance_profile(hand, arm.hand_radius, rows, present, links, arm.link_radii, drift)
