@@ -31,7 +31,7 @@ def free_to_revise(env):
     return far & (default.changed | ~default.begun | (default.remaining >= env.reviser.least_remaining))
 
 
-@pytest.mark.parametrize("decisions", (0, 1, 2))
+@pytest.mark.parametrize("decisions", [0, 1, 2])
 @pytest.mark.parametrize("env_id", IDS)
 def test_foreseen_movements_are_the_ones_that_will_be_commanded(env_id, decisions):
     env, observation, generator = under_way(env_id, decisions=decisions)
