@@ -127,8 +127,9 @@ def problems_of_changes(
         yield _first(
             there & (time >= time_limit), time, what, f"s is not before the time limit, {time_limit:g} s"
         )
-    late = scenes.jump_times[:, 1:] <= scenes.jump_times[:, :-1]
-    yield _first(given[:, 1:] & late, scenes.jumps[:, 1:, 0], "jump", "s is not after the one before it")
+    late = np.zeros_like(given)
+    late[:, 1:] = scenes.jump_times[:, 1:] <= scenes.jump_times[:, :-1]
+    yield _first(given & late, scenes.jumps[..., 0], "jump", "s is not after the one before it")
     for first in (0, d + 1):
         speed = np.sqrt((scenes.courses[..., first : first + d] ** 2).sum(axis=-1))
         yield _first(scenes.present & (speed > FASTEST), speed, "course", f"m/s is faster than {FASTEST} m/s")

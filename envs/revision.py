@@ -175,11 +175,12 @@ class Reviser:
         d, number = layout.dimension, layout.n_via
         axes = frame(self._line(default))
         scale = np.array(layout.via_scale[:d])
-        offsets = actions[:, : number * d].reshape(-1, number, d) * scale
+        offsets = actions[:, : number * d].reshape(len(actions), number, d) * scale
         vias = default.vias + sum(offsets[..., i : i + 1] * axis[:, None] for i, axis in enumerate(axes))
         low, high = layout.duration_range
         factor = (high / low) ** (0.5 * actions[:, number * d])
-        duration = np.maximum(default.remaining * factor, self.least_remaining)
+        longest = np.maximum(default.remaining, high)
+        duration = np.clip(default.remaining * factor, self.least_remaining, longest)
         points = np.concatenate((state.position[:, None], vias, default.goal[:, None]), axis=1)
         plan = timed(points, duration, state)
         zero = (actions == 0.0).all(axis=-1)[
