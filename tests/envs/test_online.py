@@ -189,6 +189,21 @@ def test_a_predicted_collision_ends_the_decision_before_it_happens():
     assert events(play(careless)) == [Event.CONTACT]
 
 
+def test_a_change_of_course_is_foreseen_only_once_it_has_happened():
+    """An obstacle stands near the goal, and sets out for it a third of a second before it touches the hand there."""
+    turn = 0.6
+    env, _ = make(
+        MOVING,
+        obstacles=[[0.1, 0.6, 0.0, 0.0, 0.03]],
+        courses=[[0, 0, turn, 0, -0.5]],
+        decide_at=("clearance",),
+    )
+    *_, info = env.step(np.zeros(3))
+    assert info["event"] == Event.CLEARANCE
+    assert turn <= info["time"] < turn + 2.0 * LOOK * SAMPLED
+    assert play(env)[-1]["first_contact_time"] < turn + FORESIGHT
+
+
 def test_an_obstacle_that_runs_into_a_resting_arm_is_a_collision_and_no_crash():
     course = [[0.0, -0.2, 0.0, 0.0, -0.2]]
     env, _ = make(
