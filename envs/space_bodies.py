@@ -18,6 +18,8 @@ OUTER = 5
 """Links next to the hand: what is drawn near it concerns them first, and only what is chosen concerns the others."""
 LENGTH = 1e-4
 """A hand alone is a link of that length, as a link must have one, [m]."""
+ABOVE = 0.06
+"""How far sideways what is above the hand may be, [m]."""
 
 
 class Bodies(NamedTuple):
@@ -70,6 +72,21 @@ class Swept(NamedTuple):
             radii = (arm.hand_radius,)
         first = max(len(radii) - OUTER, 0)
         return cls(Bodies(links[:, :, first:], radii[first:]), Bodies(links[:, :, :first], radii[:first]))
+
+    def top(self, phase: NDArray[np.int64], place: Float) -> Float:
+        """Height of what of the links near the hand stands above it, at K times of each movement.
+
+        Args:
+            phase: Index of the times, shape (N, K).
+            place: The hand then, shape (N, K, 3), [m].
+
+        Returns:
+            Shape (N, K), [m].
+        """
+        ends = self.outer.ends[np.arange(len(phase))[:, None], phase]
+        apart = np.sqrt(((ends[..., :2] - place[:, :, None, None, :2]) ** 2).sum(axis=-1))
+        high = ends[..., 2] + np.array(self.outer.radii, np.float32)[:, None]
+        return np.asarray(np.where(apart < ABOVE, high, place[:, :, None, None, 2]).max(axis=(-2, -1)))
 
     def take(self, rows: NDArray[np.int64]) -> Swept:
         """The movements at `rows`."""

@@ -9,12 +9,30 @@ from viapoint.envs.action import check_increasing_pair
 MOST = 8
 """Obstacles of a scene at most."""
 
-FAMILIES: dict[str, int] = {"clutter": 1, "shelf": 3, "gate": 3, "pillar": 1}
+FAMILIES: dict[str, int] = {
+    "clutter": 1,
+    "pillar": 1,
+    "shelf": 3,
+    "gate": 3,
+    "slot": 4,
+    "window": 4,
+    "tunnel": 6,
+}
 """What may stand in the way, and the fewest obstacles that it takes.
 
-`clutter` is a sphere, a post or a bar near the straight line, `shelf` a board of three bars side by side, `gate` two
-posts with a sill between them, `pillar` a thick post on the table. Other spheres, posts and bars stand about each.
+`clutter` is a sphere, a post or a bar near the straight line, `pillar` a thick post on the table, `shelf` a board of
+three bars side by side, `gate` two posts with a sill between them. `slot` is a shelf with a beam over the arm, `window`
+a gate with one, `tunnel` two windows of one sill and one beam, one behind the other. Other spheres, posts and bars
+stand about each.
 """
+TRAINED = ("clutter", "pillar", "shelf", "gate", "slot", "window", "window")
+"""Families that are drawn unless one says otherwise, the narrowest of them twice as often."""
+NARROW = ("shelf", "gate", "slot", "window", "tunnel")
+"""Families among whose scenes there are hard ones often enough to search for them."""
+BOARDS = ("shelf", "slot")
+"""Families that stand on a board of three bars, which the movement passes over."""
+BEAMS = ("slot", "window", "tunnel")
+"""Families with a beam, which the arm passes under."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,8 +41,9 @@ class SpaceDistribution:
 
     n_obstacles: tuple[int, int] = (1, 6)
     """Fewest and most obstacles; where a family takes more than the fewest, it gets them."""
-    families: tuple[str, ...] = tuple(FAMILIES)
-    """Drawn with equal chances; those that take more than the most obstacles are left out."""
+    families: tuple[str, ...] = TRAINED
+    """Drawn with equal chances, one named twice with twice the chance; those that take more than the most obstacles
+    are left out."""
     distance: tuple[float, float] = (0.30, 0.50)
     """From start to goal, [m]."""
     steepness: float = 0.5
@@ -39,17 +58,23 @@ class SpaceDistribution:
     """[m]."""
     bar_half_length: tuple[float, float] = (0.06, 0.18)
     """[m]."""
-    board_half_length: tuple[float, float] = (0.06, 0.13)
+    board_half_length: tuple[float, float] = (0.10, 0.25)
     """Of a shelf's bars, [m]."""
     board_spacing: float = 0.04
     """Between a shelf's bars, [m]: nothing of the arm fits in between."""
-    gate_half_width: tuple[float, float] = (0.16, 0.24)
-    """Between the middle of a gate and each post, [m]; the gripper is 0.21 m wide."""
+    beam_half_length: tuple[float, float] = (0.08, 0.15)
+    """[m]."""
+    beam_overlap: float = 0.08
+    """How far a beam reaches from above the hand towards the arm's base, [m]."""
+    gate_half_width: tuple[float, float] = (0.06, 0.14)
+    """Between the middle of a gate and each post, [m], before they make room; the gripper is 0.21 m wide."""
+    tunnel_length: float = 0.1
+    """Between its gates, [m]."""
     spread: float = 0.22
     """Greatest distance of other obstacles from the straight line, [m]."""
-    ease: float = 0.25
+    ease: float = 0.15
     """Hardness is a uniform number to this power: less is harder."""
-    link_margin: float = 0.012
+    link_margin: float = 0.006
     """Least clearance of the movement that is kept clear, its links included, at the times that are looked at, [m]."""
     end_margin: float = 0.02
     """Least clearance of the arm at start and goal, [m]."""
@@ -70,7 +95,7 @@ class SpaceDistribution:
             raise ValueError(f"families {self.families!r} take more than {most} obstacles")
         for name in (
             "distance", "sphere_radius", "post_radius", "pillar_radius", "bar_radius", "bar_half_length",
-            "board_half_length", "gate_half_width",
+            "board_half_length", "beam_half_length", "gate_half_width",
         ):  # fmt: skip
             check_increasing_pair(name, getattr(self, name))
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.space_distribution import SpaceDistribution
+from viapoint.envs.space_distribution import BEAMS, BOARDS, SpaceDistribution
 
 Float = NDArray[np.float64]
 
-PARTS = 3
+PARTS = 6
 """Rows of a structure at most."""
 NUMBERS = 6
 """Uniform numbers that make one structure or one obstacle."""
@@ -28,6 +28,8 @@ class Course(NamedTuple):
     """On the movement that is kept clear, shape (N, K, 3), [m]."""
     heading: Float
     """Horizontal direction of the movement there, shape (N, K, 3)."""
+    top: Float
+    """Height of the links above the hand there, shape (N, K), [m]."""
     hardness: Float
     """Shape (N, 1), in [0, 1]."""
 
@@ -67,13 +69,20 @@ def structure(family: str, d: SpaceDistribution, course: Course, u: Float, hand_
         rows[:, :, 0] = _post(foot + _left(course.heading) * side[..., None], top, radius)
     else:
         below = hand_radius + d.link_margin + 0.005 + 0.06 * u[..., 0] * (1.0 - course.hardness)
-        rows[:] = (_shelf if family == "shelf" else _gate)(d, course, u, below)
+        rows[:, :, :3] = (_shelf if family in BOARDS else _gate)(d, course, u, below)
     if family in ("clutter", "pillar"):
         top = rows[:, :, 0, :3] + rows[:, :, 0, 3:6]
         away = top - course.place
         retreat[:, :, 0] = away / np.maximum(np.sqrt((away**2).sum(axis=-1, keepdims=True)), 1e-6)
-    if family == "gate":
-        retreat[:, :, :2] = np.stack((-_left(course.heading), _left(course.heading)), axis=-2)
+    elif family not in BOARDS:
+        aside = np.stack((-_left(course.heading), _left(course.heading)), axis=-2)
+        retreat[:, :, :2] = retreat[:, :, 4:] = aside
+    if family in BEAMS:
+        rows[:, :, 3] = _beam(d, course, u)
+        retreat[:, :, 3, 2] = 1.0
+    if family == "tunnel":
+        rows[:, :, 4:] = rows[:, :, :2]
+        rows[:, :, 4:, :3] += d.tunnel_length * course.heading[:, :, None]
     return Built(rows, retreat)
 
 
@@ -114,6 +123,16 @@ def _gate(d: SpaceDistribution, course: Course, u: Float, below: Float) -> Float
     posts = [_post(middle + (side * width)[..., None] * across, top, radius) for side in (-1.0, 1.0)]
     low = np.concatenate((middle[..., :2], (course.place[..., 2] - below - sill)[..., None]), axis=-1)
     return np.stack((*posts, _row(low, width[..., None] * across, sill)), axis=-2)
+
+
+def _beam(d: SpaceDistribution, course: Course, u: Float) -> Float:
+    """A bar over the links above the hand, across the movement, from near the arm's base outwards."""
+    radius, half = _between(d.bar_radius, u[..., 5]), _between(d.beam_half_length, u[..., 2])
+    out = _left(course.heading)
+    out = np.where((out * course.place).sum(axis=-1, keepdims=True) < 0.0, -out, out)
+    height = course.top + d.link_margin + radius
+    middle = course.place + (half - d.beam_overlap)[..., None] * out
+    return _row(np.concatenate((middle[..., :2], height[..., None]), axis=-1), half[..., None] * out, radius)
 
 
 def _post(centre: Float, top: Float, radius: Float) -> Float:

@@ -16,7 +16,7 @@ from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.space_bodies import Bodies, Swept
-from viapoint.envs.space_distribution import SpaceDistribution
+from viapoint.envs.space_distribution import BOARDS, SpaceDistribution
 from viapoint.envs.space_obstacles import NUMBERS, PARTS, Course, single, structure
 
 Float = NDArray[np.float64]
@@ -27,6 +27,10 @@ ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 14
 movement is looked at."""
 ATTEMPTS = (1, 2, 4, *[8] * 50)
 """How many attempts are made at once, one time after the other: few are left after the first."""
+FAITHFUL = 8
+"""How many times attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
+FAMILY = 6 * ENDS + 3 * WITNESSES + 1
+"""Which of the uniform numbers of an attempt stands for the family."""
 GIVE_WAY = 1.3
 """How far what is in the witness's way moves, relative to what it lacks in clearance."""
 IN_THE_WAY = 0.004
@@ -58,20 +62,27 @@ class SpaceSampler:
         """
         number = len(generators)
         scenes = Scenes(np.zeros((number, 3)), np.zeros((number, 3)), np.zeros((number, self._rows, 7)))
-        pending = np.arange(number)
-        for attempts in ATTEMPTS:
+        pending, family = np.arange(number), np.array([each.random() for each in generators])
+        for group, attempts in enumerate(ATTEMPTS):
+            if not len(pending):
+                break
             u = np.concatenate([generators[int(i)].random((attempts, self._size)) for i in pending])
             each = np.repeat(pending, attempts)
+            if group < FAITHFUL:
+                u[:, FAMILY] = family[each]
             found, attempt = self._attempt(u, None if ends is None else (ends[0][each], ends[1][each]))
             solved, first = np.unique(each[found], return_index=True)
             scenes.put(solved, attempt.take(first))
             pending = np.setdiff1d(pending, solved)
-            if not len(pending):
-                return scenes
-        raise RuntimeError(
-            f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(ATTEMPTS)} attempts"
-            + ("" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}")
-        )
+        if len(pending):
+            between = (
+                "" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
+            )
+            raise RuntimeError(
+                f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(ATTEMPTS)} "
+                f"attempts{between}"
+            )
+        return scenes
 
     @property
     def _size(self) -> int:
@@ -87,7 +98,9 @@ class SpaceSampler:
         )
         start, goal, good = self._ends(parts[0].reshape(-1, ENDS, 6), ends)
         above = (
-            self._families[self._which(parts[2][:, 1])] == "shelf" if self._rows else np.zeros(len(u), bool)
+            np.isin(self._families[self._which(parts[2][:, 1])], BOARDS)
+            if self._rows
+            else np.zeros(len(u), bool)
         )
         path, reached = self._witness(parts[1].reshape(-1, WITNESSES, 3), start, goal, above)
         found = good & reached
@@ -172,15 +185,17 @@ class SpaceSampler:
             if not len(some):
                 continue
             start, goal, path = (part[some] for part in course)
-            here = self._course((start, goal, path), u[some, :, -1], hardness[some])
+            here = self._course((start, goal, path), u[some, :, -1], hardness[some], swept.take(some))
             rows[some], retreat[some] = structure(
                 name, self.distribution, here, u[some, :, :NUMBERS], self.arm.hand_radius
             )
         clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7)).min(axis=-1)
         lacking = self.distribution.link_margin + 0.002 - clearance
         lacking = np.maximum(lacking.reshape(rows.shape[:3]), 0.0)
-        together = (self._families[which] == "shelf")[:, None, None]
-        lacking = np.where(together, lacking.max(axis=-1, keepdims=True), lacking)
+        board = np.isin(self._families[which], BOARDS)[:, None]
+        lacking[..., :3] = np.where(
+            board[..., None], lacking[..., :3].max(axis=-1, keepdims=True), lacking[..., :3]
+        )
         rows[..., :3] += np.where(rows[..., -1:] > 0.0, GIVE_WAY * lacking[..., None] * retreat, 0.0)
         return rows
 
@@ -188,7 +203,7 @@ class SpaceSampler:
         self, u: Float, course: tuple[Float, Float, Float], hardness: Float, swept: Swept, missing: Float
     ) -> tuple[Bool, Float]:
         """Which scenes get as many further obstacles as are missing, and these, shape (N, rows, 7)."""
-        here = self._course(course, u[..., -1], hardness)
+        here = self._course(course, u[..., -1], hardness, swept)
         rows = self._loose(u, here)
         room = self._room(swept.outer, rows)
         rows = _pushed(rows, here.place, hardness * np.maximum(room - 0.002, 0.0))
@@ -203,7 +218,7 @@ class SpaceSampler:
         """Index of the family that a uniform number stands for."""
         return np.minimum((u * len(self._families)).astype(np.int64), len(self._families) - 1)
 
-    def _course(self, course: tuple[Float, Float, Float], u: Float, hardness: Float) -> Course:
+    def _course(self, course: tuple[Float, Float, Float], u: Float, hardness: Float, swept: Swept) -> Course:
         """The movement around places that are drawn on the middle of the witness."""
         start, goal, path = course
         phase = (0.3 * PHASES + 0.4 * PHASES * u).astype(np.int64)
@@ -212,7 +227,8 @@ class SpaceSampler:
         step[..., 2] = 0.0
         length = np.sqrt((step**2).sum(axis=-1, keepdims=True))
         heading = np.where(length > 1e-6, step / np.maximum(length, 1e-6), (1.0, 0.0, 0.0))
-        return Course(start[:, None], goal[:, None], path[each, phase], heading, hardness)
+        place = path[each, phase]
+        return Course(start[:, None], goal[:, None], place, heading, swept.top(phase, place), hardness)
 
     def _loose(self, u: Float, here: Course) -> Float:
         """Spheres, posts and bars, a half about the straight line, a half about the witness, shape (N, OTHERS, 7)."""

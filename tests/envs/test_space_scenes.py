@@ -8,7 +8,7 @@ from viapoint.envs.arms import PANDA
 from viapoint.envs.outcome import least_clearance
 from viapoint.envs.reach import ReachVectorEnv
 from viapoint.envs.scenes import check_scenes
-from viapoint.envs.space_distribution import FAMILIES, SpaceDistribution
+from viapoint.envs.space_distribution import BEAMS, FAMILIES, SpaceDistribution
 from viapoint.envs.space_sampling import SpaceSampler
 from viapoint.envs.task import Task
 
@@ -32,6 +32,16 @@ def test_every_family_can_begin_and_end_and_stands_in_the_way_of_the_straight_mo
     assert (scenes.present.sum(axis=-1) >= FAMILIES[family]).all()
     line = scenes.start[:, None] + (scenes.goal - scenes.start)[:, None] * np.linspace(0, 1, 60)[:, None]
     assert (least_clearance(PANDA, line, scenes, whole_arm=True) < -0.003).all()
+
+
+def test_a_beam_is_above_the_hand_on_its_way_and_a_board_or_sill_below():
+    for family in BEAMS:
+        scenes = drawn(8, families=(family,), n_obstacles=(FAMILIES[family],) * 2)
+        level = np.abs(scenes.obstacles[..., 5]) < 1e-9
+        bars = scenes.present & level & (scenes.obstacles[..., 3:5] != 0.0).any(axis=-1)
+        height = np.where(bars, scenes.obstacles[..., 2], np.nan)
+        # The beam leaves room for what is above the hand, from the wrist down.
+        assert (np.nanmax(height, axis=-1) - np.nanmin(height, axis=-1) > 0.2).all()
 
 
 def test_one_to_six_obstacles_of_every_kind(scenes):
@@ -60,7 +70,7 @@ def test_a_scene_depends_on_its_own_generator_alone(scenes):
             np.testing.assert_array_equal(one[0], together[seed])
 
 
-def test_the_straight_movement_fails_and_random_ones_solve_nearly_every_scene(scenes):
+def test_the_straight_movement_fails_and_random_ones_solve_most_scenes(scenes):
     """Physics agrees with the construction: straight collides everywhere, and there is a way round."""
     env = gym.make_vec("viapoint/PandaObstacles-v0", num_envs=NUMBER, threads=1)
     env.reset(options=scenes.as_options())
@@ -73,7 +83,7 @@ def test_the_straight_movement_fails_and_random_ones_solve_nearly_every_scene(sc
         solved |= info["is_success"]
         agree = info["collision"] == (info["min_clearance"] < 0.0)
         assert agree[info["reachable"]].all()
-    assert solved.mean() > 0.8
+    assert solved.mean() > 0.6
 
 
 @pytest.mark.parametrize("n_via", [1, 3])
@@ -99,7 +109,7 @@ def test_the_hand_alone_may_be_what_must_clear():
     [
         ({"n_obstacles": (3, 2)}, "n_obstacles"),
         ({"n_obstacles": (0, 9)}, "n_obstacles"),
-        ({"families": ("wall",)}, "clutter, shelf, gate, pillar"),
+        ({"families": ("wall",)}, "clutter, pillar, shelf, gate, slot, window, tunnel"),
         ({"families": ("gate",), "n_obstacles": (1, 2)}, "take more than 2 obstacles"),
         ({"distance": (0.4, 0.2)}, "distance"),
     ],
