@@ -11,6 +11,7 @@ import pytest
 from viapoint.training import cli
 from viapoint.training.paper import command, obstacles
 from viapoint.training.paper.claims import SUBJECTS, Claim, at_least, at_most, near
+from viapoint.training.paper.double_step import double_step, excess
 from viapoint.training.paper.movements import construction, via_waypoints
 from viapoint.training.paper.passage import count_roots, passage_polynomial, root_of
 from viapoint.training.paper.profiles import Profile
@@ -51,7 +52,7 @@ def test_every_number_is_as_promised(made):
         assert (claim["arm"] is None) == (claim["deviation_mm"] is None)
 
 
-def test_all_twelve_rows_are_there_and_most_are_carried_out(made):
+def test_all_rows_are_there_and_most_are_carried_out(made):
     claims = claims_of(made)
     assert {claim["row"] for claim in claims} == set(SUBJECTS) == {*ROWS, 12}
     carried = [claim for claim in claims if claim["arm"] is not None]
@@ -183,3 +184,33 @@ def test_a_profile_finds_peaks_and_valley():
     assert profile.peaks[:, 0] == pytest.approx([0.25, 0.75], abs=2e-3)
     assert 0.0 < profile.valley_depth < 0.2
     assert np.isnan(profile.bend[0])
+
+
+@pytest.mark.parametrize("moment", [0.04, 0.2, 0.55])
+@pytest.mark.parametrize("remaining", [0.7, 1.1])
+def test_a_sum_of_two_movements_costs_more_than_the_plan_by_the_closed_form(moment, remaining):
+    movement = double_step(moment, remaining=remaining)
+    more = movement.cost("superposed") - movement.cost("planned")
+    assert more > 0.0
+    assert more == pytest.approx(excess(0.4, moment, 0.7, remaining), rel=1e-9)  # T1 and T4 are 40 cm apart
+
+
+def test_sum_and_plan_are_the_same_where_the_arrival_stays():
+    time = np.linspace(0.0, 0.7, 301)
+    for moment in (0.1, 0.35, 0.6):
+        movement = double_step(moment, remaining=0.7 - moment)
+        for nu in range(4):
+            apart = movement.superposed(time, nu) - movement.planned(time, nu)
+            assert abs(apart).max() < 1e-10 * abs(movement.first(time, nu)).max() / (0.7 - moment) ** 3
+
+
+@pytest.mark.parametrize("way", ["superposed", "planned"])
+def test_a_movement_whose_target_jumps_is_smooth_and_arrives(way):
+    movement, tiny = double_step(0.2), 1e-7
+    for nu in range(3):
+        before, after = getattr(movement, way)(np.array([0.2 - tiny, 0.2 + tiny]), nu)
+        rate = abs(movement.first(np.linspace(0.0, 0.7, 50), nu + 1)).max()
+        assert abs(after - before).max() < 10.0 * tiny * rate
+    ends = [getattr(movement, way)(np.array([0.0, 0.9]), nu) for nu in range(3)]
+    np.testing.assert_allclose(ends[0], [(-0.32, 0.42), (-0.02, 0.57)], atol=1e-12)
+    np.testing.assert_allclose(ends[1:], 0.0, atol=1e-10)

@@ -45,7 +45,7 @@ class Claim:
     """A statement with its number on the model and, where it can be carried out, on the simulated arm."""
 
     row: int
-    """Which of the twelve subjects it belongs to."""
+    """Which of the subjects it belongs to."""
     claim: str
     """Worded so that it is exact, or says what it holds approximately."""
     figure: str = "-"
@@ -108,8 +108,9 @@ SUBJECTS = {
     10: "Repetitive and performance-limited movements",
     11: "The primer and its online version",
     12: "Obstacle avoidance",
+    13: "A target that jumps on the way (Flash & Henis 1991)",
 }
-"""The twelve rows."""
+"""Twelve rows of Flash & Hogan 1985, and one of what followed from it."""
 
 
 def _ends(promise: Promise) -> list[float | None]:

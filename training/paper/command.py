@@ -15,7 +15,7 @@ from viapoint.training.paper.reproduce import STEPS, Reproduction, reproduce
 
 IN_THE_GUIDE = (
     "fig01_model", "fig03_straight", "fig04_joints", "fig05_height", "fig06_place", "fig08_obstacles",
-    "fig10_isochrony", "valleys", "alternatives", "limits",
+    "fig10_isochrony", "valleys", "alternatives", "limits", "double_step", "double_step_jerk",
 )  # fmt: skip
 """The figures that docs/flash-hogan.md shows."""
 

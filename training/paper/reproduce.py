@@ -1,4 +1,4 @@
-"""All twelve rows and all figures, one after the other."""
+"""All rows and all figures, one after the other."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from viapoint.training.paper import (
     alternatives,
     curved,
+    double_step,
     figures_curved,
+    figures_double,
     figures_other,
     figures_straight,
     limits,
@@ -37,6 +39,7 @@ ROWS: dict[int, Callable[[], list[Claim]]] = {
     9: alternatives.alternative_claims,
     10: limits.limit_claims,
     11: online.online_claims,
+    13: double_step.double_step_claims,
 }
 """The rows that need no agent; row 12 comes with its movements."""
 
@@ -80,6 +83,12 @@ DRAWINGS = (
             "the torques of both (C, D; limits dotted).", _plain(figures_other.limits)),
     Drawing("online", "The target jumps on the way (dot) and the movement follows without a jerk.",
             _plain(figures_other.online)),
+    Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
+            "after its start: by a second movement that is added, or by one new plan with the same arrival.",
+            _plain(figures_double.paths_and_speeds)),
+    Drawing("double_step_jerk", "Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
+            "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
+            _plain(figures_double.comparison)),
 )  # fmt: skip
 """Every figure, in the order of the paper."""
 
@@ -111,6 +120,7 @@ def reproduce(out: Path, agent: Path | None, tell: Callable[[str], None]) -> Rep
     tell("row 12")
     decided = obstacles.decide(agent)
     claims += obstacles.obstacle_claims(decided)
+    claims.sort(key=lambda claim: claim.row)
     pictures = []
     for drawing in DRAWINGS:
         tell(drawing.name)
