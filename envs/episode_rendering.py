@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs._drawing import Pencil, in_space, resampled
 from viapoint.envs._movement import Movement
-from viapoint.envs._stage import DONE, SPACING, Stage
+from viapoint.envs._stage import SPACING, Stage
 from viapoint.envs.courses import ChangingScenes
 from viapoint.envs.execution import Rollout
 from viapoint.envs.palette import PALETTE, Colour
@@ -20,8 +20,10 @@ from viapoint.envs.scenes import Scenes
 Float = NDArray[np.float64]
 History = list[tuple[float, MovingPlan]]
 
-FADED: Colour = tuple(0.45 * a + 0.55 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
+FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
 """Of a plan that was given up."""
+GIVEN_UP = 0.0045
+"""Radius of its path, [m]."""
 POINTS = 60
 """Along a planned path."""
 
@@ -45,7 +47,7 @@ class ChangingStage(Stage):
         super().set(self.changing.at(np.array([time])), joints, movement, step)
         pencil = Pencil(self.scene)
         for plan in begun[:-1]:
-            pencil.line(in_space(resampled(_path(plan), SPACING), self._floor + 0.001), DONE, FADED)
+            pencil.line(in_space(resampled(_path(plan), SPACING), self._floor + 0.001), GIVEN_UP, FADED)
         return self.scene
 
 
