@@ -70,15 +70,16 @@ class Anchors:
         distance = np.sqrt((line * line).sum(axis=-1))[:, None, None]
         scaled = np.stack(frame(line), axis=-2) * distance
         hand = start[:, None, None] + self.paths @ scaled[:, None]
-        actions = self._actions(distance)
+        actions = self.actions(observation)
         log_jerk = np.broadcast_to(self.log_jerk, actions.shape[:2])
         duration = np.full_like(log_jerk, self.task.action.centre_duration)
         moves = Movements(hand, duration, log_jerk, effort_of(log_jerk, duration, self.task))
         return look_along(observation, actions, moves, self.task)
 
-    def _actions(self, distance: Float) -> Float:
-        """Shape (B, A, m), inside (-1, 1)."""
-        vias = self.vias * distance
+    def actions(self, observation: dict[str, Float]) -> Float:
+        """In each of B scenes, shape (B, A, m), inside (-1, 1)."""
+        line = observation["goal"] - observation["hand"]
+        vias = self.vias * np.sqrt((line * line).sum(axis=-1))[:, None, None]
         rest = np.zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]), dtype=vias.dtype)
         return np.asarray(clamp(np.concatenate((vias, rest), axis=-1), -0.97, 0.97))
 

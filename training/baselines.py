@@ -8,8 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes import Scenes
 from viapoint.training.motion_planner import MotionPlannerMethod
+from viapoint.training.online_methods import OnlinePlanner, Unrevised
+from viapoint.training.online_trial import new_trial
 from viapoint.training.planner import Planner, PlannerBudget
 from viapoint.training.step_agent import StepAgentMethod, is_step_wise
 from viapoint.training.trial import Trial, Trials
@@ -138,6 +141,14 @@ METHODS: dict[str, Callable[[Trial], Method]] = {
 }
 """The baselines by the name the command line knows them by."""
 
+ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
+    "straight": Straight,
+    "random": lambda trial: RandomVias(trial, 1),
+    "planner": OnlinePlanner,
+    "unrevised": lambda trial: Unrevised(Straight(trial), trial),
+}
+"""Those where plans are revised on the way."""
+
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """A baseline for an environment made with `kwargs`.
@@ -145,6 +156,7 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     Raises:
         ValueError: There is none of that name.
     """
-    if name not in METHODS:
-        raise ValueError(f"method must be agent or one of {', '.join(METHODS)}, got {name!r}")
-    return METHODS[name](Trial(env_id, **kwargs))
+    known = ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS
+    if name not in known:
+        raise ValueError(f"method must be agent or one of {', '.join(known)} in {env_id}, got {name!r}")
+    return known[name](new_trial(env_id, **kwargs))

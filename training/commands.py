@@ -21,6 +21,8 @@ from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import load
+from viapoint.training.online_methods import Unrevised
+from viapoint.training.online_trial import OnlineTrial
 from viapoint.training.runs import Run, find_model, load_model
 from viapoint.training.step_agent import is_step_wise, whole_task
 
@@ -99,7 +101,9 @@ def evaluate(config: EvaluateConfig) -> None:
     frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))
     methods: list[Method] = []
     for name in config.methods:
-        if name != "agent":
+        if name == "unrevised" and agent:
+            methods.append(Unrevised(agent.method(), OnlineTrial(env_id, **env_kwargs)))
+        elif name != "agent":
             methods.append(make_method(name, env_id, **env_kwargs))
         elif agent:
             methods += [agent.method(count) for count in sorted({0, config.candidates})]

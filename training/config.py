@@ -13,9 +13,9 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.envs.registration import STEP_TASKS, TASKS
+from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
 from viapoint.training.discount import check_discount_unit
-from viapoint.training.presets import PRESETS, REACH_PRESETS, STEP_PRESETS, Algorithm, Preset
+from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, STEP_PRESETS, Algorithm, Preset
 
 C = TypeVar("C")
 
@@ -100,13 +100,15 @@ class TrainConfig:
             if getattr(self, name) is not None:
                 _check_whole(name, getattr(self, name), least)
         if self.discount_unit is not None:
-            check_discount_unit(self.algo, self.discount_unit)
+            check_discount_unit(self.algo, self.discount_unit, self.env)
 
     @property
     def preset(self) -> Preset:
         """What holds for everything that is not given."""
         if self.env in STEP_TASKS:
             return STEP_PRESETS[self.algo]
+        if self.env in ONLINE_TASKS:
+            return ONLINE_PRESETS[self.algo]
         reach = TASKS.get(self.env, {}).get("n_obstacles") == 0
         return REACH_PRESETS[self.algo] if reach and self.algo in REACH_PRESETS else PRESETS[self.algo]
 

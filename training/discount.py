@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.registration import ONLINE_TASKS
+
 ELAPSED = "elapsed"
 """Where an info tells how long its decision took, [s]."""
 
@@ -54,15 +56,15 @@ class TimeDiscount:
         return np.asarray(self.gamma ** (elapsed / self.unit), dtype=np.float32)
 
 
-def check_discount_unit(algorithm: str, unit: float) -> None:
+def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
     """Refuse what cannot be a setting of an algorithm by its name on the command line.
 
     Raises:
-        ValueError: The unit is no positive number, or the algorithm's episodes are one decision.
+        ValueError: The unit is no positive number, or the algorithm's episodes are one decision there.
     """
     _check_unit("discount_unit", unit)
-    if algorithm == "viatd3":
-        raise ValueError("discount_unit must be None for viatd3: its episodes are one decision")
+    if algorithm == "viatd3" and env_id not in ONLINE_TASKS:
+        raise ValueError(f"discount_unit must be None for viatd3: episodes of {env_id} are one decision")
 
 
 def _check_unit(name: str, unit: float) -> None:

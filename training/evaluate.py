@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from viapoint.envs.scenes import Scenes
 from viapoint.training.baselines import Method
 from viapoint.training.frozen_scenes import BANDS, DRAWN, FrozenScenes
+from viapoint.training.online_trial import new_trial
 from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.trial import Trial
 
@@ -182,7 +183,7 @@ def _evaluate_one(
             began = time.perf_counter()
             decided = method.decide(trial.observe(scenes), scenes)
             seconds += time.perf_counter() - began
-            outcome = getattr(method, "carry_out", trial)(scenes, decided)
+            outcome = trial.play(method, scenes, decided)
             action = np.asarray(decided, dtype=np.float64)
             pieces.append({**outcome.info, "reward": outcome.reward, "": action})
             if progress is not None:
@@ -226,7 +227,7 @@ def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: floa
 
 @contextmanager
 def _trial(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Iterator[Trial]:
-    trial = Trial(env_id, num_envs, **kwargs)
+    trial = new_trial(env_id, num_envs, **kwargs)
     try:
         yield trial
     finally:

@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
 from viapoint.envs.action import frame
+from viapoint.training.movements import direction
 
 PLACES = 5.0
 """Metres times this are of size one: obstacles lie within a few decimetres of the line."""
@@ -46,7 +47,8 @@ class SceneExtractor(BaseFeaturesExtractor):
         """Shape (B, features_dim)."""
         hand, goal = observation["hand"], observation["goal"]
         start = observation.get("start", hand)
-        axes = torch.stack(frame(goal - start), dim=-2)
+        line = goal - start if "start" in observation else direction(observation)
+        axes = torch.stack(frame(line), dim=-2)
         middle = 0.5 * (start + goal)
         distance = (goal - start).norm(dim=-1, keepdim=True)
         own = [2.0 * middle, 2.0 * (goal - middle), 2.0 * distance]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.courses import ChangingScenes
 from viapoint.envs.scenes import Scenes
 
 Float = NDArray[np.float64]
@@ -22,7 +23,8 @@ BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
 BAND_EDGES = (0.2, 0.05, 0.01)
 DRAWN = ""
 """Family of the scenes that are drawn from the training distribution."""
-FIELDS = ("start", "goal", "obstacles", "share", "solution")
+MEASURED = ("share", "solution")
+"""What is known of each scene."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
@@ -37,7 +39,8 @@ class FrozenScenes:
     name: str
     """Of the set, or the path of its file."""
     env_id: str
-    scenes: Scenes
+    scenes: Any
+    """N :class:`~viapoint.envs.scenes.Scenes`, or :class:`~viapoint.envs.courses.ChangingScenes`."""
     share: Float
     """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,)."""
     solution: Float
@@ -72,8 +75,7 @@ class FrozenScenes:
 
     def arrays(self) -> dict[str, Float]:
         """The numbers by name."""
-        values = (*self.scenes, self.share, self.solution)
-        return dict(zip(FIELDS, values, strict=True))
+        return {**self.scenes._asdict(), **{name: getattr(self, name) for name in MEASURED}}
 
     def save(self, path: Path) -> None:
         """Write the set with its hash."""
@@ -121,13 +123,15 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in (*FIELDS, "env_id", "sha256", "family", "number")}
+            kind = ChangingScenes if "jumps" in archive else Scenes
+            names = (*kind._fields, *MEASURED, "env_id", "sha256", "family", "number")
+            content = {name: archive[name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
         raise ValueError(f"{path} is not a file of scenes: {error}") from None
     frozen = FrozenScenes(
         name=str(name_or_path),
         env_id=str(content["env_id"]),
-        scenes=Scenes(content["start"], content["goal"], content["obstacles"]),
+        scenes=kind(*(content[name] for name in kind._fields)),
         share=content["share"],
         solution=content["solution"],
         family=content["family"],

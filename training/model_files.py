@@ -226,11 +226,12 @@ def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
 
 def _by_time(algorithm: str, env: ViaVecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
     """Arguments that make an algorithm discount by time."""
-    check_discount_unit(algorithm, unit)
+    check_discount_unit(algorithm, unit, env.env_id)
     if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
         raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
     kind = ALGORITHMS[algorithm]
-    gamma = arguments.get("gamma", inspect.signature(kind).parameters["gamma"].default)
+    known = inspect.signature(kind).parameters
+    gamma = arguments["gamma"] if "gamma" in arguments else known["gamma"].default
     return timed(kind, env.observation_space, gamma=gamma, unit=unit)
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
+from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training.baselines import agent_method
 from viapoint.training.evaluate import MethodResult, evaluate
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, load, shipped_path
+from viapoint.training.online_trial import new_trial
 from viapoint.training.runs import Run
 from viapoint.training.step_agent import whole_task
-from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
 
 LOG_EVERY = 1_000
@@ -269,8 +270,8 @@ def validation_scenes(run: Run) -> FrozenScenes:
     env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
     if shipped_path("validation", env_id).is_file() and set(env_kwargs) <= ACTION_ARGUMENTS:
         return load("validation", env_id).take(slice(0, config.eval_scenes))
-    trial = Trial(env_id, 1, **env_kwargs)
-    scenes = trial.task.sampler()([np.random.default_rng(DRAWN_SEED)] * config.eval_scenes)
+    trial = new_trial(env_id, 64 if env_id in ONLINE_TASKS else 1, **env_kwargs)
+    scenes = trial.draw(config.eval_scenes, DRAWN_SEED)
     trial.close()
     return FrozenScenes(
         name="drawn",

@@ -123,3 +123,14 @@ REACH_PRESETS: dict[str, Preset] = {
     "viatd3": dataclasses.replace(PRESETS["viatd3"], n_timesteps=1_280),
 }
 """Where nothing is in the way, less will do."""
+
+ONLINE_PRESETS: dict[str, Preset] = {
+    name: dataclasses.replace(
+        preset,
+        n_timesteps=2 * preset.n_timesteps,
+        discount_unit=0.1,
+        hyperparameters=(*preset.hyperparameters, *({"gamma": 0.99} if name == "viatd3" else {}).items()),
+    )
+    for name, preset in PRESETS.items()
+}
+"""Where plans are revised on the way: episodes are several decisions, and discounts follow time."""

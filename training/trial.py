@@ -39,7 +39,7 @@ class Trial:
     """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
-        self.env_id = env_id
+        self.env_id, self.kwargs = env_id, kwargs
         sizes = {num_envs, min(num_envs, 64)}
         self._envs: dict[int, ReachVectorEnv] = {
             size: gym.make_vec(env_id, num_envs=size, **kwargs)  # type: ignore[misc]
@@ -47,6 +47,10 @@ class Trial:
         }
         self.task = self._envs[num_envs].task
         self._capacity = num_envs
+
+    def draw(self, number: int, seed: int) -> Any:
+        """As many scenes as wanted; the same for the same seed."""
+        return self.task.sampler()([np.random.default_rng(seed)] * number)
 
     def observe(self, scenes: Scenes) -> dict[str, NDArray[np.float32]]:
         """First observations in N scenes, without a simulation."""
@@ -56,6 +60,11 @@ class Trial:
     def __call__(self, scenes: Scenes, actions: Float) -> Trials:
         """Simulate one action in each of N scenes, one or more."""
         return self._try(scenes, (actions,), lambda env, some: env.decide(some))
+
+    def play(self, method: Any, scenes: Scenes, decided: Float) -> Trials:
+        """Simulate what a method has decided in N scenes, or let it do so itself where it can."""
+        trials: Trials = getattr(method, "carry_out", self)(scenes, decided)
+        return trials
 
     def perform(self, scenes: Scenes, plan: Plan) -> Trials:
         """Simulate one plan in each of N scenes, one or more; plans may have any number of via-points."""
@@ -69,9 +78,9 @@ class Trial:
             number = len(what[0][some])
             size = next(size for size in self._envs if size >= number)
             env = self._envs[size]
-            filled = Scenes(*(_repeated(field, size) for field in scenes.take(some)))
+            filled = Scenes(*(repeated(field, size) for field in scenes.take(some)))
             env.reset(options=filled.as_options())
-            _, reward, info = act(env, *(_repeated(part[some], size) for part in what))
+            _, reward, info = act(env, *(repeated(part[some], size) for part in what))
             pieces.append(Trials(reward[:number], {name: value[:number] for name, value in info.items()}))
         info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
         return Trials(np.concatenate([piece.reward for piece in pieces]), info)
@@ -82,6 +91,6 @@ class Trial:
             env.close()
 
 
-def _repeated(values: Float, number: int) -> Float:
+def repeated(values: Float, number: int) -> Float:
     """The first repeated at the end until there are `number`."""
     return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))

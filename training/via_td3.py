@@ -3,7 +3,8 @@
 It differs from :class:`stable_baselines3.TD3` in what a movement allows. The critic sees the features of the planned
 movement and learns only the part of the reward that no formula gives. The actor improves movements and learns on scenes
 that are drawn but never simulated: what it makes of a movement climbs the critic's judgement, and what it foretells of
-it regresses that. An episode is one decision, so nothing is bootstrapped.
+it regresses that. Where an episode is one decision, nothing is bootstrapped; where it is several, what follows a
+decision counts as the critic judges it, and the actor learns on observations of the episodes themselves.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from torch.nn import functional
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.actor import ViaActor
+from viapoint.training.actor import ViaActor, arrays
 from viapoint.training.features import Look
 from viapoint.training.policies import Judgement, ViaCritic, ViaPolicy
-from viapoint.training.scene_pool import ScenePool
+from viapoint.training.scene_pool import Pool, ScenePool, VisitedPool
 
 SHARPNESS = 8.0
 """How fast the probability of success falls with the learned part of the reward, about one half."""
 
 
 class ViaTD3(TD3):
-    """An off-policy learner of via-points on environments whose episodes are one decision.
+    """An off-policy learner of via-points.
 
     Args:
         policy: `ViaPolicy`.
@@ -100,7 +101,7 @@ class ViaTD3(TD3):
         )
         if self.env is not None:
             self.policy_kwargs.setdefault("task", self.env.get_attr("task", indices=0)[0].as_dict())
-        self.pool: ScenePool | None = None
+        self.pool: Pool | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -108,10 +109,7 @@ class ViaTD3(TD3):
         """Update critic and actor `gradient_steps` times."""
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        if self.pool is None:
-            task = Task.from_dict(self.policy_kwargs["task"], ARMS)
-            seed, fresh = self.seed or 0, self.fresh_scenes
-            self.pool = ScenePool(task, self.actor.look, seed, fresh=fresh, augment=self.augment)
+        self.pool = self.pool or self._new_pool()
         self.pool.begin(self._n_updates // gradient_steps)
         losses = []
         for _ in range(gradient_steps):
@@ -122,18 +120,48 @@ class ViaTD3(TD3):
             self.logger.record(f"train/{name}", float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    def _new_pool(self) -> Pool:
+        """What the actor learns on: scenes that are drawn, or where episodes have several decisions, visited ones."""
+        task, seed = Task.from_dict(self.policy_kwargs["task"], ARMS), self.seed or 0
+        if not self.gamma:
+            return ScenePool(task, self.actor.look, seed, fresh=self.fresh_scenes, augment=self.augment)
+        assert self.replay_buffer is not None
+        return VisitedPool(
+            self.replay_buffer, self.actor.look, seed, first=self.learning_starts // self.n_envs
+        )
+
     def _update_critic(self, batch_size: int) -> float:
-        """Regress what the formulas leave of the reward."""
+        """Regress what the formulas leave of the reward and of what follows."""
         assert self.replay_buffer is not None
         batch: Any = self.replay_buffer.sample(batch_size)
         judgement = self.critic.judge(batch.observations, batch.actions.unsqueeze(1))
         target = batch.rewards - judgement.known.total().detach()
+        if self.gamma:
+            discount = self.gamma if batch.discounts is None else batch.discounts
+            target = target + (1.0 - batch.dones) * discount * self._value(batch.next_observations)
         loss = functional.smooth_l1_loss(judgement.learned, target, beta=0.5)
         self.critic.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.critic.parameters(), 10.0)
         self.critic.optimizer.step()
         return float(loss.item())
+
+    @torch.no_grad()
+    def _value(self, observation: Any) -> Tensor:
+        """What is to come, in the critic's judgement: of a few anchors, improved, and of the first as it is, (B, 1)."""
+        look = self.actor.look_at(observation, self._few(observation))
+        actions = torch.cat(
+            (look.actions[:, :1], self.actor.improve(self.actor.encode(observation), look).actions), 1
+        )
+        value: Tensor = self.critic.judge(observation, actions).reward().amax(dim=1, keepdim=True)
+        return value
+
+    def _few(self, observation: Any) -> Tensor:
+        """The first anchor in each scene, and as many others as an update looks at."""
+        every = torch.as_tensor(self.actor.anchors.actions(arrays(observation)))
+        others = 1 + torch.randint(0, every.shape[1] - 1, (len(every), self.promising))
+        some = torch.cat((torch.zeros_like(others[:, :1]), others), dim=1)
+        return every[torch.arange(len(every)).unsqueeze(-1), some]
 
     def _update_actor(self, batch_size: int) -> tuple[float, float]:
         """Improve anchors, then what became of them, in the critic's judgement, and let the scores foretell it."""
