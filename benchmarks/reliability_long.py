@@ -140,6 +140,7 @@ def picture(results: list[dict[str, Any]], path: Path) -> None:
         axes.plot(count, [point["memory"] for point in result["curve"]], color="#2a6f97", linewidth=1.4)
         axes.set(ylim=(0, None), ylabel="resident memory [MB]", xlabel=result["what"].partition(",")[0])
         axes.set_title(f"{result['memory_growth']:+.1f} MB after the first tenth", fontsize=9)
+        axes.locator_params(axis="x", nbins=4)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path)
