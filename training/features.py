@@ -19,6 +19,8 @@ from viapoint.training.sight import STRETCHES, Array, Observation, Sight, push, 
 
 GEOMETRY = STRETCHES + 4
 """Numbers that tell clearance and reach of a movement."""
+SURE = 0.006
+"""Within half of it on either side of touching, success is not foretold for sure, [m]."""
 
 
 class SceneView(NamedTuple):
@@ -133,7 +135,7 @@ def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
     """
     moves = movements(observation, actions, task)
     seen = see(observation, moves.path, task, moves.duration)
-    return Foresight(seen, moves.log_jerk, known_reward(seen, moves, task))
+    return Foresight(seen, moves.log_jerk, known_reward(seen, moves, task, foretold=on_the_way(observation)))
 
 
 def look_at(observation: Observation, actions: Array, task: Task) -> Look:
@@ -147,19 +149,36 @@ def look_along(observation: Observation, actions: Array, moves: Movements, task:
     seen, pushed = push(observation, moves.path, task, moves.duration)
     axes = xp.stack(frame(direction(observation)), axis=-1)
     in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
-    known = known_reward(seen, moves, task).total()
+    known = known_reward(seen, moves, task, foretold=on_the_way(observation)).total()
     return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known)
 
 
-def known_reward(seen: Sight, moves: Movements, task: Task) -> KnownReward:
-    """As :func:`viapoint.envs.reward.reward_terms` has it."""
+def known_reward(seen: Sight, moves: Movements, task: Task, *, foretold: bool = False) -> KnownReward:
+    """As :func:`viapoint.envs.reward.reward_terms` has it.
+
+    Args:
+        seen: Of the movements.
+        moves: They.
+        task: The environment's.
+        foretold: Whether success and collision are counted, too, as if nothing would change on the way: where an
+            episode is several decisions they are paid at its end, and to learn from there takes long.
+    """
     least = clamp(namespace_of(seen.clearance).min(seen.clearance, axis=-1), *CLEARANCE_RANGE)
     relative = moves.duration / task.action.centre_duration
+    clearance = task.weights.clearance * least / CLEARANCE_UNIT
     return KnownReward(
-        task.weights.clearance * least / CLEARANCE_UNIT,
+        clearance + _hope(seen, task) if foretold else clearance,
         -task.weights.smoothness * moves.effort,
         -task.weights.duration * (relative - 1.0),
     )
+
+
+def _hope(seen: Sight, task: Task) -> Array:
+    """Success of what touches nothing and stays in reach, collision of the rest, as a ramp."""
+    xp = namespace_of(seen.clearance)
+    least = xp.minimum(xp.min(seen.clearance, axis=-1), seen.reach_margin)
+    share = clamp(0.5 + least / SURE, 0.0, 1.0)
+    return share * (task.weights.success + task.weights.collision) - task.weights.collision
 
 
 def _sized(seen: Sight) -> Array:
