@@ -19,7 +19,7 @@ def solution_share(trial: Trial, scenes: Scenes, *, seed: int = 0) -> Float:
     """Fraction of uniformly random actions that succeed in simulation, shape (N,).
 
     From 512 draws, 4,096 where fewer than eight of them succeed. All scenes are tried with the same actions. Those
-    that fail for certain are not simulated (see :mod:`viapoint.training.screening`).
+    that fail or succeed for certain are not simulated (see :mod:`viapoint.training.screening`).
     """
     draws = np.random.default_rng(seed).uniform(-1.0, 1.0, (MANY, trial.task.action.size))
     solved = _count(trial, scenes, draws[:FEW])
@@ -43,14 +43,16 @@ def planned_share(trial: Trial, scenes: Scenes, *, seed: int = 0, draws: int = 2
 def _count(trial: Trial, scenes: Scenes, draws: Float) -> NDArray[np.int64]:
     """How many of the draws solve each scene, shape (N,)."""
     number = len(scenes.start)
+    solved = np.zeros(number, dtype=np.int64)
     open_rows, open_actions = [], []
     for some in np.split(draws, range(64, len(draws), 64)):
         rows, actions = np.repeat(np.arange(number), len(some)), np.tile(some, (number, 1))
-        open_ = ~screen(trial.task, scenes.take(rows), actions).fails
+        screened = screen(trial.task, scenes.take(rows), actions)
+        solved += np.bincount(rows[screened.succeeds], minlength=number)
+        open_ = ~(screened.fails | screened.succeeds)
         open_rows.append(rows[open_])
         open_actions.append(actions[open_])
     rows, actions = np.concatenate(open_rows), np.concatenate(open_actions)
-    if not len(rows):
-        return np.zeros(number, dtype=np.int64)
-    success = trial(scenes.take(rows), actions).success
-    return np.bincount(rows[success], minlength=number)
+    if len(rows):
+        solved += np.bincount(rows[trial(scenes.take(rows), actions).success], minlength=number)
+    return solved

@@ -1,9 +1,10 @@
 """Makes the frozen scenes again: `python -m viapoint.training.make_scenes`.
 
 `validation` and `test` are drawn from the training distribution with seeds that training never uses, a quarter of each
-set in each band of the solution share. `hard` holds scenes of families that are never trained on, as many of each, all
-with a share below 5 %. Every scene was solved in simulation by some of at most 4,096 random actions, so that its
-difficulty is known, and by the planner.
+set in each band of the solution share. `hard` holds scenes of some families, as many of each, all with a share below
+5 %. No agent of the plane is trained on its families; in space they are the narrow ones, one of which is never trained
+on. Every scene was solved in simulation by some of at most 4,096 random actions, so that its difficulty is known, and
+by the planner.
 
 Searching for scenes takes estimates of their shares, which change with the program. So each scene of a file knows which
 of the drawn scenes it is: what is made again are these, and the hash tells whether scenes and shares are the same.
@@ -20,8 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.sampler import Sampler
 from viapoint.envs.scene_families import FAMILIES, family_sampler
 from viapoint.envs.scenes import Scenes
+from viapoint.envs.space_distribution import NARROW, SpaceDistribution
+from viapoint.envs.space_sampling import SpaceSampler
 from viapoint.envs.task import Task
 from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands, load, shipped_path
 from viapoint.training.scene_search import Kinds, Source, measured, redrawn, search
@@ -41,6 +45,8 @@ SETS = {
     "viapoint/PlanarReach-v0": ALL[:2],
     "viapoint/PlanarObstacles-v0": ALL,
     "viapoint/PlanarWholeArm-v0": ALL,
+    "viapoint/PandaReach-v0": ALL[:2],
+    "viapoint/PandaObstacles-v0": ALL,
 }
 """Environments with shipped scenes, and their sets."""
 
@@ -64,15 +70,16 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
     """
     seed = SEEDS[name]
     if name == "hard":
-        seeds = {family: seed + 101 * i for i, family in enumerate(FAMILIES)}
+        families = hard_families(task)
+        seeds = {family: seed + 101 * i for i, family in enumerate(families)}
         hard = Kinds(
             of_share=lambda share: np.where(share < HARDEST, 0, -1),
             names=("share < 5 %",),
-            quota=size // len(FAMILIES),
+            quota=size // len(families),
         )
         return [
-            Lot(family, _source(family_sampler(task, family), seeds[family], block=64), hard, seeds[family])
-            for family in FAMILIES
+            Lot(family, _source(sampler, seeds[family], block=64), hard, seeds[family])
+            for family, sampler in families.items()
         ]
     if task.scenes.n_obstacles[1] == 0:
         any_ = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
@@ -81,6 +88,14 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
     levels = ((0.03, 2048), (0.013, 16384)) if rare else ((0.03, 1024),)
     source = _source(task.sampler(), seed, block=2048 if rare else 512, levels=levels)
     return [Lot(DRAWN, source, Kinds(of_share=bands, names=BANDS, quota=size // len(BANDS)), seed)]
+
+
+def hard_families(task: Task) -> dict[str, Sampler]:
+    """The families of hard scenes of a task, by name."""
+    if not isinstance(task.scenes, SpaceDistribution):
+        return {name: family_sampler(task, name) for name in FAMILIES}
+    each = {name: dataclasses.replace(task.scenes, families=(name,)) for name in NARROW}
+    return {name: SpaceSampler(task.arm, of, whole_arm=task.whole_arm) for name, of in each.items()}
 
 
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:

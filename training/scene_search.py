@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from viapoint.envs.scenes import Scenes
 from viapoint.training.difficulty import planned_share, solution_share
-from viapoint.training.planner import Planner
+from viapoint.training.planner import Planner, PlannerBudget
 from viapoint.training.trial import Trial
 
 Float = NDArray[np.float64]
@@ -23,6 +23,8 @@ SPARE, SAFE = 1.2, 1.1
 """How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
 AT_ONCE = 64
 """Scenes measured together."""
+QUICK = PlannerBudget(generations=4)
+"""In space, where simulation takes longer."""
 MOST_DRAWN, MOST_ROUNDS = 1 << 18, 20
 """Scenes drawn, and how often more are measured or planned, before giving up."""
 
@@ -166,7 +168,7 @@ def measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
 
 def _planned(trial: Trial, scenes: Scenes, label: str) -> tuple[Float, NDArray[np.bool_]]:
     """The planner's solutions, and which of them are."""
-    planner = Planner(trial)
+    planner = Planner(trial, budget=QUICK if trial.task.arm.dimension == 3 else None)
     planned = [planner(scenes.take(rows)) for rows in _lots(scenes, f"{label}: planner")]
     return np.concatenate([p.action for p in planned]), np.concatenate([p.success for p in planned])
 

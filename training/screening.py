@@ -1,4 +1,4 @@
-"""Which actions need no simulation because their plans already fail."""
+"""Which actions need no simulation because their plans already tell what comes of them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ CERTAIN = 0.002
 With the default durations plans are tracked within a fifth of a millimetre; much shorter ones are not. Where plans are
 looked at, less often than the physics does, their clearance can only be overestimated.
 """
+SURE = 0.01
+"""Least clearance and reach margin of a plan in space that succeeds for certain, [m].
+
+There movements are slowed down to what the arm's limits allow, so that plans are tracked within a millimetre, whatever
+their duration: of 1,009 random plans with a margin over 2 mm none failed.
+"""
 CHUNK = 4096
 
 
@@ -28,6 +34,8 @@ class Screened(NamedTuple):
 
     fails: NDArray[np.bool_]
     """Whether the movement fails for certain."""
+    succeeds: NDArray[np.bool_]
+    """Whether it succeeds for certain; in the plane, where it may be too fast to be tracked, this is not known."""
     merit: Float
     """Clearance or reach margin of the plan, whichever is less, [m]."""
 
@@ -44,4 +52,5 @@ def screen(task: Task, scenes: Scenes, actions: Float) -> Screened:
             plans = torch.tensor(actions[rows], dtype=torch.float32).unsqueeze(1)
             sight = foresee(tensors, plans, task).seen
         merit[rows] = torch.minimum(sight.clearance.amin(dim=-1), sight.reach_margin)[:, 0].numpy()
-    return Screened(merit < -CERTAIN, merit)
+    in_space = task.whole_arm and task.arm.dimension == 3
+    return Screened(merit < -CERTAIN, merit > (SURE if in_space else np.inf), merit)
