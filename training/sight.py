@@ -57,7 +57,7 @@ def see(observation: Observation, hand: Array, task: Task, duration: Array = Non
     if "obstacles" not in observation:
         return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
     if _among_links(task):
-        return Sight(_seen_of_links(observation, hand, task), margin)
+        return Sight(_seen_of_links(observation, hand, task, duration), margin)
     nearest, pairs = _nearest(observation, hand, task, duration)
     return Sight(_lowest(_clearance(nearest, pairs, task)[..., 0, :]), margin)
 
@@ -74,7 +74,7 @@ def push(observation: Observation, hand: Array, task: Task, duration: Array = No
         at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
         return Sight(xp.full_like(at_ends[..., 0], FAR), margin), xp.zeros_like(at_ends)
     if _among_links(task):
-        near = _approaches(observation, hand, task, NEAR)
+        near = _approaches(observation, hand, task, duration, NEAR)
         return Sight(near.clearance, margin), near.gradient * _nearness(near.clearance)
     nearest, pairs = _nearest(observation, hand, task, duration)
     moves = xp.asarray(_STEP * np.eye(hand.shape[-1]), dtype=hand.dtype)
@@ -98,23 +98,31 @@ def _among_links(task: Task) -> bool:
     return task.whole_arm and task.arm.dimension == 3
 
 
-def _seen_of_links(observation: Observation, hand: Array, task: Task) -> Array:
+def _seen_of_links(observation: Observation, hand: Array, task: Task, duration: Array) -> Array:
     """Clearance in each stretch; with respect to the hand it is differentiated as if it changed in proportion."""
     if namespace_of(hand) is np:
-        return _approaches(observation, hand, task, -np.inf).clearance
+        return _approaches(observation, hand, task, duration, -np.inf).clearance
     middle = hand[..., LOOKS // 2 :: LOOKS, :]
-    near = _approaches(observation, hand, task, NEAR if middle.requires_grad else -np.inf)
+    near = _approaches(observation, hand, task, duration, NEAR if middle.requires_grad else -np.inf)
     clearance, gradient = (middle.new_tensor(part) for part in near)
     return clearance + (gradient * (middle - middle.detach())).sum(-1)
 
 
-def _approaches(observation: Observation, hand: Array, task: Task, within: float) -> Approaches:
-    parts = (observation["obstacles"], hand)
-    flat, still = (np.asarray(part if type(part) is np.ndarray else part.detach().cpu()) for part in parts)
-    rows: ObstacleRows = task.observation.obstacles(flat)
+def _approaches(
+    observation: Observation, hand: Array, task: Task, duration: Array, within: float
+) -> Approaches:
+    rows: ObstacleRows = task.observation.obstacles(_numbers(observation["obstacles"]))
     together = np.concatenate((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
-    obstacles = Obstacles.packed(together, rows.present > 0.5)
-    return approaches(task.arm, still, obstacles, STRETCHES, within)
+    velocity, taken = None, None
+    if "obstacle_velocities" in observation:
+        velocity = _numbers(observation["obstacle_velocities"]).reshape(rows.centre.shape)
+        taken = _numbers(duration)
+    obstacles = Obstacles.packed(together, rows.present > 0.5, velocity)
+    return approaches(task.arm, _numbers(hand), obstacles, STRETCHES, within, taken)
+
+
+def _numbers(part: Array) -> Any:
+    return part if type(part) is np.ndarray else part.detach().cpu().numpy()
 
 
 class _Others(NamedTuple):

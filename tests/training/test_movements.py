@@ -11,7 +11,11 @@ from viapoint.training.features import foresee
 from viapoint.training.movements import movements
 from viapoint.training.sight import INSTANTS
 
-IDS = ("viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0")
+IDS = (
+    "viapoint/PlanarMovingObstacles-v0",
+    "viapoint/PlanarTargetJump-v0",
+    "viapoint/PandaMovingObstacles-v0",
+)
 
 
 def under_way(env_id, number=24, decisions=1, **kwargs):
