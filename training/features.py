@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.action import frame
+from viapoint.envs.execution import SETTLING
 from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.task import Task
 from viapoint.training.movements import Movements, direction, movements, on_the_way
@@ -135,7 +136,7 @@ def foresee(observation: Observation, actions: Array, task: Task) -> Foresight:
     """
     moves = movements(observation, actions, task)
     seen = see(observation, moves.path, task, moves.duration)
-    return Foresight(seen, moves.log_jerk, known_reward(seen, moves, task, foretold=on_the_way(observation)))
+    return Foresight(seen, moves.log_jerk, known_reward(seen, moves, task, observation.get("time_left")))
 
 
 def look_at(observation: Observation, actions: Array, task: Task) -> Look:
@@ -149,36 +150,44 @@ def look_along(observation: Observation, actions: Array, moves: Movements, task:
     seen, pushed = push(observation, moves.path, task, moves.duration)
     axes = xp.stack(frame(direction(observation)), axis=-1)
     in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
-    known = known_reward(seen, moves, task, foretold=on_the_way(observation)).total()
+    known = known_reward(seen, moves, task, observation.get("time_left")).total()
     return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known)
 
 
-def known_reward(seen: Sight, moves: Movements, task: Task, *, foretold: bool = False) -> KnownReward:
+def known_reward(seen: Sight, moves: Movements, task: Task, time_left: Array = None) -> KnownReward:
     """As :func:`viapoint.envs.reward.reward_terms` has it.
 
     Args:
         seen: Of the movements.
         moves: They.
         task: The environment's.
-        foretold: Whether success and collision are counted, too, as if nothing would change on the way: where an
-            episode is several decisions they are paid at its end, and to learn from there takes long.
+        time_left: Of the episodes, shape (B, 1), [s], where they are several decisions. Then success and collision
+            are counted, too, as if nothing would change on the way: they are paid at an episode's end, and to learn
+            from there takes long.
     """
     least = clamp(namespace_of(seen.clearance).min(seen.clearance, axis=-1), *CLEARANCE_RANGE)
     relative = moves.duration / task.action.centre_duration
     clearance = task.weights.clearance * least / CLEARANCE_UNIT
     return KnownReward(
-        clearance + _hope(seen, task) if foretold else clearance,
+        clearance if time_left is None else clearance + _hope(seen, time_left - moves.duration, task),
         -task.weights.smoothness * moves.effort,
         -task.weights.duration * (relative - 1.0),
     )
 
 
-def _hope(seen: Sight, task: Task) -> Array:
-    """Success of what touches nothing and stays in reach, collision of the rest, as a ramp."""
-    xp = namespace_of(seen.clearance)
+def _hope(seen: Sight, spare: Array, task: Task) -> Array:
+    """Success of what touches nothing, stays in reach and is in time, collision of what does not, as ramps.
+
+    Args:
+        seen: Of the movements.
+        spare: Time that is left when they are over, shape (B, H), [s].
+        task: The environment's.
+    """
+    xp = namespace_of(spare)
     least = xp.minimum(xp.min(seen.clearance, axis=-1), seen.reach_margin)
-    share = clamp(0.5 + least / SURE, 0.0, 1.0)
-    return share * (task.weights.success + task.weights.collision) - task.weights.collision
+    clear = clamp(0.5 + least / SURE, 0.0, 1.0)
+    in_time = clamp(spare / SETTLING - 1.0, 0.0, 1.0)
+    return clear * in_time * task.weights.success - (1.0 - clear) * task.weights.collision
 
 
 def _sized(seen: Sight) -> Array:
