@@ -13,9 +13,17 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
 from viapoint.training.discount import check_discount_unit
-from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, STEP_PRESETS, Algorithm, Preset
+from viapoint.training.presets import (
+    ONLINE_PRESETS,
+    PRESETS,
+    REACH_PRESETS,
+    SPACE_PRESETS,
+    STEP_PRESETS,
+    Algorithm,
+    Preset,
+)
 
 C = TypeVar("C")
 
@@ -109,8 +117,10 @@ class TrainConfig:
             return STEP_PRESETS[self.algo]
         if self.env in ONLINE_TASKS:
             return ONLINE_PRESETS[self.algo]
-        reach = TASKS.get(self.env, {}).get("n_obstacles") == 0
-        return REACH_PRESETS[self.algo] if reach and self.algo in REACH_PRESETS else PRESETS[self.algo]
+        task = TASKS.get(OWN_ARM_TASKS.get(self.env, self.env), {})
+        in_space = SPACE_PRESETS if "arm" in task else PRESETS
+        presets = REACH_PRESETS if task.get("n_obstacles") == 0 else in_space
+        return presets.get(self.algo, PRESETS[self.algo])
 
     @property
     def total_timesteps(self) -> int:
