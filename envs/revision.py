@@ -179,8 +179,8 @@ class Reviser:
         vias = default.vias + sum(offsets[..., i : i + 1] * axis[:, None] for i, axis in enumerate(axes))
         low, high = layout.duration_range
         factor = (high / low) ** (0.5 * actions[:, number * d])
-        longest = np.maximum(default.remaining, high)
-        duration = np.clip(default.remaining * factor, self.least_remaining, longest)
+        remaining = np.maximum(default.remaining, self.least_remaining)
+        duration = np.clip(remaining * factor, self.least_remaining, np.maximum(remaining, high))
         points = np.concatenate((state.position[:, None], vias, default.goal[:, None]), axis=1)
         plan = timed(points, duration, state)
         zero = (actions == 0.0).all(axis=-1)[

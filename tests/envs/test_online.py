@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from viapoint import primitives
+from viapoint.envs.action import Plan
 from viapoint.envs.decision_ends import FORESIGHT, LOOK, SAMPLED, Event
 from viapoint.envs.execution import SETTLING
 from viapoint.envs.online_episodes import jerk_cost_between
@@ -149,6 +150,19 @@ def test_a_hand_that_arrives_early_rests_until_something_happens():
     rest = env.last_rollout.hand[600:750]
     assert np.ptp(rest, axis=0).max() < 1e-3
     assert infos[-1]["is_success"]
+
+
+def test_a_resting_hand_may_set_out_again():
+    far, turns = [[-0.3, 0.6, 0.0, 0.0, 0.02]], [[0.0, 0.0, 1.2, 0.1, 0.0]]
+    env, _ = make(MOVING, obstacles=far, courses=turns, decide_at=())
+    *_, info = env.step(np.zeros(3))
+    assert (info["event"], info["time"]) == (Event.COURSE, pytest.approx(1.2))
+    *_, terminated, _, info = env.step(np.array([0.0, 0.5, 0.4], np.float32))
+    assert terminated
+    assert info["is_success"]
+    least, (low, high) = env.reviser.least_remaining, env.action_layout.duration_range
+    assert env.last_plan.durations.sum() == pytest.approx(least * (high / low) ** 0.2)
+    assert np.linalg.norm(env.last_rollout.hand[600:] - GOAL, axis=-1).max() > 0.1
 
 
 def test_a_jump_that_is_no_reason_to_decide_is_noticed_on_arrival():
@@ -414,3 +428,42 @@ def test_pictures_show_the_episode_so_far():
     assert len(before) == 1
     assert len(frames) == round(env.last_rollout.time[-1] * env.metadata["render_fps"]) + 1
     assert len({frame.tobytes() for frame in frames}) > 20
+
+
+def test_a_plan_in_metres_and_seconds_can_be_performed_on_the_way():
+    env, _ = make(horizon=0.2, decide_at=("horizon",))
+    env.step(np.zeros(3))
+    default, batch = env.batch.default, env.batch
+    waypoints = np.stack((default.state.position, default.vias[:, 0] + 0.02, default.goal), axis=1)
+    batch.perform(Plan(waypoints, np.array([[0.3, 0.4]])))
+    (_, before), (time, after) = env.last_plans
+    np.testing.assert_array_equal(after.waypoints, waypoints)
+    np.testing.assert_allclose(before.states(np.array([time])).acceleration, after.acceleration, atol=1e-9)
+    with pytest.raises(ValueError, match=r"waypoints of shape \(1, 3, 2\)"):
+        batch.perform(Plan(waypoints[:, ::2], np.array([[0.7]])))
+
+
+def test_any_jumps_and_courses_are_played_or_refused_with_a_reason():
+    generator, found = np.random.default_rng(0), {True: 0, False: 0}
+    env = gym.make(MOVING).unwrapped
+    edges = [0.0, -0.0, 1e-300, 1e-9, 1e-3, 0.3, 2.4, 2.5, 1e9, -1.0]
+    for seed in range(150):
+        env.reset(seed=seed)
+        options = {name: part[0] for name, part in env.batch.scenes.as_options().items()}
+        number = int((options["obstacles"][:, -1] > 0.0).sum())
+        options["obstacles"], courses = options["obstacles"][:number], options["courses"][:number]
+        nasty = generator.random(courses.shape) < 0.05
+        courses = np.where(nasty, generator.choice(edges, courses.shape), courses)
+        jumps = np.column_stack(
+            (np.sort(generator.choice(edges[2:8], 2)), options["goal"] + generator.uniform(-0.1, 0.1, (2, 2)))
+        )
+        reason = ""
+        try:
+            env.reset(options={**options, "jumps": jumps[: seed % 3], "courses": courses})
+        except ValueError as error:
+            reason = str(error)
+        assert not reason or reason.startswith("scene 0: ")
+        found[not reason] += 1
+        for info in () if reason else play(env, actions=0.5, seed=seed):
+            assert np.isfinite(list(info.values())).all()
+    assert min(found.values()) > 20
