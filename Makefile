@@ -34,6 +34,7 @@ format: $(READY) ## let ruff put the source in order
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
 	@$(BIN)/python -m viapoint.training.make_scenes
+	@$(BIN)/python -m viapoint.training.make_online_scenes
 
 hashes: $(READY) ## hash a thousand episodes of every environment anew
 	@$(BIN)/python benchmarks/reliability_determinism.py --write

@@ -13,17 +13,9 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import STEP_TASKS
 from viapoint.training.discount import check_discount_unit
-from viapoint.training.presets import (
-    ONLINE_PRESETS,
-    PRESETS,
-    REACH_PRESETS,
-    SPACE_PRESETS,
-    STEP_PRESETS,
-    Algorithm,
-    Preset,
-)
+from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
 C = TypeVar("C")
 
@@ -113,14 +105,7 @@ class TrainConfig:
     @property
     def preset(self) -> Preset:
         """What holds for everything that is not given."""
-        if self.env in STEP_TASKS:
-            return STEP_PRESETS[self.algo]
-        if self.env in ONLINE_TASKS:
-            return ONLINE_PRESETS[self.algo]
-        task = TASKS.get(OWN_ARM_TASKS.get(self.env, self.env), {})
-        in_space = SPACE_PRESETS if "arm" in task else PRESETS
-        presets = REACH_PRESETS if task.get("n_obstacles") == 0 else in_space
-        return presets.get(self.algo, PRESETS[self.algo])
+        return preset_of(self.env, self.algo)
 
     @property
     def total_timesteps(self) -> int:

@@ -7,6 +7,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
+
 Algorithm = Literal["viatd3", "sac", "td3", "ppo", "tqc"]
 
 
@@ -137,12 +139,25 @@ SPACE_PRESETS: dict[str, Preset] = {
 """Where every link of an arm in space must clear: looking takes longer, and there are more ways to go."""
 
 ONLINE_PRESETS: dict[str, Preset] = {
-    name: dataclasses.replace(
-        preset,
-        n_timesteps=2 * preset.n_timesteps,
+    name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
+} | {
+    "viatd3": dataclasses.replace(
+        PRESETS["viatd3"],
         discount_unit=0.1,
-        hyperparameters=(*preset.hyperparameters, *({"gamma": 0.99} if name == "viatd3" else {}).items()),
+        eval_every=800,
+        hyperparameters=(*PRESETS["viatd3"].hyperparameters, ("gamma", 0.99)),
     )
-    for name, preset in PRESETS.items()
 }
 """Where plans are revised on the way: episodes are several decisions, and discounts follow time."""
+
+
+def preset_of(env_id: str, algo: Algorithm) -> Preset:
+    """What holds for an algorithm on an environment unless one says otherwise."""
+    if env_id in STEP_TASKS:
+        return STEP_PRESETS[algo]
+    if env_id in ONLINE_TASKS:
+        return ONLINE_PRESETS[algo]
+    task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
+    in_space = SPACE_PRESETS if "arm" in task else PRESETS
+    presets = REACH_PRESETS if task.get("n_obstacles") == 0 else in_space
+    return presets.get(algo, PRESETS[algo])

@@ -1,0 +1,95 @@
+"""Laws of learning and measuring where plans are revised: whole episodes, the true course for the planner alone."""
+
+import numpy as np
+import pytest
+
+from viapoint.training.baselines import make_method
+from viapoint.training.config import TrainConfig
+from viapoint.training.evaluate import evaluate
+from viapoint.training.files import read_json
+from viapoint.training.frozen_scenes import FrozenScenes, load
+from viapoint.training.make_online_scenes import SIZES, shares
+from viapoint.training.online_trial import OnlineTrial, new_trial
+from viapoint.training.runs import Run, load_model
+from viapoint.training.train import train
+from viapoint.training.trial import Trial
+
+MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
+
+
+def results(env_id, *names, number=12):
+    frozen = load("validation", env_id).take(slice(0, number))
+    methods = [make_method(name, env_id) for name in names]
+    found = evaluate(methods, frozen, env_id, time_decisions=False).results
+    return {name: each.summary()["success"]["rate"] for name, each in zip(names, found, strict=True)}
+
+
+def test_the_trial_is_of_the_kind_that_an_environment_needs():
+    assert isinstance(new_trial(MOVING, 2), OnlineTrial)
+    assert type(new_trial("viapoint/PlanarReach-v0", 2)) is Trial
+
+
+def test_the_planner_solves_frozen_scenes_and_straight_movements_do_not():
+    rates = results(MOVING, "planner", "straight")
+    assert rates["planner"] == 1.0
+    assert rates["straight"] < 0.3
+
+
+def test_a_jumping_target_is_reached_by_revision_only():
+    rates = results(JUMPS, "straight", "unrevised")
+    assert rates == {"straight": 1.0, "unrevised": 0.0}
+
+
+def test_an_episode_is_the_same_alone_and_among_others():
+    trial = OnlineTrial(MOVING, 8)
+    scenes = trial.draw(11, seed=4)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, trial.task.action.size))
+    together = trial(scenes, actions)
+    for row in (0, 7, 10):
+        alone = trial(scenes.take([row]), actions[[row]])
+        for name, value in alone.info.items():
+            np.testing.assert_array_equal(value[0], together.info[name][row])
+
+
+def test_drawn_scenes_are_the_same_for_the_same_seed():
+    one, other = (OnlineTrial(MOVING, size).draw(5, seed=9) for size in (3, 70))
+    for mine, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_shipped_sets_hold_what_they_promise(env_id):
+    for name, size in SIZES.items():
+        frozen = load(name, env_id)
+        assert len(frozen.share) == size
+        assert len(np.unique(frozen.number)) == size
+        if env_id == MOVING:
+            trial, some = OnlineTrial(env_id, 4), frozen.take(slice(0, 4))
+            np.testing.assert_allclose(shares(trial, some.scenes)[:1], some.share[:1], atol=1e-3)
+
+
+def test_files_of_changing_scenes_come_back_whole(tmp_path):
+    frozen = load("validation", JUMPS).take(slice(0, 3))
+    frozen.save(tmp_path / "some.npz")
+    again: FrozenScenes = load(tmp_path / "some.npz", JUMPS)
+    assert again.sha256 == frozen.sha256
+    np.testing.assert_array_equal(again.scenes.jumps, frozen.scenes.jumps)
+
+
+def settings(folder, n_timesteps, **changes):
+    hyperparameters = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
+    return TrainConfig(
+        env=MOVING, n_timesteps=n_timesteps, n_envs=16, out=folder, eval_every=0, checkpoint_every=48,
+        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, progress=False, **changes,
+    )  # fmt: skip
+
+
+def test_training_that_is_taken_up_ends_where_it_would_have(tmp_path):
+    whole = train(settings(tmp_path / "whole", 96))
+    train(settings(tmp_path / "parts", 48))
+    parts = train(TrainConfig(out=tmp_path / "parts", resume=True, n_timesteps=96, progress=False))
+    first, second = (
+        load_model(run.folder / "final").policy.state_dict() for run in (whole, Run(parts.folder))
+    )
+    assert all((first[name] == second[name]).all() for name in first)
+    assert read_json(whole.folder / "final" / "model.json")["discount_unit"] == 0.1
