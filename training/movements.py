@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs._arrays import clamp, namespace_of
+from viapoint.envs._arrays import namespace_of
 from viapoint.envs.action import frame
 from viapoint.envs.task import Task
 from viapoint.training.sight import INSTANTS, Array, Observation
@@ -81,7 +81,9 @@ def _on_the_way(observation: Observation, actions: Array, task: Task) -> Movemen
         waypoints.append(via)
     low, high = layout.duration_range
     factor = xp.exp(actions[..., number * d] * (0.5 * float(np.log(high / low))))
-    duration = clamp(observation["remaining"] * factor, 0.5 * low, 10.0 * high)
+    remaining = xp.maximum(observation["remaining"], xp.full_like(observation["remaining"], 0.5 * low))
+    longest = xp.maximum(remaining, xp.full_like(remaining, high))
+    duration = xp.minimum(xp.maximum(remaining * factor, xp.full_like(factor, 0.5 * low)), longest)
     points = xp.stack([*waypoints, goal], axis=-2)
     began = {"start_velocity": velocity, "start_acceleration": acceleration}
     durations = primitives.passage_durations(points, duration, **began)
