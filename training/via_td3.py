@@ -148,12 +148,16 @@ class ViaTD3(TD3):
 
     @torch.no_grad()
     def _value(self, observation: Any) -> Tensor:
-        """What is to come, in the critic's judgement: of a few anchors, improved, and of the first as it is, (B, 1)."""
+        """What is to come, shape (B, 1): the critic judges what the actor would choose among a few.
+
+        A choice by the critic itself would prefer what it overestimates, and so many decisions to few.
+        """
         look = self.actor.look_at(observation, self._few(observation))
-        actions = torch.cat(
-            (look.actions[:, :1], self.actor.improve(self.actor.encode(observation), look).actions), 1
-        )
-        value: Tensor = self.critic.judge(observation, actions).reward().amax(dim=1, keepdim=True)
+        improved = self.actor.improve(self.actor.encode(observation), look)
+        actions = torch.cat((look.actions[:, :1], improved.actions), dim=1)
+        scores = torch.cat((improved.worth[:, :1] + look.known[:, :1], improved.promise), dim=1)
+        chosen = actions[torch.arange(len(actions)), scores.argmax(dim=1)]
+        value: Tensor = self.critic.judge(observation, chosen.unsqueeze(1)).reward()
         return value
 
     def _few(self, observation: Any) -> Tensor:
