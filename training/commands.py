@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
+from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training import report
 from viapoint.training import train as training
 from viapoint.training.baselines import Method, agent_method, make_method
@@ -95,7 +96,7 @@ def evaluate(config: EvaluateConfig) -> None:
     env_id = agent.env_id if agent else config.env
     if env_id is None:
         raise ValueError("without an agent, --env must say which environment is meant")
-    if config.failures is not None and is_step_wise(env_id):
+    if config.failures is not None and (is_step_wise(env_id) or env_id in ONLINE_TASKS):
         raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
     env_id, env_kwargs = whole_task(env_id, agent.env_kwargs if agent else {})
     frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))

@@ -13,7 +13,7 @@ import gymnasium as gym
 import tyro
 
 import viapoint.envs
-from viapoint.envs.registration import STEP_TASKS
+from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
 from viapoint.training.discount import check_discount_unit
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
@@ -345,14 +345,15 @@ def _plain(value: Any) -> Any:
 
 def _check_env(env: str) -> None:
     if env not in gym.registry:
-        raise ValueError(f"env must be one of {', '.join((*viapoint.envs.TASKS, *STEP_TASKS))}, got {env!r}")
+        raise ValueError(
+            f"env must be one of {', '.join((*viapoint.envs.TASKS, *STEP_TASKS, *ONLINE_TASKS))}, got {env!r}"
+        )
 
 
 def _check_whole_movements(env: str) -> None:
-    if env in STEP_TASKS:
-        raise ValueError(
-            f"env must be one where an action is a whole movement, {STEP_TASKS[env]} for one, got {env!r}"
-        )
+    if env in STEP_TASKS or env in ONLINE_TASKS:
+        like = STEP_TASKS.get(env, DEFAULT_ENV)
+        raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
 
 
 def _check_whole(name: str, value: Any, least: int) -> None:
