@@ -127,16 +127,14 @@ REACH_PRESETS: dict[str, Preset] = {
 """Where nothing is in the way, less will do."""
 
 SPACE_PRESETS: dict[str, Preset] = {
-    "viatd3": _preset(
-        64,
-        12_800,
-        "ViaPolicy",
+    "viatd3": dataclasses.replace(
+        PRESETS["viatd3"],
+        eval_every=800,
         checkpoint_every=1_600,
-        learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
-        fresh_scenes=32,
+        hyperparameters=(*PRESETS["viatd3"].hyperparameters, ("fresh_scenes", 32)),
     ),
 }
-"""Where every link of an arm in space must clear: looking takes longer, and there are more ways to go."""
+"""Where every link of an arm in space must clear: looking takes longer, so fewer scenes are looked at."""
 
 ONLINE_PRESETS: dict[str, Preset] = {
     name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
