@@ -25,8 +25,9 @@ Bool = NDArray[np.bool_]
 ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 14
 """How many pairs of ends, witnesses, structures and other obstacles are drawn at once, and at how many times a
 movement is looked at."""
-ATTEMPTS = (1, 2, 4, *[8] * 50)
-"""How many attempts are made at once, one time after the other: few are left after the first."""
+ATTEMPTS = (1, 2, 4, *[8] * 400)
+"""How many attempts are made at once, one time after the other: few are left after the first,
+but one in a hundred makes a tunnel."""
 FAITHFUL = 8
 """How many times attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
 FAMILY = 6 * ENDS + 3 * WITNESSES + 1
