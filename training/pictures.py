@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from viapoint.envs.scenes import Scenes
+from viapoint.training.commands import find_agent
 from viapoint.training.flow_picture import draw_flow
+from viapoint.training.frozen_scenes import load
 
 Float = NDArray[np.float64]
+Frame = NDArray[np.uint8]
 
 SEEDS = {"PlanarReach": (4,), "PlanarObstacles": (15, 5, 12, 6), "PlanarWholeArm": (1,)}
 """Scenes that show what a task is about; the first of each is its picture."""
@@ -23,6 +26,11 @@ FILES = {
     "PlanarObstacles": "planar_obstacles.png",
     "PlanarWholeArm": "planar_whole_arm.png",
 }
+IN_SPACE = "viapoint/PandaObstacles-v0"
+PASSAGES = (14, 21)
+"""Scenes of its set `test` that the shipped agent is shown in: a slot, and a shelf among spheres."""
+MOMENTS = (0.3, 0.45, 0.6, 1.0)
+"""Of a movement, as parts of its duration."""
 ATTEMPTS = 400
 """Random movements in a scene."""
 SCENES = 10
@@ -89,17 +97,54 @@ def picture(task: str, path: Path) -> None:
 def animation(task: str, path: Path, *, size: int = 400) -> None:
     """A movement in each scene of a task, one after the other, for ever."""
     env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array_list", width=size, height=size)
-    each = 1000.0 / (env.metadata["render_fps"] * SPEED)
-    images: list[Image.Image] = []
-    durations: list[int] = []
-    for seed in SEEDS[task]:
-        frames = perform(env, solve(env, seed))
-        images += [Image.fromarray(frame) for frame in frames]
-        durations += [round(each)] * (len(frames) - 1) + [PAUSE]
+    films = [perform(env, solve(env, seed)) for seed in SEEDS[task]]
     env.close()
+    _animate(path, films, env.metadata["render_fps"])
+
+
+def _animate(path: Path, films: list[list[Frame]], fps: float) -> None:
+    """Save films as one animation that never ends."""
+    images = [Image.fromarray(frame) for frames in films for frame in frames]
+    each = round(1000.0 / (fps * SPEED))
+    durations = [time for frames in films for time in (*[each] * (len(frames) - 1), PAUSE)]
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=durations, loop=0, quality=80, method=4
     )
+
+
+def passage(env: gym.Env[Any, Any], row: int, *, straight: bool = False) -> list[Frame]:
+    """The frames of the shipped agent's movement in a test scene, or those of the straight one until it hits.
+
+    Raises:
+        RuntimeError: The agent's does not succeed, or the straight one does.
+    """
+    scene, agent = load("test", IN_SPACE).scenes.take([row]), find_agent(None, IN_SPACE)
+    observation, _ = env.reset(options=scene.as_options())
+    task: Any = env.unwrapped.task  # type: ignore[attr-defined]
+    batch = {name: part[None] for name, part in observation.items()}
+    action = np.zeros(task.action.size) if straight else agent.method(80).decide(batch, scene)[0]
+    info = env.step(action.astype(np.float32))[-1]
+    if info["is_success"] is straight:
+        raise RuntimeError(f"scene {row} shows nothing: is_success is {info['is_success']}")
+    frames: list[Frame] = env.render()  # type: ignore[assignment]
+    if straight:
+        frames = frames[: 1 + round(info["first_contact_time"] / info["duration"] * (len(frames) - 1))]
+    return frames
+
+
+def passages(strip: Path, pair: Path, film: Path) -> None:
+    """The shipped agent of an arm in space: moments of a movement, the straight one beside them, and a film."""
+    sides = {strip: 300, pair: 480, film: 300}
+    for path, side in sides.items():
+        env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
+        if path == film:
+            _animate(path, [passage(env, row) for row in PASSAGES], env.metadata["render_fps"])
+        else:
+            frames, hit = passage(env, PASSAGES[0]), passage(env, PASSAGES[0], straight=True)[-1]
+            moments = MOMENTS if path == strip else MOMENTS[1:2]
+            shown = [frames[round(moment * (len(frames) - 1))] for moment in moments]
+            Image.fromarray(np.concatenate((*shown, hit), axis=1)).save(path, optimize=True)
+        env.close()
 
 
 def flow(path: Path) -> None:
@@ -121,6 +166,7 @@ def main() -> None:
     for task, name in FILES.items():
         picture(task, out / name)
     animation("PlanarObstacles", out / "reaching.webp")
+    passages(out / "panda_agent.png", out / "panda_obstacles.png", out / "panda.webp")
     flow(out / "flow.png")
     for path in sorted(out.iterdir()):
         print(f"{path}  {path.stat().st_size / 1000:.0f} kB")

@@ -189,3 +189,16 @@ def test_the_pictures_of_the_documentation(tmp_path, monkeypatch):
         assert image.size == (480, 480)
     with Image.open(tmp_path / "flow.png") as image:
         assert image.width > 1200
+
+
+def test_the_pictures_of_the_agent_in_space_show_that_it_passes_and_the_straight_movement_does_not():
+    env = gym.make(pictures.IN_SPACE, render_mode="rgb_array_list", width=32, height=32)
+    try:
+        row = pictures.PASSAGES[0]
+        passed, hit = pictures.passage(env, row), pictures.passage(env, row, straight=True)
+    except GLUnavailableError as error:
+        pytest.skip(str(error))
+    finally:
+        env.close()
+    assert passed[0].shape == hit[0].shape == (32, 32, 3)
+    assert len(hit) < len(passed)
