@@ -12,14 +12,14 @@ from viapoint.envs.scenes import check_scenes
 from viapoint.training.baselines import METHODS, make_method
 from viapoint.training.difficulty import planned_share, solution_share
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, load, shipped_path
-from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, lots, remake
+from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake
 from viapoint.training.planner import Planner, PlannerBudget
 from viapoint.training.scene_search import Kinds, Source, redrawn, search
 from viapoint.training.screening import screen
 from viapoint.training.trial import Trial
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
-ENV_ID = "viapoint/PlanarObstacles-v0"
+ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +58,13 @@ def test_shipped_sets_are_whole_and_distinct_and_every_share_is_known(shipped):
     assert len(np.unique(shipped.scenes.start, axis=0)) == size
 
 
-def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_family(shipped):
+def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_family(shipped, trials):
     if shipped.name == "hard":
         names, counts = np.unique(shipped.family, return_counts=True)
-        assert set(names) == set(FAMILIES)
-        assert set(counts) == {len(shipped.share) // len(FAMILIES)}
-        assert set(shipped.family[: len(FAMILIES)]) == set(FAMILIES)  # in turn, so that any part is mixed
+        families = hard_families(trials(shipped.env_id).task)
+        assert set(names) == set(families)
+        assert set(counts) == {len(shipped.share) // len(families)}
+        assert set(shipped.family[: len(families)]) == set(families)  # in turn, so that any part is mixed
         assert (shipped.share < 0.05).all()
     else:
         assert (shipped.family == "").all()
@@ -115,7 +116,7 @@ def test_what_is_too_rare_is_said_to_be_missing(trial):
         search(trial, source, impossible, seed=0, label="some", most_drawn=128)
 
 
-@pytest.mark.parametrize("env_id", [ENV_ID, "viapoint/PlanarWholeArm-v0"])
+@pytest.mark.parametrize("env_id", [ENV_ID, "viapoint/PlanarWholeArm-v0", IN_SPACE])
 def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, trials):
     """With estimated shares, a little too high."""
     task = trials(env_id).task
@@ -150,6 +151,17 @@ def test_share_counts_only_what_fails_for_certain_as_failed(trial):
     assert not trial(scenes.take(rows), actions).success[fails].any()
     assert 0.3 < fails.mean() < 0.98
     assert solution_share(trial, scenes.take(slice(0, 2))).shape == (2,)
+
+
+def test_what_succeeds_for_certain_does_and_only_in_space_it_is_known(trial, trials):
+    scenes = trials(IN_SPACE).task.sampler()([np.random.default_rng(i) for i in range(40)])
+    rows = np.repeat(np.arange(40), 16)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (len(rows), 4))
+    screened = screen(trials(IN_SPACE).task, scenes.take(rows), actions)
+    assert 40 < screened.succeeds.sum() < 300
+    assert trials(IN_SPACE)(scenes.take(rows[screened.succeeds]), actions[screened.succeeds]).success.all()
+    planar = trial.task.sampler()([np.random.default_rng(i) for i in range(40)])
+    assert not screen(trial.task, planar, np.ones((40, 3))).succeeds.any()
 
 
 def test_the_planner_solves_unseen_scenes_better_than_chance_could(trial):
