@@ -18,7 +18,7 @@ WORDS = {1: "one", 2: "two", 6: "six", 8: "eight"}
 
 def table(section):
     """The rows of the first table of a section, without its head."""
-    text = f"\n{PAGE}".partition(f"\n{section}\n")[2].partition("\n## ")[0]
+    text = f"\n{PAGE}".partition(f"\n{section}\n")[2].partition("\n##")[0]
     rows = [
         [cell.strip().strip("`") for cell in line.strip("|").split("|")]
         for line in text.splitlines()
