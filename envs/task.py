@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from viapoint.envs.action import ActionLayout
+from viapoint.envs.arms import OF_ONES_OWN
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.reward import RewardWeights
@@ -55,7 +56,7 @@ class Task:
         """
         arm = arms.get(record["arm"])
         if arm is None:
-            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}")
+            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}; {OF_ONES_OWN}")
         return cls(
             arm=arm,
             whole_arm=bool(record["whole_arm"]),

@@ -272,6 +272,8 @@ def _encode(value: Any) -> Any:
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
+    if hasattr(value, "reach_margin"):
+        return value.name  # of an arm; whoever loads the model makes it known first
     raise ValueError(f"a {type(value).__name__} cannot be written as JSON: {value!r}")
 
 

@@ -9,7 +9,22 @@ from viapoint.envs.arms.panda import PANDA
 from viapoint.envs.arms.planar import ADULT
 
 ARMS: dict[str, Arm] = {arm.name: arm for arm in (ADULT, PANDA)}
-"""Every arm by its name."""
+"""Every known arm by its name."""
+
+OF_ONES_OWN = "viapoint.envs.arms.register_arm makes an arm of your own known by its name"
+"""What to do where an arm is not known."""
+
+
+def register_arm(arm: Arm) -> None:
+    """Make an arm of one's own known by its name, so that environments, runs and models find it.
+
+    Files of runs and models hold no more of an arm than its name: whoever loads one makes the arm known first.
+
+    Raises:
+        ValueError: Another arm is known by that name.
+    """
+    if ARMS.setdefault(arm.name, arm) != arm:
+        raise ValueError(f"another arm is known as {arm.name!r}; give this one another name")
 
 
 def arm_of(arm: Any) -> Arm:
@@ -21,7 +36,7 @@ def arm_of(arm: Any) -> Arm:
     """
     if isinstance(arm, str):
         if arm not in ARMS:
-            raise ValueError(f"arm must be a record or one of {', '.join(ARMS)}, got {arm!r}")
+            raise ValueError(f"arm must be a record or one of {', '.join(ARMS)}, got {arm!r}; {OF_ONES_OWN}")
         return ARMS[arm]
     if not hasattr(arm, "reach_margin"):
         raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
@@ -29,4 +44,4 @@ def arm_of(arm: Any) -> Arm:
     return found
 
 
-__all__ = ["ADULT", "ARMS", "PANDA", "Arm", "arm_of"]
+__all__ = ["ADULT", "ARMS", "PANDA", "Arm", "arm_of", "register_arm"]

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import viapoint.envs
-from viapoint.envs.arms import PANDA, Arm
+from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
 from viapoint.envs.arms.capsule_fit import around_points, surface
 from viapoint.envs.registration import OWN_ARM_TASKS
 
@@ -213,3 +213,16 @@ def test_the_fetch_of_gymnasium_robotics():
     _, _, info = env.unwrapped.decide(np.zeros((16, 4)))
     assert info["is_success"].all()
     assert info["tracking_error"].max() < 2e-3
+
+
+def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):
+    monkeypatch.delitem(ARMS, arm.name, raising=False)
+    with pytest.raises(ValueError, match=rf"got '{arm.name}'.*register_arm makes an arm of your own known"):
+        gym.make("viapoint/Obstacles-v0", arm=arm.name)
+    monkeypatch.setitem(ARMS, arm.name, arm)
+    register_arm(arm)
+    env = gym.make("viapoint/Obstacles-v0", arm=arm.name).unwrapped
+    assert env.task.arm is arm
+    env.close()
+    with pytest.raises(ValueError, match="another arm is known as"):
+        register_arm(ur5e(velocity_limit=1.0))

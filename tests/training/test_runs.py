@@ -1,5 +1,6 @@
 """What is written comes back the same; what is wrong is refused by name; nothing that is read is run."""
 
+import dataclasses
 import json
 import pickle
 import subprocess
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from viapoint.envs.arms import ARMS, PANDA
 from viapoint.training import files
 from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.config import TrainConfig
@@ -292,3 +294,16 @@ def test_a_checkpoint_of_another_model_is_refused(env, tmp_path):
     assert read_checkpoint(same, tmp_path / "checkpoint") == {}
     for name, array in weights(model).items():
         np.testing.assert_array_equal(weights(same)[name], array)
+
+
+def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_path, monkeypatch):
+    own = dataclasses.replace(PANDA, name="mine")
+    monkeypatch.setitem(ARMS, "mine", own)
+    env = ViaVecEnv("viapoint/Reach-v0", 1, arm=own, threads=1)
+    preset = PRESETS["viatd3"]
+    model = build("viatd3", preset.policy, env, preset.arguments(), seed=0)
+    save_model(model, tmp_path)
+    assert load_model(tmp_path).get_env().env_kwargs["arm"] == "mine"
+    monkeypatch.delitem(ARMS, "mine")
+    with pytest.raises(BadFileError, match=r"got 'mine'; .*register_arm makes an arm"):
+        load_model(tmp_path)
