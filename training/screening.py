@@ -24,7 +24,7 @@ SURE = 0.01
 """Least clearance and reach margin of a plan in space that succeeds for certain, [m].
 
 There movements are slowed down to what the arm's limits allow, so that plans are tracked within a millimetre, whatever
-their duration: of 1,009 random plans with a margin over 2 mm none failed.
+their duration: of 1,017 random plans with a margin over 2 mm none failed.
 """
 CHUNK = 4096
 
