@@ -1,5 +1,7 @@
 """Small scenes and small trainings, shared by the tests of training."""
 
+import signal
+
 import numpy as np
 import pytest
 import torch
@@ -43,3 +45,10 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     for module in (frozen_scenes, monitor):
         monkeypatch.setattr(module, "shipped_path", lambda name, env_id: path)
     return small_scenes
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _heeds_ctrl_c():
+    """A shell's background jobs ignore Ctrl-C, and so would everything that the tests start."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
