@@ -256,7 +256,7 @@ class DemoConfig:
     seed: int = 0
     """Of the training."""
     n_timesteps: int | None = None
-    """Decisions to train for; three quarters of the preset's if not given, so that nobody waits for long."""
+    """Decisions to train for; two thirds of the preset's if not given, so that nobody waits for long."""
     n_scenes: int | None = None
     """Test scenes to evaluate on; all if not given."""
     candidates: int = 80
@@ -275,7 +275,7 @@ class DemoConfig:
     @property
     def total_timesteps(self) -> int:
         """Decisions of a training that begins."""
-        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps * 3 // 4
+        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps * 2 // 3
 
 
 @dataclass(frozen=True, kw_only=True)

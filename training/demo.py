@@ -28,7 +28,7 @@ from viapoint.training.video import film
 BASELINES = ("straight", "random")
 PICTURES = 12
 """In the gallery."""
-MOVEMENTS = 6
+MOVEMENTS = 4
 """In the film."""
 
 
