@@ -9,17 +9,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-import gymnasium as gym
 import tyro
 
-import viapoint.envs
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
+from viapoint.envs.registration import STEP_TASKS
+from viapoint.training.config_checks import (
+    DEFAULT_ENV,
+    check_env,
+    check_one_source,
+    check_whole,
+    check_whole_movements,
+)
 from viapoint.training.discount import check_discount_unit
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
 C = TypeVar("C")
-
-DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 
 
 def _from_words(words: list[str]) -> dict[str, Any]:
@@ -86,7 +89,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        _check_env(self.env)
+        check_env(self.env)
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         if self.env in STEP_TASKS and self.algo not in STEP_PRESETS:
@@ -95,10 +98,10 @@ class TrainConfig:
                 f"{', '.join(STEP_PRESETS)}"
             )
         for name, least in (("seed", 0), ("eval_scenes", 1)):
-            _check_whole(name, getattr(self, name), least)
+            check_whole(name, getattr(self, name), least)
         for name, least in (("n_timesteps", 1), ("n_envs", 1), ("eval_every", 0), ("checkpoint_every", 1)):
             if getattr(self, name) is not None:
-                _check_whole(name, getattr(self, name), least)
+                check_whole(name, getattr(self, name), least)
         if self.discount_unit is not None:
             check_discount_unit(self.algo, self.discount_unit, self.env)
 
@@ -167,13 +170,13 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         if self.env is not None:
-            _check_env(self.env)
-        _check_one_source(self.run, self.pretrained, needed="agent" in self.methods)
+            check_env(self.env)
+        check_one_source(self.run, self.pretrained, needed="agent" in self.methods)
         if not self.methods:
             raise ValueError("methods must name at least one method")
-        _check_whole("candidates", self.candidates, 0)
+        check_whole("candidates", self.candidates, 0)
         if self.n_scenes is not None:
-            _check_whole("n_scenes", self.n_scenes, 1)
+            check_whole("n_scenes", self.n_scenes, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,9 +201,9 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        _check_one_source(self.run, self.pretrained, needed=True)
-        _check_whole("n_scenes", self.n_scenes, 1)
-        _check_whole("candidates", self.candidates, 0)
+        check_one_source(self.run, self.pretrained, needed=True)
+        check_whole("n_scenes", self.n_scenes, 1)
+        check_whole("candidates", self.candidates, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,10 +224,10 @@ class BenchConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        _check_env(self.env)
-        _check_whole_movements(self.env)
-        _check_whole("num_envs", self.num_envs, 1)
-        _check_whole("repeats", self.repeats, 1)
+        check_env(self.env)
+        check_whole_movements(self.env)
+        check_whole("num_envs", self.num_envs, 1)
+        check_whole("repeats", self.repeats, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,13 +267,13 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        _check_env(self.env)
-        _check_whole_movements(self.env)
-        _check_whole("seed", self.seed, 0)
-        _check_whole("candidates", self.candidates, 1)
+        check_env(self.env)
+        check_whole_movements(self.env)
+        check_whole("seed", self.seed, 0)
+        check_whole("candidates", self.candidates, 1)
         for name in ("n_timesteps", "n_scenes"):
             if getattr(self, name) is not None:
-                _check_whole(name, getattr(self, name), 1)
+                check_whole(name, getattr(self, name), 1)
 
     @property
     def total_timesteps(self) -> int:
@@ -311,7 +314,7 @@ class ImportConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        _check_env(self.env)
+        check_env(self.env)
 
 
 def as_json(config: Any) -> dict[str, Any]:
@@ -341,28 +344,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return list(value) if isinstance(value, tuple) else value
-
-
-def _check_env(env: str) -> None:
-    if env not in gym.registry:
-        raise ValueError(
-            f"env must be one of {', '.join((*viapoint.envs.TASKS, *STEP_TASKS, *ONLINE_TASKS))}, got {env!r}"
-        )
-
-
-def _check_whole_movements(env: str) -> None:
-    if env in STEP_TASKS or env in ONLINE_TASKS:
-        like = STEP_TASKS.get(env, DEFAULT_ENV)
-        raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
-
-
-def _check_whole(name: str, value: Any, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
-
-
-def _check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) -> None:
-    if run is not None and pretrained is not None:
-        raise ValueError("give a run folder or --pretrained, not both")
-    if needed and run is None and pretrained is None:
-        raise ValueError("name a run folder, or an environment with --pretrained")

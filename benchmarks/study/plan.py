@@ -11,7 +11,8 @@ from typing import Any, Literal, get_args
 
 from viapoint.envs.registration import STEP_TASKS, TASKS
 from viapoint.training.baselines import METHODS as BASELINE_METHODS
-from viapoint.training.config import DEFAULT_ENV, TrainConfig
+from viapoint.training.config import TrainConfig
+from viapoint.training.config_checks import DEFAULT_ENV
 from viapoint.training.frozen_scenes import SETS, shipped_path
 from viapoint.training.policies import ViaPolicy
 from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm

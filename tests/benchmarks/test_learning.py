@@ -237,7 +237,6 @@ def test_a_cell_that_cannot_be_trained_says_why(tmp_path):
         work.complete(Cell(env=ENV, variant=variant, seed=0), study)
 
 
-@pytest.mark.skipif(not (DOCS / "results.json").exists(), reason="the study has not been made yet")
 def test_no_number_of_the_page_is_typed_by_hand():
     record = read_json(DOCS / "results.json")
     assert page.page(record) == (DOCS / "results.md").read_text()

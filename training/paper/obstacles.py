@@ -14,7 +14,7 @@ from viapoint.envs.scenes import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
 from viapoint.training.baselines import Method, PlannerMethod
 from viapoint.training.commands import find_agent, pretrained_folder
-from viapoint.training.config import DEFAULT_ENV
+from viapoint.training.config_checks import DEFAULT_ENV
 from viapoint.training.paper.claims import Claim, Promise, at_least, at_most, near
 from viapoint.training.paper.movements import construction, passage_share, smoothest
 from viapoint.training.paper.performed import Performed, perform
