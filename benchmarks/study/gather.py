@@ -108,7 +108,6 @@ def _training(cells: Sequence[Cell], study: Study) -> Numbers:
         "simulated_seconds": float(np.median([each["simulated_seconds"] for each in last])),
         "seconds": [each["seconds"] for each in last],
         "cores": sorted({read_json(path)["cores"] for path in cores if path.is_file()}),
-        "of_cores": sorted({read_json(path)["of"] for path in cores if path.is_file()}),
     }
 
 

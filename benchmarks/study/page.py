@@ -18,7 +18,7 @@ Rows = list[list[str]]
 
 def page(record: Numbers) -> str:
     """The whole document."""
-    parts = [INTRODUCTION.format(seeds=_seeds(record), cores=_cores(record)), KNOWLEDGE]
+    parts = [INTRODUCTION.format(seeds=_seeds(record)), KNOWLEDGE]
     parts += [_environment(env, each) for env, each in record["environments"].items()]
     parts.append(FAILURES)
     parts += [_ablations(env, each) for env, each in record["ablations"].items() if len(each) > 1]
@@ -52,20 +52,6 @@ def _seeds(record: Numbers) -> str:
     return f"{text} **Not all of them are in**; what there is: " + "; ".join(sorted(partial)) + "."
 
 
-def _cores(record: Numbers) -> str:
-    cores = {
-        (core, of)
-        for each in record["environments"].values()
-        for method in each["methods"]
-        for core in method["training"]["cores"]
-        for of in method["training"]["of_cores"]
-    }
-    if not cores:
-        return ""
-    core, of = max(cores)
-    return f", each on {core} of {of} cores" if core < of else f", each on all {of} cores"
-
-
 def _environment(env: str, numbers: Numbers) -> str:
     """One environment: figure, a table for each set, what follows from them."""
     lines = [f"## {short(env)}"]
@@ -93,7 +79,7 @@ def _rows(numbers: Numbers, name: str, about: Numbers) -> Rows:
     """Every method on one set."""
     bands = [band for band in BANDS if about["bands"][band]] if sum(about["bands"].values()) else []
     head = ["method", "seeds", "success (95 %)", *bands, "jerk / planner", "duration / planner", "decision"]
-    head += ["minutes", "decisions", "simulated"]
+    head += ["minutes (cores)", "decisions", "simulated"]
     rows = []
     for entry in numbers["methods"]:
         for way, found in entry["sets"].get(name, {}).items():
@@ -123,7 +109,9 @@ def _effort(entry: Numbers) -> list[str]:
     training = entry["training"]
     seconds = sorted(training["seconds"])
     minutes = seconds[len(seconds) // 2] / 60.0
-    return [f"{minutes:.1f}", f"{training['decisions']:,}", f"{training['simulated_seconds'] / 3600:.1f} h"]
+    cores = "-".join(str(each) for each in training["cores"])
+    simulated = f"{training['simulated_seconds'] / 3600:.1f} h"
+    return [f"{minutes:.1f} ({cores or '?'})", f"{training['decisions']:,}", simulated]
 
 
 def _families(numbers: Numbers, name: str, about: Numbers) -> str:

@@ -21,7 +21,7 @@ fraction of uniformly random actions that solve a scene: easy scenes prove littl
 successes as multiples of the planner's in the same scene: the median over scenes, then over seeds. Jerk is taken at
 equal duration. Decision: the median time of one decision on one thread; of the planner, of a search; of an agent
 that acts in every control step, of one step. Minutes: wall time of a training without validation, median over
-seeds{cores}.
+seeds, with the cores it could use; what else ran on the machine makes it longer, never shorter.
 """
 
 KNOWLEDGE = """## What the critic knows, and what it must learn
