@@ -8,32 +8,37 @@ function of a row of uniform numbers, so each environment draws from its own gen
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.space_bodies import Bodies, Swept
 from viapoint.envs.space_distribution import BOARDS, SpaceDistribution
+from viapoint.envs.space_draws import ENDS, PHASES, WITNESSES, draw_ends, draw_path
 from viapoint.envs.space_obstacles import NUMBERS, PARTS, Course, single, structure
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
-ENDS, WITNESSES, PHASES, STRUCTURES, OTHERS = 12, 8, 16, 4, 14
-"""How many pairs of ends, witnesses, structures and other obstacles are drawn at once, and at how many times a
-movement is looked at."""
+STRUCTURES, OTHERS = 4, 14
+"""How many structures and other obstacles are drawn at once."""
 ATTEMPTS = (1, 2, 4, *[8] * 400)
 """How many attempts are made at once, one time after the other: few are left after the first,
 but one in a hundred makes a tunnel."""
+TOGETHER = 256
+"""Attempts that are looked at together: only the first good one of a scene counts, so not all at once."""
 FAITHFUL = 8
 """How many times attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
 FAMILY = 6 * ENDS + 3 * WITNESSES + 1
 """Which of the uniform numbers of an attempt stands for the family."""
 GIVE_WAY = 1.3
 """How far what is in the witness's way moves, relative to what it lacks in clearance."""
+SOME = 1e-6
+"""Room that is asked whether there is any, not how much, [m]."""
 IN_THE_WAY = 0.004
 """How deep the straight movement cuts into what is in its way, [m]."""
 
@@ -45,7 +50,6 @@ class SpaceSampler:
         self.arm = arm
         self.distribution = distribution
         self.whole_arm = whole_arm
-        self._layout = ActionLayout(dimension=arm.dimension)
         self._rows = distribution.n_obstacles[1]
         self._families = np.array(distribution.possible)
 
@@ -67,14 +71,10 @@ class SpaceSampler:
         for group, attempts in enumerate(ATTEMPTS):
             if not len(pending):
                 break
-            u = np.concatenate([generators[int(i)].random((attempts, self._size)) for i in pending])
-            each = np.repeat(pending, attempts)
+            u = np.stack([generators[int(i)].random((attempts, self._size)) for i in pending])
             if group < FAITHFUL:
-                u[:, FAMILY] = family[each]
-            found, attempt = self._attempt(u, None if ends is None else (ends[0][each], ends[1][each]))
-            solved, first = np.unique(each[found], return_index=True)
-            scenes.put(solved, attempt.take(first))
-            pending = np.setdiff1d(pending, solved)
+                u[..., FAMILY] = family[pending, None]
+            pending = self._draw(u, pending, ends, scenes)
         if len(pending):
             between = (
                 "" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
@@ -84,6 +84,28 @@ class SpaceSampler:
                 f"attempts{between}"
             )
         return scenes
+
+    def _draw(self, u: Float, pending: Index, ends: tuple[Float, Float] | None, scenes: Scenes) -> Index:
+        """Put the scene of the first good attempt of each; those without one come back.
+
+        Args:
+            u: Uniform numbers, shape (P, attempts, .).
+            pending: Where the scenes belong, shape (P,).
+            ends: See :meth:`__call__`.
+            scenes: To put them.
+        """
+        left, begin = np.arange(len(pending)), 0
+        while begin < u.shape[1] and len(left):
+            several = max(TOGETHER // len(left), 1)
+            some = u[left, begin : begin + several]
+            each = np.repeat(left, some.shape[1])
+            where = pending[each]
+            given = None if ends is None else (ends[0][where], ends[1][where])
+            found, attempt = self._attempt(some.reshape(-1, self._size), given)
+            solved, first = np.unique(each[found], return_index=True)
+            scenes.put(pending[solved], attempt.take(first))
+            left, begin = np.setdiff1d(left, solved), begin + several
+        return pending[left]
 
     @property
     def _size(self) -> int:
@@ -97,58 +119,27 @@ class SpaceSampler:
             np.cumsum([6 * ENDS, 3 * WITNESSES, 3, (NUMBERS + 1) * STRUCTURES, (NUMBERS + 1) * OTHERS]),
             axis=1,
         )
-        start, goal, good = self._ends(parts[0].reshape(-1, ENDS, 6), ends)
-        above = (
-            np.isin(self._families[self._which(parts[2][:, 1])], BOARDS)
-            if self._rows
-            else np.zeros(len(u), bool)
-        )
-        path, reached = self._witness(parts[1].reshape(-1, WITNESSES, 3), start, goal, above)
-        found = good & reached
-        if not self._rows:
-            return found, Scenes(start, goal, np.zeros((len(u), 0, 7))).take(found)
+        start, goal, found = draw_ends(parts[0].reshape(-1, ENDS, 6), self.arm, self.distribution, ends)
         some = np.flatnonzero(found)
         if not len(some):
             return found, Scenes(start, goal, np.zeros((len(u), self._rows, 7))).take(found)
-        start, goal, path = start[some], goal[some], path[some]
-        kept, obstacles = self._furnish([part[some] for part in parts[2:]], start, goal, path)
-        found[some] = kept
-        return found, Scenes(start, goal, obstacles).take(kept)
-
-    def _ends(self, u: Float, ends: tuple[Float, Float] | None) -> tuple[Float, Float, Bool]:
-        """Starts and goals inside the workspace with the straight line between them inside the reach."""
-        low, high = (np.array(corner) for corner in self.arm.workspace)
-        start = low + (high - low) * u[..., :3]
-        height, angle = self.distribution.steepness * (2.0 * u[..., 3] - 1.0), 2.0 * np.pi * u[..., 4]
-        level = np.sqrt(1.0 - height**2)
-        shortest, longest = self.distribution.distance
-        step = np.stack((level * np.cos(angle), level * np.sin(angle), height), axis=-1)
-        if ends is not None:
-            start = np.where(np.isnan(ends[0])[:, None], start, ends[0][:, None])
-        goal = start + (shortest + (longest - shortest) * u[..., 5:6]) * step
-        inside = ((goal >= low) & (goal <= high)).all(axis=-1)
-        if ends is not None:
-            goal = np.where(np.isnan(ends[1])[:, None], goal, ends[1][:, None])
-            inside |= np.isfinite(ends[1][:, :1])
-        line = start[..., None, :] + (goal - start)[..., None, :] * np.linspace(0.0, 1.0, 5)[:, None]
-        good = inside & (self.arm.reach_margin(line).min(axis=-1) > self.distribution.reach_margin)
-        each, first = np.arange(len(u)), good.argmax(axis=-1)
-        return start[each, first], goal[each, first], good.any(axis=-1)
-
-    def _witness(self, u: Float, start: Float, goal: Float, above: Bool) -> tuple[Float, Bool]:
-        """Hand path of a movement through one via-point inside the reach, shape (N, PHASES, 3): above, or anywhere."""
-        angle = np.pi * np.where(above[:, None], 0.25 + 0.5 * u[..., 0], 1.3 * u[..., 0] - 0.15)
-        size = 0.45 + 0.5 * u[..., 1]
-        along = u[..., 2] - 0.5
-        action = np.stack((along, size * np.cos(angle), size * np.sin(angle), np.zeros_like(along)), axis=-1)
-        shape = (*action.shape[:2], 3)
-        plan = self._layout.decode(
-            action, np.broadcast_to(start[:, None], shape), np.broadcast_to(goal[:, None], shape)
+        above = (
+            np.isin(self._families[self._which(parts[2][some, 1])], BOARDS)
+            if self._rows
+            else np.zeros(len(some), bool)
         )
-        paths = plan.trajectory()(plan.durations.sum(axis=-1)[..., None] * np.linspace(0.0, 1.0, PHASES))
-        good = (self.arm.reach_margin(paths) > self.distribution.reach_margin).all(axis=-1)
-        first = good.argmax(axis=-1)
-        return paths[np.arange(len(first)), first], good.any(axis=-1)
+        witnesses = parts[1][some].reshape(-1, WITNESSES, 3)
+        margin = self.distribution.reach_margin
+        path, reached = draw_path(witnesses, self.arm, (start[some], goal[some]), margin, above)
+        found[some] = reached
+        some, path = some[reached], path[reached]
+        start, goal = start[some], goal[some]
+        obstacles = np.zeros((len(some), self._rows, 7))
+        if self._rows and len(some):
+            kept, obstacles = self._furnish([part[some] for part in parts[2:]], start, goal, path)
+            found[some] = kept
+            start, goal, obstacles = start[kept], goal[kept], obstacles[kept]
+        return found, Scenes(start, goal, obstacles)
 
     def _furnish(self, u: list[Float], start: Float, goal: Float, path: Float) -> tuple[Bool, Float]:
         """Which scenes get something in the way, shape (N,), and their obstacles, shape (N, rows, 7)."""
@@ -156,8 +147,12 @@ class SpaceSampler:
         general, hardness = u[0], u[0][:, :1] ** self.distribution.ease
         swept = Swept.of(self.arm, path, whole_arm=self.whole_arm)
         built = self._built(general[:, 1], _each(u[1], STRUCTURES), hardness, (start, goal, path), swept)
-        whole = self._free(swept.outer, built.reshape(number, -1, 7)).reshape(built.shape[:3]).all(axis=-1)
-        fits = whole & self._blocks(start, goal, built)
+        fits: Any = (
+            self._free(swept.outer, built.reshape(number, -1, 7)).reshape(built.shape[:3]).all(axis=-1)
+        )
+        some = np.flatnonzero(fits.any(axis=-1))
+        if len(some):
+            fits[some] &= self._blocks(start[some], goal[some], built[some] * fits[some, :, None, None])
         wanted = least + np.floor((most - least + 1) * general[:, 2])
         chosen = built[np.arange(number), fits.argmax(axis=-1)]
         chosen[wanted == 0.0] = 0.0
@@ -190,9 +185,9 @@ class SpaceSampler:
             rows[some], retreat[some] = structure(
                 name, self.distribution, here, u[some, :, :NUMBERS], self.arm.hand_radius
             )
-        clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7)).min(axis=-1)
-        lacking = self.distribution.link_margin + 0.002 - clearance
-        lacking = np.maximum(lacking.reshape(rows.shape[:3]), 0.0)
+        enough = self.distribution.link_margin + 0.002
+        clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7), enough)
+        lacking = np.maximum((enough - clearance).reshape(rows.shape[:3]), 0.0)
         board = np.isin(self._families[which], BOARDS)[:, None]
         lacking[..., :3] = np.where(
             board[..., None], lacking[..., :3].max(axis=-1, keepdims=True), lacking[..., :3]
@@ -206,7 +201,7 @@ class SpaceSampler:
         """Which scenes get as many further obstacles as are missing, and these, shape (N, rows, 7)."""
         here = self._course(course, u[..., -1], hardness, swept)
         rows = self._loose(u, here)
-        room = self._room(swept.outer, rows)
+        room = self._room(swept.outer, rows, np.inf)
         rows = _pushed(rows, here.place, hardness * np.maximum(room - 0.002, 0.0))
         key = np.where((room > 0.0) & _within_bounds(rows), u[..., -1], -1.0)
         order = np.argsort(-key, axis=-1, kind="stable")[:, : self._rows]
@@ -239,26 +234,22 @@ class SpaceSampler:
         centre[..., 2] = np.maximum(centre[..., 2], 0.02)
         return single(self.distribution, centre, u[..., [0, 1, 2, 4, 5, 3]])
 
-    def _room(self, bodies: Bodies, rows: Float) -> Float:
+    def _room(self, bodies: Bodies, rows: Float, most: float) -> Float:
         """How much nearer each row may come to the witness, which wants more room at its ends, shape (N, n), [m]."""
-        d = self.distribution
-        if not len(bodies.radii):
-            return np.full(rows.shape[:2], np.inf)
-        clearance = bodies.clearance(rows)
-        at_ends = clearance[..., [0, -1]].min(axis=-1) - d.end_margin
-        return np.asarray(np.minimum(clearance.min(axis=-1) - d.link_margin, at_ends))
+        margin = np.full(PHASES, self.distribution.link_margin)
+        margin[[0, -1]] = self.distribution.end_margin
+        return bodies.clearance(rows, most, margin)
 
     def _free(self, bodies: Bodies, rows: Float) -> Bool:
         """Which rows leave room for the witness and are within bounds, shape (N, n); what is none does."""
-        return ((self._room(bodies, rows) > 0.0) & _within_bounds(rows)) | (rows[..., -1] <= 0.0)
+        return ((self._room(bodies, rows, SOME) > 0.0) & _within_bounds(rows)) | (rows[..., -1] <= 0.0)
 
     def _blocks(self, start: Float, goal: Float, built: Float) -> Bool:
         """Which structures the straight movement hits, shape (N, STRUCTURES)."""
         line = start[:, None] + (goal - start)[:, None] * np.linspace(0.0, 1.0, PHASES // 2)[:, None]
         bodies = Swept.of(self.arm, line, whole_arm=self.whole_arm).outer
-        clearance = bodies.clearance(built.reshape(len(built), -1, 7)).min(axis=-1)
-        hit = (clearance < -IN_THE_WAY).reshape(built.shape[:3]) & (built[..., -1] > 0.0)
-        return np.asarray(hit.any(axis=-1))
+        clearance = bodies.clearance(built.reshape(len(built), -1, 7), -IN_THE_WAY)
+        return np.asarray((clearance < -IN_THE_WAY).reshape(built.shape[:3]).any(axis=-1))
 
 
 def _within_bounds(rows: Float) -> Bool:
