@@ -1,7 +1,8 @@
 """The nearest approach of links to obstacles over a movement, without looking at every link, obstacle and time.
 
-In between two looks a capsule comes no nearer than its ends have travelled; where even that could not make it the
-nearest of all, nothing is looked at. So the result is exact, over every time that is given.
+A movement is cut into short stretches. In each, a link stays inside the ball around it in the middle of the stretch,
+widened by how far its ends go from there; where even that ball is not the nearest of all, nothing is looked at. So the
+result is exact, over every time that is given.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.clearance import FAR, segment_distance_squared
+from viapoint.envs.nearness import Single, ball_bounds
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 
-STRETCH = 12
-"""Times from one look to the next."""
+STRETCH = 8
+"""Times of a stretch."""
+ROUNDING = 1e-5
+"""More than what rounding adds to a distance, [m]."""
 
 
 class Traced(NamedTuple):
@@ -26,7 +31,7 @@ class Traced(NamedTuple):
     """Shape (N, T, P, 3), [m]."""
     hand: int
     """Index of the hand's."""
-    links: NDArray[np.int64]
+    links: Index
     """Indices of both ends of each link's axis, shape (L, 2)."""
 
 
@@ -42,7 +47,7 @@ def nearest_approach(
     radii: tuple[float, ...],
     obstacles: Float,
     present: NDArray[np.bool_],
-    last: NDArray[np.int64] | None = None,
+    last: Index | None = None,
 ) -> Float:
     """Least clearance of links over a movement and all obstacles, shape (N,), [m]; at most FAR.
 
@@ -53,35 +58,56 @@ def nearest_approach(
         present: Whether a row is an obstacle, shape (N, n), bool.
         last: Index of each movement's last time, shape (N,); all by default.
     """
-    size, number = np.array(radii), traced.places.shape[1]
-    last = np.full(len(obstacles), number - 1) if last is None else last
-    looks = np.append(np.arange(0, number - 1, STRETCH), number - 1)
-    seen = traced.places[np.arange(len(last))[:, None], np.minimum(looks, last[:, None])]
-    clearance = np.stack(
-        [
-            np.sqrt(segment_distance_squared(seen[:, :, first], seen[:, :, second], obstacles))
-            - (obstacles[..., None, -1] + radius)
-            for (first, second), radius in zip(traced.links, radii, strict=True)
-        ],
-        axis=1,
-    )  # (N, L, n, looks)
-    clearance = np.where(present[:, None, :, None], np.minimum(clearance, FAR), FAR)
-    least: Float = clearance.min(axis=(1, 2, 3), initial=FAR)
-    if len(looks) < 2 or not present.any():
+    least = np.full(len(obstacles), FAR)
+    if not present.any():
         return least
-    travelled = _travelled(traced.places, looks)[:, traced.links].max(axis=2)
-    bound = 0.5 * (clearance[..., 1:] + clearance[..., :-1] - travelled[:, :, None])
-    each, link, row, stretch = np.nonzero((bound < least[:, None, None, None]) & (bound < FAR))
-    times = np.minimum(looks[stretch, None] + np.arange(1, STRETCH), looks[stretch + 1, None])
-    times = np.minimum(times, last[each, None])
-    first, second = (traced.places[each[:, None], times, traced.links[link, end][:, None]] for end in (0, 1))
-    near = np.sqrt(segment_distance_squared(first, second, obstacles[each, row][:, None])).min(axis=(1, 2))
-    np.minimum.at(least, each, near - (obstacles[each, row, -1] + size[link]))
+    places, links = traced.places, traced.links
+    last = np.full(len(least), places.shape[1] - 1) if last is None else last
+    starts = np.arange(0, places.shape[1], STRETCH)
+    looks = np.minimum(np.minimum(starts + STRETCH // 2, places.shape[1] - 1), last[:, None])
+    about = places.astype(np.float32, order="C")
+    seen = about[np.arange(len(least))[:, None], looks]
+    strayed = _strayed(about, seen)[:, :, links].max(axis=-1) + np.float32(ROUNDING)
+    first, second = seen[:, :, links[:, 0]], seen[:, :, links[:, 1]]
+    around = np.float32(0.5) * _norm(second - first) + strayed + np.array(radii, np.float32)
+    centres = np.moveaxis(np.float32(0.5) * (first + second), -1, 1).reshape(len(least), 3, -1)
+    bounds = ball_bounds(centres, around.reshape(len(least), -1), obstacles)
+    bounds -= np.where(present, obstacles[..., -1], -np.inf).astype(np.float32)[..., None]
+    size = np.array(radii)
+
+    def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:
+        """Of links from obstacles, shape (M, .), one after the other, at times of that shape."""
+        first, second = (places[each[:, None], times, links[link, end][:, None]] for end in (0, 1))
+        squared = segment_distance_squared(first, second, obstacles[each, row][:, None])[:, 0]
+        return np.asarray(np.sqrt(squared) - (obstacles[each, row, -1] + size[link])[:, None])
+
+    flat, each = bounds.reshape(len(least), -1), np.arange(len(least))
+    row, ball = np.divmod(flat.argmin(axis=-1), bounds.shape[-1])
+    stretch, link = np.divmod(ball, len(size))
+    nearest = clearance(each, row, link, looks[each, stretch, None])[:, 0]
+    np.minimum(least, np.where(present[each, row], nearest, FAR), out=least)
+    each, row, ball = np.nonzero(bounds < least[:, None, None])
+    stretch, link = np.divmod(ball, len(size))
+    nearest = clearance(each, row, link, looks[each, stretch, None])[:, 0]
+    np.minimum.at(least, each, nearest)
+    nearer = nearest - strayed[each, stretch, link] < least[each]
+    each, row, stretch, link = each[nearer], row[nearer], stretch[nearer], link[nearer]
+    times = np.minimum(starts[stretch, None] + np.arange(STRETCH), last[each, None])
+    np.minimum.at(least, each, clearance(each, row, link, times).min(axis=-1))
     return least
 
 
-def _travelled(places: Float, looks: NDArray[np.int64]) -> Float:
-    """How far each place travels between looks, shape (N, P, looks - 1), [m]."""
-    step = np.diff(places, axis=1)
-    length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
-    return np.moveaxis(np.add.reduceat(length, looks[:-1], axis=1), 1, 2)
+def _strayed(places: Single, seen: Single) -> Single:
+    """How far each place goes at most, in each stretch, from where it is seen, shape (N, K, P), [m]."""
+    most, least = places[:, ::STRETCH].copy(), places[:, ::STRETCH].copy()
+    for later in range(1, min(STRETCH, places.shape[1])):
+        here = places[:, later::STRETCH]
+        some = slice(0, here.shape[1])
+        np.maximum(most[:, some], here, out=most[:, some])
+        np.minimum(least[:, some], here, out=least[:, some])
+    return _norm(np.maximum(most - seen, seen - least))
+
+
+def _norm(vectors: Single) -> Single:
+    x, y, z = (vectors[..., i] for i in range(3))
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
