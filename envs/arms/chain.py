@@ -1,7 +1,7 @@
 """A chain of hinges: where its points are, and what torques move it.
 
-Positions, velocities and torques are computed component by component, so that every operation works on whole batches,
-and what is constant and zero in a robot's dimensions is never multiplied. NumPy arrays and torch tensors alike.
+Vectors have their three components first, apart in memory, so that every operation works on whole batches, and what is
+constant and zero in a robot's dimensions is never multiplied. NumPy arrays and torch tensors alike.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from viapoint.envs._arrays import Array, namespace_of
 
-Vector = list[Array]
-"""Three components, an array of shape (...) or a number each."""
+Vector = Array
+"""Three components, an array of shape (3, ...) or three arrays."""
 Constants = tuple[float, float, float]
 
 
@@ -32,7 +34,7 @@ class Frame(NamedTuple):
 
     def place(self, point: Constants) -> Vector:
         """A constant point of this frame, in the world."""
-        return _sum(self.origin, self.turned(point))
+        return self.origin + self.turned(point)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,14 +63,14 @@ class Chain:
         """Every joint's frame at angles of shape (..., J), [rad]."""
         xp = namespace_of(joints)
         frames: list[Frame] = []
-        cosines, sines = xp.cos(joints), xp.sin(joints)
-        for index, hinge in enumerate(self.hinges):
-            before = frames[-1] if frames else _world()
+        angles = xp.stack([joints[..., index] for index in range(len(self.hinges))], axis=0)
+        cosines, sines = xp.cos(angles), xp.sin(angles)
+        units = xp.reshape(xp.asarray(np.eye(3), dtype=joints.dtype), (3, 3, *[1] * (joints.ndim - 1)))
+        before = Frame(units[0], units[1], units[2], xp.zeros_like(units[0]))
+        for hinge, cosine, sine in zip(self.hinges, cosines, sines, strict=True):
             x, y, z = (before.turned(axis) for axis in hinge.turn)
-            cosine, sine = cosines[..., index], sines[..., index]
-            turned_x = [cosine * u + sine * v for u, v in zip(x, y, strict=True)]
-            turned_y = [cosine * v - sine * u for u, v in zip(x, y, strict=True)]
-            frames.append(Frame(turned_x, turned_y, z, before.place(hinge.offset)))
+            before = Frame(cosine * x + sine * y, cosine * y - sine * x, z, before.place(hinge.offset))
+            frames.append(before)
         return frames
 
     def points(self, joints: Array, places: tuple[tuple[int, Constants], ...]) -> Array:
@@ -79,12 +81,12 @@ class Chain:
             places: Index of the joint and point in its frame [m], P times.
         """
         xp = namespace_of(joints)
-        frames, nothing = self.frames(joints), 0.0 * joints[..., 0]
+        frames = self.frames(joints)
         placed = [frames[index].place(point) for index, point in places]
-        # Components apart in memory: they are written, and mostly read, one after the other.
-        parts = xp.stack([part + nothing for point in placed for part in point], axis=0)
-        apart = xp.reshape(parts, (len(places), 3, *joints.shape[:-1]))
-        return xp.moveaxis(apart, (0, 1), (-2, -1))
+        # Components apart in memory: they are mostly read one after the other.
+        shape = (3, *joints.shape[:-1])
+        whole = [part if part.shape == shape else xp.broadcast_to(part, shape) for part in placed]
+        return xp.moveaxis(xp.stack(whole, axis=0), (0, 1), (-2, -1))
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
         """What moves the chain, and what only holds it against gravity, shape (..., J) each, [N m].
@@ -141,17 +143,11 @@ GRAVITY = 9.81
 """[m/s^2], downwards along z."""
 
 
-@functools.cache
-def _world() -> Frame:
-    """Where the chain begins."""
-    return Frame([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
-
-
 def _resisting(frame: Frame, hinge: Hinge, vector: Vector) -> Vector:
     """A link's inertia times a vector of the world."""
     local = [_dot(axis, vector) for axis in (frame.x, frame.y, frame.z)]
-    times = [sum(i * v for i, v in zip(row, local, strict=True)) for row in hinge.inertia]
-    return [sum(axis[k] * part for axis, part in zip(frame[:3], times, strict=True)) for k in range(3)]
+    times = [_added([i * v for i, v in zip(row, local, strict=True)]) for row in hinge.inertia]
+    return [_added([axis[k] * part for axis, part in zip(frame[:3], times, strict=True)]) for k in range(3)]
 
 
 def _swept(spin: Vector, turn: Vector, arm: Vector) -> Vector:
@@ -162,9 +158,7 @@ def _swept(spin: Vector, turn: Vector, arm: Vector) -> Vector:
 def _combined(axes: tuple[Vector, Vector, Vector], weights: Constants) -> Vector:
     """Axes times constant weights, where these are not zero."""
     used = [(axis, weight) for axis, weight in zip(axes, weights, strict=True) if weight != 0.0]
-    return [
-        _added([axis[k] if weight == 1.0 else weight * axis[k] for axis, weight in used]) for k in range(3)
-    ]
+    return _added([axis if weight == 1.0 else weight * axis for axis, weight in used] or [0.0 * axes[0]])
 
 
 def _sum(first: Vector, second: Vector) -> Vector:
@@ -180,8 +174,7 @@ def _dot(first: Vector, second: Vector) -> Array:
 
 
 def _added(parts: list[Array]) -> Array:
-    """Their sum; that of none is 0."""
-    return functools.reduce(operator.add, parts) if parts else 0.0
+    return functools.reduce(operator.add, parts)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
