@@ -32,31 +32,53 @@ class Bodies(NamedTuple):
     radii: tuple[float, ...]
     """Of the B links, [m]."""
 
-    def clearance(self, rows: Float, most: float, margin: Float | float = 0.0) -> Float:
-        """Least clearance from each of n obstacles over time, less a margin, shape (N, n), [m]; no more than `most`.
+    def clearance(
+        self,
+        rows: Float,
+        most: float,
+        margin: Float | float = 0.0,
+        *,
+        floor: float = -np.inf,
+        together: int = 1,
+    ) -> Float:
+        """Least clearance over time from each of n obstacles, or from those that belong together, less a margin.
 
         A link is at least as far away as the ball around it. Only balls that come near enough to matter are looked
-        into, so a smaller `most` is quicker.
+        into, so narrow bounds are quick.
 
         Args:
             rows: Obstacles, shape (N, n, 7), [m]; those without a radius are none, and as far away as `most`.
             most: Greatest number that matters, [m].
             margin: To subtract at each time, shape (T,), or at all of them, [m].
+            floor: Below it one number is as good as another, [m].
+            together: How many rows belong together.
+
+        Returns:
+            Shape (N, n / together), [m]; no more than `most`.
         """
-        least, present = np.full(rows.shape[:2], most), rows[..., -1] > 0.0
-        if not len(self.radii) or not present.any():
+        least, radii = np.full((len(rows), rows.shape[1] // together), most), rows[..., -1]
+        if not len(self.radii) or not (radii > 0.0).any():
             return least
         margins = np.broadcast_to(margin, self.ends.shape[1:2]).repeat(len(self.radii))
         bound = ball_bounds(*self._balls(margins), rows)
+        bound -= np.where(radii > 0.0, radii, -np.inf).astype(np.float32)[..., None]
+        places = bound.shape[-1]
+        bound = bound.reshape(*least.shape, together * places)
         nearest = bound.argmin(axis=-1)
-        lowest = np.take_along_axis(bound, nearest[..., None], axis=-1)[..., 0]
-        scene, row = np.nonzero(present & (lowest < most + rows[..., -1]))
-        first = nearest[scene, row]
-        self._look(least, rows, (scene, row), first, margins)
-        nearer = bound[scene, row] < (least + rows[..., -1])[scene, row, None]
-        nearer[np.arange(len(first)), first] = False
+        scene, one = np.nonzero(np.take_along_axis(bound, nearest[..., None], axis=-1)[..., 0] < most)
+
+        def look(scene: Index, one: Index, ball: Index) -> None:
+            row, ball = together * one + ball // places, ball % places
+            clearance = self._between(rows[scene, row], scene, ball) - margins[ball]
+            np.minimum.at(least, (scene, one), clearance)
+
+        look(scene, one, nearest[scene, one])
+        open_ = least[scene, one] >= floor
+        scene, one = scene[open_], one[open_]
+        nearer = bound[scene, one] < least[scene, one, None].astype(np.float32)
+        nearer[np.arange(len(one)), nearest[scene, one]] = False
         which, ball = np.nonzero(nearer)
-        self._look(least, rows, (scene[which], row[which]), ball, margins)
+        look(scene[which], one[which], ball)
         return least
 
     def every_other(self) -> Bodies:
@@ -71,15 +93,13 @@ class Bodies(NamedTuple):
         around = np.tile(half + np.array(self.radii) + ROUNDING, self.ends.shape[1]) + margins
         return centre.reshape(len(centre), 3, -1), around.astype(np.float32)
 
-    def _look(
-        self, least: Float, rows: Float, which: tuple[Index, Index], ball: Index, margins: Float
-    ) -> None:
-        """Lessen what some obstacles, one after the other, have to the links in balls."""
-        obstacles, body = rows[which], ball % len(self.radii)
-        ends = self.ends[which[0], ball // len(self.radii), body][:, :, None]
+    def _between(self, obstacles: Float, scene: Index, ball: Index) -> Float:
+        """Clearance of obstacles, shape (M, 7), each from one link at one time, shape (M,), [m]."""
+        body = ball % len(self.radii)
+        ends = self.ends[scene, ball // len(self.radii), body][:, :, None]
         squared = segment_distance_squared(ends[:, 0], ends[:, 1], obstacles[:, None].astype(np.float32))
         distance = np.sqrt(squared[:, 0, 0]) - np.array(self.radii, np.float32)[body]
-        np.minimum.at(least, which, distance.astype(np.float64) - obstacles[:, -1] - margins[ball])
+        return np.asarray(distance.astype(np.float64) - obstacles[:, -1])
 
 
 class Swept(NamedTuple):

@@ -37,6 +37,10 @@ class Course(NamedTuple):
         """Places on the straight line, shape (N, K, 3), [m]."""
         return np.asarray(self.start + (self.goal - self.start) * fraction[..., None])
 
+    def take(self, rows: Any) -> Course:
+        """The scenes at `rows`, an index, slice or mask."""
+        return Course(*(part[rows] for part in self))
+
 
 class Built(NamedTuple):
     """What is built at K places of N scenes."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.space_bodies import Bodies, Swept
-from viapoint.envs.space_distribution import BOARDS, SpaceDistribution
+from viapoint.envs.space_distribution import BOARDS, FAMILIES, SpaceDistribution
 from viapoint.envs.space_draws import ENDS, PHASES, WITNESSES, draw_ends, draw_path
 from viapoint.envs.space_obstacles import NUMBERS, PARTS, Course, single, structure
 
@@ -147,17 +147,13 @@ class SpaceSampler:
         general, hardness = u[0], u[0][:, :1] ** self.distribution.ease
         swept = Swept.of(self.arm, path, whole_arm=self.whole_arm)
         built = self._built(general[:, 1], _each(u[1], STRUCTURES), hardness, (start, goal, path), swept)
-        fits: Any = (
-            self._free(swept.outer, built.reshape(number, -1, 7)).reshape(built.shape[:3]).all(axis=-1)
-        )
-        some = np.flatnonzero(fits.any(axis=-1))
-        if len(some):
-            fits[some] &= self._blocks(start[some], goal[some], built[some] * fits[some, :, None, None])
+        fits = self._free(swept.outer, built)
+        self._keep_blocking(fits, start, goal, built)
         wanted = least + np.floor((most - least + 1) * general[:, 2])
         chosen = built[np.arange(number), fits.argmax(axis=-1)]
         chosen[wanted == 0.0] = 0.0
         good = fits.any(axis=-1) | (wanted == 0.0)
-        good &= self._free(swept.inner, chosen).all(axis=-1)
+        good &= self._free(swept.inner, chosen[:, None])[:, 0]
         some, others = np.flatnonzero(good), np.zeros((number, self._rows, 7))
         missing = np.maximum(wanted - (chosen[..., -1] > 0.0).sum(axis=-1), 0.0)
         enough, others[some] = self._others(
@@ -173,22 +169,21 @@ class SpaceSampler:
     def _built(
         self, family: Float, u: Float, hardness: Float, course: tuple[Float, Float, Float], swept: Swept
     ) -> Float:
-        """What the drawn families build, moved out of the witness's way, shape (N, STRUCTURES, PARTS, 7)."""
-        which = self._which(family)
+        """What the drawn families build, moved out of the witness's way, shape (N, STRUCTURES, up to PARTS, 7)."""
+        names = self._families[self._which(family)]
         rows, retreat = np.zeros((*u.shape[:2], PARTS, 7)), np.zeros((*u.shape[:2], PARTS, 3))
-        for index, name in enumerate(self._families):
-            some = np.flatnonzero(which == index)
-            if not len(some):
-                continue
-            start, goal, path = (part[some] for part in course)
-            here = self._course((start, goal, path), u[some, :, -1], hardness[some], swept.take(some))
+        here = self._course(course, u[..., -1], hardness, swept)
+        most = max(FAMILIES[name] for name in set(names))
+        for name in np.unique(names):
+            some = names == name
             rows[some], retreat[some] = structure(
-                name, self.distribution, here, u[some, :, :NUMBERS], self.arm.hand_radius
+                name, self.distribution, here.take(some), u[some, :, :NUMBERS], self.arm.hand_radius
             )
+        rows, retreat = rows[:, :, :most], retreat[:, :, :most]
         enough = self.distribution.link_margin + 0.002
         clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7), enough)
         lacking = np.maximum((enough - clearance).reshape(rows.shape[:3]), 0.0)
-        board = np.isin(self._families[which], BOARDS)[:, None]
+        board = np.isin(names, BOARDS)[:, None]
         lacking[..., :3] = np.where(
             board[..., None], lacking[..., :3].max(axis=-1, keepdims=True), lacking[..., :3]
         )
@@ -199,22 +194,45 @@ class SpaceSampler:
         self, u: Float, course: tuple[Float, Float, Float], hardness: Float, swept: Swept, missing: Float
     ) -> tuple[Bool, Float]:
         """Which scenes get as many further obstacles as are missing, and these, shape (N, rows, 7)."""
-        here = self._course(course, u[..., -1], hardness, swept)
-        rows = self._loose(u, here)
+        order = np.argsort(-u[..., -1], axis=-1, kind="stable")
+        # Mostly there are enough among the first ones.
+        enough, chosen = self._others_of(u, order[:, : self._rows], course, hardness, swept, missing)
+        left = np.flatnonzero(~enough)
+        if len(left):
+            start, goal, path = (part[left] for part in course)
+            enough[left], chosen[left] = self._others_of(
+                u[left], order[left], (start, goal, path), hardness[left], swept.take(left), missing[left]
+            )
+        return enough & self._free(swept.inner, chosen[:, None])[:, 0], chosen
+
+    def _others_of(
+        self,
+        u: Float,
+        order: Index,
+        course: tuple[Float, Float, Float],
+        hardness: Float,
+        swept: Swept,
+        missing: Float,
+    ) -> tuple[Bool, Float]:
+        """The same of some of them, in their order, and as the links near the hand allow."""
+        u = np.take_along_axis(u, order[..., None], axis=1)
+        here = self._course(course, u[..., -1], hardness)
+        rows = self._loose(u, here, order % 2 == 0)
         room = self._room(swept.outer, rows, np.inf)
         rows = _pushed(rows, here.place, hardness * np.maximum(room - 0.002, 0.0))
-        key = np.where((room > 0.0) & _within_bounds(rows), u[..., -1], -1.0)
-        order = np.argsort(-key, axis=-1, kind="stable")[:, : self._rows]
-        used = np.arange(order.shape[1]) < missing[:, None]
-        enough = (np.take_along_axis(key, order, axis=1) >= 0.0).sum(axis=-1) >= missing
-        chosen = np.where(used[..., None], np.take_along_axis(rows, order[..., None], axis=1), 0.0)
-        return enough & self._free(swept.inner, chosen).all(axis=-1), chosen
+        good = (room > 0.0) & _within_bounds(rows)
+        which = np.argsort(~good, axis=-1, kind="stable")[:, : self._rows]
+        used = np.arange(which.shape[1]) < missing[:, None]
+        chosen = np.where(used[..., None], np.take_along_axis(rows, which[..., None], axis=1), 0.0)
+        return good.sum(axis=-1) >= missing, chosen
 
     def _which(self, u: Float) -> NDArray[np.int64]:
         """Index of the family that a uniform number stands for."""
         return np.minimum((u * len(self._families)).astype(np.int64), len(self._families) - 1)
 
-    def _course(self, course: tuple[Float, Float, Float], u: Float, hardness: Float, swept: Swept) -> Course:
+    def _course(
+        self, course: tuple[Float, Float, Float], u: Float, hardness: Float, swept: Swept | None = None
+    ) -> Course:
         """The movement around places that are drawn on the middle of the witness."""
         start, goal, path = course
         phase = (0.3 * PHASES + 0.4 * PHASES * u).astype(np.int64)
@@ -224,32 +242,45 @@ class SpaceSampler:
         length = np.sqrt((step**2).sum(axis=-1, keepdims=True))
         heading = np.where(length > 1e-6, step / np.maximum(length, 1e-6), (1.0, 0.0, 0.0))
         place = path[each, phase]
-        return Course(start[:, None], goal[:, None], place, heading, swept.top(phase, place), hardness)
+        top = place[..., 2] if swept is None else swept.top(phase, place)
+        return Course(start[:, None], goal[:, None], place, heading, top, hardness)
 
-    def _loose(self, u: Float, here: Course) -> Float:
-        """Spheres, posts and bars, a half about the straight line, a half about the witness, shape (N, OTHERS, 7)."""
+    def _loose(self, u: Float, here: Course, about: Bool) -> Float:
+        """Spheres, posts and bars, some about the straight line, the others about the witness, shape (N, n, 7)."""
         away = self.distribution.spread * (2.0 * u[..., 3:6] - 1.0)
-        about = (np.arange(OTHERS) % 2 == 0)[:, None]
-        centre = np.where(about, here.on_line(u[..., -1]), here.place) + away
+        centre = np.where(about[..., None], here.on_line(u[..., -1]), here.place) + away
         centre[..., 2] = np.maximum(centre[..., 2], 0.02)
         return single(self.distribution, centre, u[..., [0, 1, 2, 4, 5, 3]])
 
-    def _room(self, bodies: Bodies, rows: Float, most: float) -> Float:
+    def _room(self, bodies: Bodies, rows: Float, most: float, **how: Any) -> Float:
         """How much nearer each row may come to the witness, which wants more room at its ends, shape (N, n), [m]."""
         margin = np.full(PHASES, self.distribution.link_margin)
         margin[[0, -1]] = self.distribution.end_margin
-        return bodies.clearance(rows, most, margin)
+        return bodies.clearance(rows, most, margin, **how)
 
-    def _free(self, bodies: Bodies, rows: Float) -> Bool:
-        """Which rows leave room for the witness and are within bounds, shape (N, n); what is none does."""
-        return ((self._room(bodies, rows, SOME) > 0.0) & _within_bounds(rows)) | (rows[..., -1] <= 0.0)
+    def _free(self, bodies: Bodies, built: Float) -> Bool:
+        """Which of K structures leave room for the witness and are within bounds, shape (N, K), given (N, K, ., 7)."""
+        number, several, parts = built.shape[:3]
+        inside: Any = (_within_bounds(built) | (built[..., -1] <= 0.0)).all(axis=-1)
+        rows = np.where(inside[..., None, None], built, 0.0).reshape(number, several * parts, 7)
+        return inside & (self._room(bodies, rows, SOME, floor=0.0, together=parts) > 0.0)
 
-    def _blocks(self, start: Float, goal: Float, built: Float) -> Bool:
-        """Which structures the straight movement hits, shape (N, STRUCTURES)."""
-        line = start[:, None] + (goal - start)[:, None] * np.linspace(0.0, 1.0, PHASES // 2)[:, None]
+    def _keep_blocking(self, fits: Bool, start: Float, goal: Float, built: Float) -> None:
+        """Strike out the first structures that the straight movement does not hit, shape (N, STRUCTURES)."""
+        left = np.flatnonzero(fits.any(axis=-1))
+        if not len(left):
+            return
+        line = start[left, None] + (goal - start)[left, None] * np.linspace(0.0, 1.0, PHASES // 2)[:, None]
         bodies = Swept.of(self.arm, line, whole_arm=self.whole_arm).outer
-        clearance = bodies.clearance(built.reshape(len(built), -1, 7), -IN_THE_WAY)
-        return np.asarray((clearance < -IN_THE_WAY).reshape(built.shape[:3]).any(axis=-1))
+        while len(left):
+            first = fits[left].argmax(axis=-1)
+            depth = bodies.clearance(
+                built[left, first], -IN_THE_WAY, floor=-IN_THE_WAY, together=built.shape[2]
+            )
+            missed = depth[:, 0] >= -IN_THE_WAY
+            fits[left[missed], first[missed]] = False
+            more = missed & fits[left].any(axis=-1)
+            left, bodies = left[more], Bodies(bodies.ends[more], bodies.radii)
 
 
 def _within_bounds(rows: Float) -> Bool:
