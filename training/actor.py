@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
@@ -11,8 +13,9 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from torch import Tensor, nn
 
 from viapoint.envs.task import Task
+from viapoint.training import graphs
 from viapoint.training.anchors import anchors_of
-from viapoint.training.features import Look, fares_size, look_at, scene_sizes, scene_view
+from viapoint.training.features import Look, SceneView, fares_size, look_at, scene_sizes, scene_view
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation
 
@@ -63,16 +66,24 @@ class ViaActor(BaseModel):
 
     def look(self, observation: Observation) -> Look:
         """What the actor sees of its anchors."""
-        return self._tensors(self.anchors.look(arrays(observation)))
+        return self._seen(self.anchors.look(arrays(observation)))
 
     def look_at(self, observation: Observation, actions: Tensor) -> Look:
         """What it sees of actions of its own, shape (B, A, m)."""
-        inside = actions.detach().clamp(-0.999, 0.999).cpu().numpy()
-        return self._tensors(look_at(arrays(observation), inside, self.task))
+        inside = arrays({"": actions.detach().clamp(-0.999, 0.999)})[""]
+        return self._seen(look_at(arrays(observation), inside, self.task))
 
     def encode(self, observation: Observation) -> Tensor:
         """The scene as the operator takes it, shape (B, width)."""
-        return cast(Tensor, self.scene(self.encoder(scene_view(observation, self.task))))
+        return self.encode_view(self.view(observation))
+
+    def view(self, observation: Observation) -> SceneView:
+        """The scene as networks see it."""
+        return SceneView(*tensors(scene_view(arrays(observation), self.task), self.scene.weight))
+
+    def encode_view(self, view: SceneView) -> Tensor:
+        """The same of a scene that is seen already."""
+        return cast(Tensor, self.scene(self.encoder(view)))
 
     def improve(self, scene: Tensor, look: Look) -> Improved:
         """Better movements, and what the ones looked at promise and are worth."""
@@ -83,19 +94,19 @@ class ViaActor(BaseModel):
 
     def propose(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """The movements of the last round, shape (B, kept, m), and their worth, shape (B, kept)."""
-        scene, look = self.encode(observation), self.look(observation)
+        seen = arrays(observation)
+        scene, look = self.encode(seen), self.look(seen)
         for _ in range(self.rounds):
-            look = self.look_at(observation, best(self.improve(scene, look), self.kept))
+            look = self.look_at(seen, best(self.improve(scene, look), self.kept))
         return look.actions, self.improve(scene, look).worth + look.known
 
-    def _tensors(self, look: Look) -> Look:
-        look = Look(*(torch.as_tensor(part, dtype=torch.float32, device=self.device) for part in look))
+    def _seen(self, look: Look) -> Look:
+        look = Look(*tensors(look, self.scene.weight))
         return look if self.sighted else look._replace(fares=torch.zeros_like(look.fares))
 
     def forward(self, observation: Observation) -> Tensor:
         """The most worthy action, shape (B, m)."""
-        actions, worth = self.propose(observation)
-        return actions[torch.arange(len(actions)), worth.argmax(dim=-1)]
+        return most(*self.propose(observation))
 
     def _predict(self, observation: Observation, deterministic: bool = False) -> Tensor:
         return cast(Tensor, self(observation))
@@ -103,11 +114,32 @@ class ViaActor(BaseModel):
 
 def best(improved: Improved, count: int) -> Tensor:
     """The better movements that promise most, shape (B, count, m)."""
-    rows = torch.arange(len(improved.promise)).unsqueeze(-1)
     chosen = improved.promise.topk(min(count, improved.promise.shape[1]), dim=-1).indices
-    return improved.actions[rows, chosen]
+    return _at(improved.actions, chosen)
+
+
+def most(actions: Tensor, worth: Tensor) -> Tensor:
+    """The action that is worth most in each scene, shape (B, m), of actions (B, A, m) and their worth (B, A)."""
+    return _at(actions, worth.argmax(dim=-1, keepdim=True))[:, 0]
+
+
+def _at(actions: Tensor, chosen: Tensor) -> Tensor:
+    return actions.gather(1, chosen.unsqueeze(-1).expand(-1, -1, actions.shape[-1]))
 
 
 def arrays(observation: Observation) -> Observation:
-    """Looking is done in NumPy: there are no gradients, and small arrays are dealt with faster."""
-    return {name: part.detach().cpu().numpy() for name, part in observation.items()}
+    """Looking is done in NumPy, but for graphs: there are no gradients, and small arrays are dealt with faster."""
+    if graphs.is_drawn():
+        return observation
+    return {
+        name: part if type(part) is np.ndarray else part.detach().cpu().numpy()
+        for name, part in observation.items()
+    }
+
+
+def tensors(parts: Iterable[Any], like: Tensor) -> Iterator[Tensor]:
+    """What was seen as tensors where `like` is, numbers in its precision."""
+    for part in parts:
+        tensor = torch.as_tensor(part)
+        kind = like.dtype if tensor.is_floating_point() else tensor.dtype
+        yield tensor if tensor.dtype is kind and like.is_cpu else tensor.to(device=like.device, dtype=kind)

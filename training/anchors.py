@@ -7,14 +7,12 @@ from collections.abc import Container
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs._arrays import clamp
+from viapoint.envs._arrays import clamp, namespace_of
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.task import Task
 from viapoint.training.features import Look, look_along, look_at
 from viapoint.training.movements import Movements, direction, effort_of, on_the_way
-from viapoint.training.sight import INSTANTS
-
-Float = NDArray[np.float32]
+from viapoint.training.sight import INSTANTS, Array, Observation
 
 ALONG = {2: (-0.32, -0.16, 0.0, 0.16, 0.32), 3: (-0.25, 0.0, 0.25)}
 HEIGHT = {2: (0.12, 0.25, 0.40, 0.55, 0.70, 0.85), 3: (0.20, 0.45, 0.75)}
@@ -64,24 +62,26 @@ class Anchors:
     def __len__(self) -> int:
         return len(self.paths)
 
-    def look(self, observation: dict[str, Float]) -> Look:
-        """See how they would fare in each of B scenes; the observation is of NumPy arrays."""
+    def look(self, observation: Observation) -> Look:
+        """See how they would fare in each of B scenes."""
         start, line = observation["hand"], observation["goal"] - observation["hand"]
-        distance = np.sqrt((line * line).sum(axis=-1))[:, None, None]
-        scaled = np.stack(frame(line), axis=-2) * distance
-        hand = start[:, None, None] + self.paths @ scaled[:, None]
+        xp = namespace_of(line)
+        distance = xp.sqrt(xp.sum(line * line, axis=-1))[:, None, None]
+        scaled = xp.stack(frame(line), axis=-2) * distance
+        hand = start[:, None, None] + xp.asarray(self.paths) @ scaled[:, None]
         actions = self.actions(observation)
-        log_jerk = np.broadcast_to(self.log_jerk, actions.shape[:2])
-        duration = np.full_like(log_jerk, self.task.action.centre_duration)
+        log_jerk = xp.broadcast_to(xp.asarray(self.log_jerk), actions.shape[:2])
+        duration = xp.full_like(log_jerk, self.task.action.centre_duration)
         moves = Movements(hand, duration, log_jerk, effort_of(log_jerk, duration, self.task))
         return look_along(observation, actions, moves, self.task)
 
-    def actions(self, observation: dict[str, Float]) -> Float:
+    def actions(self, observation: Observation) -> Array:
         """In each of B scenes, shape (B, A, m), inside (-1, 1)."""
         line = observation["goal"] - observation["hand"]
-        vias = self.vias * np.sqrt((line * line).sum(axis=-1))[:, None, None]
-        rest = np.zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]), dtype=vias.dtype)
-        return np.asarray(clamp(np.concatenate((vias, rest), axis=-1), -0.97, 0.97))
+        xp = namespace_of(line)
+        vias = xp.asarray(self.vias) * xp.sqrt(xp.sum(line * line, axis=-1))[:, None, None]
+        rest = xp.zeros((*vias.shape[:2], self.task.action.size - vias.shape[-1]), dtype=vias.dtype)
+        return clamp(xp.concat((vias, rest), axis=-1), -0.97, 0.97)
 
 
 class AnchorsOnTheWay:
@@ -115,16 +115,17 @@ class AnchorsOnTheWay:
     def __len__(self) -> int:
         return len(self.vias)
 
-    def actions(self, observation: dict[str, Float]) -> Float:
+    def actions(self, observation: Observation) -> Array:
         """In each of B scenes, shape (B, A, m), inside (-1, 1)."""
         line = direction(observation)
-        distance = np.maximum(np.sqrt((line * line).sum(axis=-1)), NARROW)[:, None, None]
-        vias = self.vias * distance
-        pace = np.broadcast_to(self.pace, (*vias.shape[:2], 1))
-        return np.asarray(clamp(np.concatenate((vias, pace), axis=-1), -0.97, 0.97))
+        xp = namespace_of(line)
+        distance = xp.maximum(xp.sqrt(xp.sum(line * line, axis=-1)), NARROW)[:, None, None]
+        vias = xp.asarray(self.vias) * distance
+        pace = xp.broadcast_to(xp.asarray(self.pace), (*vias.shape[:2], 1))
+        return clamp(xp.concat((vias, pace), axis=-1), -0.97, 0.97)
 
-    def look(self, observation: dict[str, Float]) -> Look:
-        """See how they would fare in each of B scenes; the observation is of NumPy arrays."""
+    def look(self, observation: Observation) -> Look:
+        """See how they would fare in each of B scenes."""
         return look_at(observation, self.actions(observation), self.task)
 
 

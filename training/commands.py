@@ -51,6 +51,13 @@ class Agent(NamedTuple):
         name = f"agent, ranks {candidates}" if candidates else "agent"
         return agent_method(name, self.model, candidates)
 
+    def compile_decisions(self, candidates: int = 0) -> None:
+        """See :meth:`viapoint.training.policies.ViaPolicy.compile_decisions`."""
+        if not hasattr(self.model.policy, "compile_decisions"):
+            kind = type(self.model).__name__
+            raise ValueError(f"decisions are compiled of ViaTD3 only; this agent is a {kind}")
+        self.model.policy.compile_decisions(candidates)
+
 
 def find_agent(run: Path | None, pretrained: str | None) -> Agent:
     """The agent of a run folder, or the one shipped for an environment.
@@ -107,7 +114,14 @@ def evaluate(config: EvaluateConfig) -> None:
         elif name != "agent":
             methods.append(make_method(name, env_id, **env_kwargs))
         elif agent:
-            methods += [agent.method(count) for count in sorted({0, config.candidates})]
+            for count in sorted({0, config.candidates}):
+                methods.append(agent.method(count))
+                if config.compiled:
+                    print(
+                        f"{methods[-1].name}: compiling its decision, which takes a minute or two",
+                        file=sys.stderr,
+                    )
+                    agent.compile_decisions(count)
     with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
         result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()

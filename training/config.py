@@ -156,6 +156,8 @@ class EvaluateConfig:
     """agent, straight, constant, random, random16, random80, planner, ompl."""
     candidates: int = 0
     """If not 0, the agent gets a second row, in which its critic ranks so many actions at each decision."""
+    compiled: bool = False
+    """Whether single decisions are made into machine code first: a minute or two for each row of the agent."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int | None = None

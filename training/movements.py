@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint import primitives
 from viapoint.envs._arrays import namespace_of
-from viapoint.envs.action import frame
+from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.task import Task
+from viapoint.training import graphs
 from viapoint.training.sight import INSTANTS, Array, Observation
 
 SHORT = 0.02
@@ -59,8 +60,9 @@ def direction(observation: Observation) -> Array:
 
 def _at_rest(observation: Observation, actions: Array, task: Task) -> Movements:
     start, goal = (_for_each(observation[name], actions) for name in ("hand", "goal"))
-    plan = task.action.decode(actions, start, goal)
-    trajectory, line = plan.trajectory(), goal - start
+    drawn, line = graphs.is_drawn(), goal - start
+    plan = (graphs.decoded if drawn else ActionLayout.decode)(task.action, actions, start, goal)
+    trajectory = graphs.through(*plan) if drawn else plan.trajectory()
     duration = namespace_of(actions).sum(plan.durations, axis=-1)
     return _seen(trajectory, duration, line, task)
 
@@ -86,8 +88,9 @@ def _on_the_way(observation: Observation, actions: Array, task: Task) -> Movemen
     duration = xp.minimum(xp.maximum(remaining * factor, xp.full_like(factor, 0.5 * low)), longest)
     points = xp.stack([*waypoints, goal], axis=-2)
     began = {"start_velocity": velocity, "start_acceleration": acceleration}
-    durations = primitives.passage_durations(points, duration, **began)
-    trajectory = primitives.through(points, durations, **began)
+    maker: Any = graphs if graphs.is_drawn() else primitives
+    durations = maker.passage_durations(points, duration, **began)
+    trajectory = maker.through(points, durations, **began)
     found = _seen(trajectory, duration, xp.broadcast_to(line[:, None], goal.shape), task)
     cost = trajectory.cost() * layout.centre_duration**5 / (360.0 * NOMINAL**2)
     return found._replace(effort=xp.log(1.0 + cost))
@@ -98,7 +101,8 @@ def _seen(trajectory: primitives.Trajectory, duration: Array, line: Array, task:
     ratio = trajectory.cost() * duration**5 / (360.0 * xp.sum(line * line, axis=-1))
     log_jerk = xp.log(xp.maximum(ratio, xp.ones_like(ratio)))
     instants = duration[..., None] * xp.asarray(INSTANTS, dtype=duration.dtype)
-    return Movements(trajectory(instants), duration, log_jerk, effort_of(log_jerk, duration, task))
+    path = graphs.places(trajectory, instants) if graphs.is_drawn() else trajectory(instants)
+    return Movements(path, duration, log_jerk, effort_of(log_jerk, duration, task))
 
 
 def effort_of(log_jerk: Array, duration: Array, task: Task) -> Array:

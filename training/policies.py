@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -13,8 +14,18 @@ from torch import Tensor, nn
 
 from viapoint.envs.arms import ARMS
 from viapoint.envs.task import Task
-from viapoint.training.actor import Improved, ViaActor, arrays, best
-from viapoint.training.features import GEOMETRY, Foresight, KnownReward, foresee, scene_sizes, scene_view
+from viapoint.training import graphs
+from viapoint.training.actor import ViaActor, arrays, best, most, tensors
+from viapoint.training.features import (
+    GEOMETRY,
+    Foresight,
+    KnownReward,
+    Look,
+    SceneView,
+    foresee,
+    scene_sizes,
+    scene_view,
+)
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation, Sight
 
@@ -55,27 +66,27 @@ class ViaCritic(BaseModel):
 
     def judge(self, observation: Observation, actions: Tensor) -> Judgement:
         """What to expect of H actions in each of B scenes, shape (B, H)."""
-        foresight = self._foresee(observation, actions)
+        view = SceneView(*tensors(scene_view(arrays(observation), self.task), self.scene.weight))
+        return self.judge_seen(view, self.foresee(observation, actions), actions)
+
+    def judge_seen(self, view: SceneView, foresight: Foresight, actions: Tensor) -> Judgement:
+        """The same of scenes and movements that are seen already."""
         features = foresight.vector() if self.sighted else torch.zeros_like(foresight.vector())
-        scene = self.scene(self.encoder(scene_view(observation, self.task))).unsqueeze(1)
+        scene = self.scene(self.encoder(view)).unsqueeze(1)
         learned = self.value(scene + self.movement(torch.cat((features, actions), dim=-1))).squeeze(-1)
         known = foresight.reward
         if not self.sighted:
             known = known._replace(clearance=torch.zeros_like(learned))
         return Judgement(learned, known)
 
-    def _foresee(self, observation: Observation, actions: Tensor) -> Foresight:
+    def foresee(self, observation: Observation, actions: Tensor) -> Foresight:
         """In torch where gradients are asked for, otherwise in NumPy, which deals with small arrays faster."""
-        if actions.requires_grad and torch.is_grad_enabled():
+        if graphs.is_drawn() or (actions.requires_grad and torch.is_grad_enabled()):
             return foresee(observation, actions, self.task)
         known = foresee(arrays(observation), actions.detach().cpu().numpy(), self.task)
-
-        def tensor(part: Any) -> Tensor:
-            return torch.as_tensor(part, dtype=torch.float32, device=self.device)
-
-        return Foresight(
-            Sight(*map(tensor, known.seen)), tensor(known.log_jerk), KnownReward(*map(tensor, known.reward))
-        )
+        seen, reward = (tensors(part, self.scene.weight) for part in (known.seen, known.reward))
+        (log_jerk,) = tensors([known.log_jerk], self.scene.weight)
+        return Foresight(Sight(*seen), log_jerk, KnownReward(*reward))
 
     def forward(self, observation: Observation, actions: Tensor) -> tuple[Tensor]:
         """The expected reward of one action in each scene, shape (B, 1), as SB3's critics return it."""
@@ -118,6 +129,7 @@ class ViaPolicy(TD3Policy):
     ) -> None:
         self.task = Task.from_dict(task, ARMS)
         self.candidates = candidates
+        self._compiled: dict[int, Any] = {}
         self._both: dict[str, Any] = {"width": width, "trajectory_features": trajectory_features}
         self._rounds: dict[str, Any] = {"rounds": rounds, "kept": kept, "heads": heads}
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
@@ -145,9 +157,35 @@ class ViaPolicy(TD3Policy):
         return ViaCritic(*spaces_, task=self.task, **self._both).to(self.device)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        if not self.candidates:
-            return cast(Tensor, self.actor(observation))
-        return self.ranked(observation, self.candidates)
+        compiled = self._compiled.get(self.candidates)
+        if compiled is not None and compiled.fits(observation):
+            return cast(Tensor, compiled(observation))
+        return self.decide(observation, self.candidates)
+
+    def decide(self, observation: Observation, candidates: int) -> Tensor:
+        """The actor's own choice, or of so many candidates the critic's, shape (B, m)."""
+        return self.ranked(observation, candidates) if candidates else cast(Tensor, self.actor(observation))
+
+    def compile_decisions(self, candidates: int = 0) -> None:
+        """Let machine code decide in single scenes from now on: the same decisions, several times faster.
+
+        That takes a minute or two and a C++ compiler, once in each process. It is for as many candidates as are said
+        here; decisions with other numbers of them, in many scenes at once, and with weights that were changed
+        afterwards are made as before. Nothing of it is saved.
+
+        Args:
+            candidates: As :attr:`candidates` will be.
+
+        Raises:
+            CannotCompileError: There is no compiler, or the task does not allow it.
+        """
+        from viapoint.training.compiled import CompiledDecision
+
+        self._compiled[candidates] = CompiledDecision(self, candidates)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies are without machine code."""
+        return {**self.__dict__, "_compiled": {}}
 
     def ranked(self, observation: Observation, candidates: int) -> Tensor:
         """The best of many movements in the critic's judgement, shape (B, m).
@@ -156,17 +194,30 @@ class ViaPolicy(TD3Policy):
         deterministic; of the half that promises most, and of what a second improvement makes of it, the critic
         chooses.
         """
-        actor = self.actor
-        scene, look = actor.encode(observation), actor.look(observation)
-        others = actor.look_at(observation, self._spread(candidates).expand(len(scene), -1, -1))
-        both = actor.improve(scene, look), actor.improve(scene, others)
-        every = Improved(*(torch.cat(parts, dim=1) for parts in zip(*both, strict=True)))
-        look = actor.look_at(observation, best(every, -(-candidates // 2)))
+        actor, seen = self.actor, arrays(observation)
+        view = actor.view(seen)
+        scene = actor.encode_view(view)
+        others = actor.look_at(seen, self._spread(candidates).expand(len(scene), -1, -1))
+        every = Look(*(torch.cat(parts, dim=1) for parts in zip(actor.look(seen), others, strict=True)))
+        look = actor.look_at(seen, best(actor.improve(scene, every), -(-candidates // 2)))
         actions = torch.cat((look.actions, actor.improve(scene, look).actions), dim=1)
-        value = self.critic.judge(observation, actions).reward()
-        return actions[torch.arange(len(actions)), value.argmax(dim=-1)]
+        return most(
+            actions, self.critic.judge_seen(view, self.critic.foresee(seen, actions), actions).reward()
+        )
+
+    def set_training_mode(self, mode: bool) -> None:
+        """As its base class; where nothing changes, the modules are not gone through one by one."""
+        if mode != self.training:
+            super().set_training_mode(mode)
 
     def _spread(self, count: int) -> Tensor:
-        engine: Any = torch.quasirandom.SobolEngine
-        sobol = engine(self.actor.size, scramble=True, seed=1).draw(count)
-        return cast(Tensor, 2.0 * sobol - 1.0)
+        """Actions spread evenly over the action space, shape (count, m)."""
+        return spread_evenly(count, self.actor.size).to(self.actor.scene.weight.device)
+
+
+@functools.cache
+def spread_evenly(count: int, dimension: int) -> Tensor:
+    """Points of a cube from -1 to 1, shape (count, dimension), always the same (Sobol')."""
+    engine: Any = torch.quasirandom.SobolEngine
+    sobol = engine(dimension, scramble=True, seed=1).draw(count)
+    return cast(Tensor, 2.0 * sobol - 1.0)

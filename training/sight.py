@@ -56,7 +56,7 @@ def see(observation: Observation, hand: Array, task: Task, duration: Array = Non
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
         return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
-    if _among_links(task):
+    if among_links(task):
         return Sight(_seen_of_links(observation, hand, task, duration), margin)
     nearest, pairs = _nearest(observation, hand, task, duration)
     return Sight(_lowest(_clearance(nearest, pairs, task)[..., 0, :]), margin)
@@ -73,7 +73,7 @@ def push(observation: Observation, hand: Array, task: Task, duration: Array = No
     if "obstacles" not in observation:
         at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
         return Sight(xp.full_like(at_ends[..., 0], FAR), margin), xp.zeros_like(at_ends)
-    if _among_links(task):
+    if among_links(task):
         near = _approaches(observation, hand, task, duration, NEAR)
         return Sight(near.clearance, margin), near.gradient * _nearness(near.clearance)
     nearest, pairs = _nearest(observation, hand, task, duration)
@@ -93,7 +93,7 @@ def _nearness(clearance: Array) -> Array:
     return clamp(1.0 - clearance / NEAR, 0.0, 1.5)[..., None]
 
 
-def _among_links(task: Task) -> bool:
+def among_links(task: Task) -> bool:
     """Whether all links of an arm in space must clear: then looking everywhere would take too long."""
     return task.whole_arm and task.arm.dimension == 3
 

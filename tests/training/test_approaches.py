@@ -86,7 +86,7 @@ def test_the_push_is_where_the_exact_look_sees_it(trial, scenes, monkeypatch):
     observation = trial.observe(scenes)
     actions = 0.5 * np.random.default_rng(2).uniform(-1.0, 1.0, (SCENES, PLANS, 4)).astype(np.float32)
     quick = look_at(observation, actions, trial.task)
-    monkeypatch.setattr(sight, "_among_links", lambda task: False)
+    monkeypatch.setattr(sight, "among_links", lambda task: False)
     slow = look_at(observation, actions, trial.task)
     inside = quick.fares[..., STRETCHES + 2] > 0.0
     pushes = [look.fares[inside][:, STRETCHES + 4 :].ravel() for look in (quick, slow)]
@@ -105,7 +105,7 @@ def test_the_gradient_with_respect_to_an_action_is_the_exact_one(trial, scenes, 
         return actions.grad.numpy().ravel(), seen.reach_margin.detach().numpy() > 0.0
 
     quick, inside = gradient()
-    monkeypatch.setattr(sight, "_among_links", lambda task: False)
+    monkeypatch.setattr(sight, "among_links", lambda task: False)
     slow, _ = gradient()
     rows = np.repeat(inside.ravel(), 4)
     assert np.corrcoef(quick[rows], slow[rows])[0, 1] > 0.9

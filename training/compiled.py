@@ -1,0 +1,117 @@
+"""A decision as machine code: the same formulas and weights, translated once by a C++ compiler.
+
+A decision is about two thousand small operations, and Python needs longer to ask for one than the processor to do it.
+So the whole decision is drawn as a graph for one scene, and torch's compiler makes one function of it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch._inductor import aoti_compile_and_package, aoti_load_package
+
+from viapoint.training import graphs, sight
+from viapoint.training.sight import Observation
+
+if TYPE_CHECKING:
+    from viapoint.training.policies import ViaPolicy
+
+
+class CannotCompileError(RuntimeError):
+    """Decisions of an agent cannot be translated into machine code, here or at all."""
+
+
+class CompiledDecision:
+    """The decision of a policy in one scene, as its weights are now.
+
+    Args:
+        policy: Whose.
+        candidates: How many movements its critic ranks; 0 takes the actor's own choice.
+
+    Raises:
+        CannotCompileError: There is no compiler, or the decision searches depending on what it finds.
+    """
+
+    def __init__(self, policy: ViaPolicy, candidates: int) -> None:
+        space: Any = policy.observation_space
+        if "obstacles" in space.spaces and sight.among_links(policy.task):
+            raise CannotCompileError(
+                "decisions cannot be compiled where all links of an arm in space must clear: which pairs of link and "
+                "obstacle are looked at depends on the scene"
+            )
+        if policy.device.type != "cpu":
+            raise CannotCompileError(
+                f"decisions are compiled for the cpu only, the agent is on {policy.device}"
+            )
+        require_compiler()
+        decision = _Decision(policy, candidates)
+        self._weights = [*policy.parameters()]
+        self._versions = self._now()
+        self._names, self._run = decision.names, _translated(decision)
+
+    def fits(self, observation: Observation) -> bool:
+        """Whether it is made for that: one scene, and the weights it was made of."""
+        return len(observation[self._names[0]]) == 1 and self._now() == self._versions
+
+    def __call__(self, observation: Observation) -> Tensor:
+        """The action, shape (1, m)."""
+        action: Tensor = self._run(*(observation[name].float() for name in self._names))
+        return action
+
+    def _now(self) -> list[int]:
+        """What changes whenever a weight does."""
+        return [weight._version for weight in self._weights]
+
+
+class _Decision(nn.Module):
+    """A policy's decision as a function of the parts of an observation."""
+
+    def __init__(self, policy: ViaPolicy, candidates: int) -> None:
+        super().__init__()
+        self.policy, self.candidates = policy, candidates
+        space: Any = policy.observation_space
+        self.boxes, self.names = space.spaces, tuple(space.spaces)
+
+    def forward(self, *parts: Tensor) -> Tensor:
+        return self.policy.decide(dict(zip(self.names, parts, strict=True)), self.candidates)
+
+    def example(self) -> tuple[Tensor, ...]:
+        """Some observation of one scene."""
+        generator = np.random.default_rng(0)
+        drawn = (generator.uniform(self.boxes[name].low, self.boxes[name].high) for name in self.names)
+        return tuple(torch.tensor(part[None], dtype=torch.float32) for part in drawn)
+
+
+def _translated(decision: _Decision) -> Any:
+    """Machine code on one thread, as a function of the same arguments."""
+    example, folder = decision.example(), tempfile.TemporaryDirectory(prefix="viapoint-")
+    with torch.no_grad(), graphs.drawn(), warnings.catch_warnings(), folder:
+        warnings.simplefilter("ignore")  # of torch's own parts about each other
+        decision(*example)  # constants must be there before a graph is drawn: within one they are no numbers
+        graph = torch.export.export(decision, example)
+        file = Path(folder.name) / "decision.pt2"
+        path = aoti_compile_and_package(graph, package_path=str(file), inductor_configs={"cpp.threads": 1})
+        return aoti_load_package(path)
+
+
+def require_compiler() -> None:
+    """Refuse where torch finds no C++ compiler.
+
+    Raises:
+        CannotCompileError: There is none.
+    """
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        get_cpp_compiler()
+    except RuntimeError as error:
+        raise CannotCompileError(
+            "compiled decisions need a C++ compiler, and torch found none: install g++, or name one in the environment "
+            "variable CXX; decisions that are not compiled need none"
+        ) from error
