@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,23 @@ class References(NamedTuple):
     """Of the plan, shape (n,), [m]."""
 
 
+class Prepared(NamedTuple):
+    """Plans of N movements whose references are being computed."""
+
+    plan: Plan
+    """As decided."""
+    scenes: Scenes
+    """Where they take place."""
+    duration: Float
+    """Shape (N,), [s]."""
+    stretch: Float
+    """By which factor each was slowed down, shape (N,)."""
+    referred: list[Future[References]]
+    """Of the groups."""
+    beside: Beside
+    """Where they are computed, and outcomes measured."""
+
+
 class Executor:
     """Carries out plans in a simulator, in groups of similar length so that short movements cost less."""
 
@@ -76,22 +94,31 @@ class Executor:
 
     def __call__(self, plan: Plan, scenes: Scenes) -> Outcome:
         """Carry out one plan in each simulation, which must have been placed at its start."""
+        return self.carry_out(self.prepare(plan, scenes))
+
+    def prepare(self, plan: Plan, scenes: Scenes) -> Prepared:
+        """Stretch plans for the arm's limits and have their references computed beside what comes next."""
         stretch = self._stretch(plan)
-        plan = Plan(plan.waypoints, plan.durations * stretch[:, None])
-        duration = np.asarray(plan.durations.sum(axis=-1))
+        paced = Plan(plan.waypoints, plan.durations * stretch[:, None])
+        duration = np.asarray(paced.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         order = np.argsort(steps, kind="stable")
         groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
-        beside = self._beside.submit if len(groups) > 1 else Beside(threaded=False).submit
-        referred = [beside(self._refer, steps, plan, scenes, sims) for sims in groups]
+        beside = self._beside if len(groups) > 1 else Beside(threaded=False)
+        referred = [beside.submit(self._refer, steps, paced, scenes, sims) for sims in groups]
+        return Prepared(plan, scenes, duration, stretch, referred, beside)
+
+    def carry_out(self, prepared: Prepared) -> Outcome:
+        """Run the physics, measuring each group of movements beside the next ones."""
+        _, scenes, duration, stretch, referred, beside = prepared
         self._groups, self._records, measured = [], [], []
         for reference in referred:
             self._groups.append(reference.result())
             self._records.append(self._simulate(self._groups[-1]))
-            measured.append(beside(self._measure, len(self._groups) - 1, scenes))
+            measured.append(beside.submit(self._measure, len(self._groups) - 1, scenes))
         outcomes = [outcome.result() for outcome in measured]
-        together = outcomes[0] if len(groups) == 1 else blank(len(duration))
-        for group, outcome in zip(self._groups, outcomes, strict=True) if len(groups) > 1 else ():
+        together = outcomes[0] if len(referred) == 1 else blank(len(duration))
+        for group, outcome in zip(self._groups, outcomes, strict=True) if len(referred) > 1 else ():
             for mine, theirs in zip(together, outcome, strict=True):
                 mine[group.sims] = theirs
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5

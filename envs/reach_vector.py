@@ -25,10 +25,10 @@ from viapoint.envs.arguments import (
 )
 from viapoint.envs.arms import ADULT, Arm, arm_of
 from viapoint.envs.beside import Beside
-from viapoint.envs.execution import Executor, Rollout
+from viapoint.envs.execution import Executor, Prepared, Rollout
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.rendering import MovementRenderer, check_render_mode
-from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
+from viapoint.envs.reward import RewardWeights, reward_terms
 from viapoint.envs.scene_options import draw_given
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Simulator
@@ -195,14 +195,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
         self._check_running()
-        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
-        rows = np.arange(self.num_envs)
+        rows, everyone = np.arange(self.num_envs), np.ones(self.num_envs, dtype=bool)
+        prepared = self._prepare(self._decoded(actions))
+        # The next scenes are drawn beside the physics, which waits for nothing but the first references.
         following = self._beside.submit(self._draw, self._generators, rows, {})
-        observation, reward, info = self.decide(actions)
-        everyone = np.ones(self.num_envs, dtype=bool)
+        observation, reward, info = self._carry_out(prepared)
         final = np.empty(self.num_envs, dtype=object)
-        for i in range(self.num_envs):
-            final[i] = {name: part[i] for name, part in observation.items()}
+        final[:] = [{name: part[i] for name, part in observation.items()} for i in range(self.num_envs)]
         masked = {**info, **{f"_{name}": everyone.copy() for name in info}}
         infos = {
             **masked,
@@ -221,9 +220,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
         self._check_running()
-        assert self.scenes is not None
-        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
-        return self.perform(self.action_layout.decode(actions, self.scenes.start, self.scenes.goal))
+        return self.perform(self._decoded(actions))
 
     def perform(self, plan: Plan) -> Decision:
         """Carry out one plan in each environment, with any number of via-points, without a reset.
@@ -232,23 +229,14 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             plan: Of num_envs movements, from the starts to the goals.
         """
         self._check_running()
-        assert self.scenes is not None
-        outcome = self._executor(plan, self.scenes)
-        terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
-        joints = self._executor.final_joints(self.scenes)
-        observation = self.observation_layout.observe(joints, np.asarray(self.arm.hand(joints)), self.scenes)
-        self._last, self.scenes = (self.scenes, plan, outcome), None
-        if self.render_mode == "human":
-            self.render()
-        return Decision(observation, terms.total(), _info(outcome, terms))
+        return self._carry_out(self._prepare(plan))
 
     def render(self) -> Any:
         """The last movement of each environment as the render mode says; after a reset, the scenes."""
         if self._last is None:
             self._check_running()
-        frames = tuple(
-            self._render_one(sim) for sim in range(self.num_envs if self.render_mode != "human" else 1)
-        )
+        shown = 1 if self.render_mode == "human" else self.num_envs
+        frames = tuple(self._render_one(sim) for sim in range(shown))
         return None if self.render_mode in (None, "human") else frames
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -258,18 +246,34 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() does nothing without a render_mode; choose one of "
-                + ", ".join(METADATA["render_modes"])
-            )
+            modes = ", ".join(METADATA["render_modes"])
+            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
             assert self.scenes is not None
             return self._renderer.still(sim, self.scenes.take([sim]))
         scenes, plan, _ = self._last
-        return self._renderer.movement(
-            sim, scenes.take([sim]), plan.take([sim]), self._executor.rollout(sim, scenes)
-        )
+        rollout = self._executor.rollout(sim, scenes)
+        return self._renderer.movement(sim, scenes.take([sim]), plan.take([sim]), rollout)
+
+    def _decoded(self, actions: Any) -> Plan:
+        assert self.scenes is not None
+        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
+        return self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
+
+    def _prepare(self, plan: Plan) -> Prepared:
+        assert self.scenes is not None
+        return self._executor.prepare(plan, self.scenes)
+
+    def _carry_out(self, prepared: Prepared) -> Decision:
+        outcome, scenes = self._executor.carry_out(prepared), prepared.scenes
+        terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
+        joints = self._executor.final_joints(scenes)
+        observation = self.observation_layout.observe(joints, np.asarray(self.arm.hand(joints)), scenes)
+        self._last, self.scenes = (scenes, prepared.plan, outcome), None
+        if self.render_mode == "human":
+            self.render()
+        return Decision(observation, terms.total(), {**outcome._asdict(), **terms.as_info()})
 
     def _check_running(self) -> None:
         if self.scenes is None:
@@ -307,15 +311,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         else:
             self.scenes = Scenes(*(field.copy() for field in self.scenes))
             self.scenes.put(rows, scenes)
-        self._simulator.place(
-            rows, np.asarray(self.arm.posture(scenes.start)), scenes.obstacles, scenes.present
-        )
+        joints = np.asarray(self.arm.posture(scenes.start))
+        self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
 
     def _observe_start(self) -> Observation:
         assert self.scenes is not None
         joints = np.asarray(self.arm.posture(self.scenes.start))
         return self.observation_layout.observe(joints, self.scenes.start, self.scenes)
-
-
-def _info(outcome: Outcome, terms: RewardTerms) -> dict[str, Any]:
-    return {**outcome._asdict(), **terms.as_info()}

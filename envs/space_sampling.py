@@ -263,7 +263,7 @@ class SpaceSampler:
         number, several, parts = built.shape[:3]
         inside: Any = (_within_bounds(built) | (built[..., -1] <= 0.0)).all(axis=-1)
         rows = np.where(inside[..., None, None], built, 0.0).reshape(number, several * parts, 7)
-        return inside & (self._room(bodies, rows, SOME, floor=0.0, together=parts) > 0.0)
+        return np.asarray(inside & (self._room(bodies, rows, SOME, floor=0.0, together=parts) > 0.0))
 
     def _keep_blocking(self, fits: Bool, start: Float, goal: Float, built: Float) -> None:
         """Strike out the first structures that the straight movement does not hit, shape (N, STRUCTURES)."""
