@@ -7,6 +7,8 @@ pairs found are then differentiated.
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -152,21 +154,42 @@ def _nearest(observation: Observation, hand: Array, task: Task, duration: Array)
         every = every._replace(drift=velocity[:, None, :, None] * times[:, :, None, :, None])
     profile = _clearance(_still(hand), every, task)
     profile = xp.reshape(profile, (*profile.shape[:3], STRETCHES, LOOKS))
-    which = xp.argmin(xp.min(profile, axis=-1), axis=2)
+    which = xp.argmin(_least_look(profile), axis=2)
     look = xp.argmin(xp.min(profile, axis=2), axis=-1)
     phase = LOOKS * xp.arange(STRETCHES) + look
     around = clamp(phase[..., None] + xp.arange(-1, 2), 0, PHASES - 1)
-    shape = (*around.shape[:2], 3 * STRETCHES, 1)
-    nearest = xp.take_along_axis(hand, xp.reshape(around, shape), axis=2)
-    nearest = xp.reshape(nearest, (*around.shape, hand.shape[-1]))
-    scene = xp.arange(len(hand))[:, None, None]
-    pairs = _Others(obstacles[scene, which][..., None, :], present[scene, which][..., None], None)
+    nearest = _picked(hand, around, 2)
+    pairs = _Others(_picked(obstacles, which, 1)[..., None, :], _picked(present, which, 1)[..., None], None)
     if moving:
         times = duration[..., None, None] * xp.asarray(INSTANTS, dtype=hand.dtype)[around]
         pairs = pairs._replace(
-            drift=(velocity[scene, which][..., None, :] * times[..., None])[..., None, :, :]
+            drift=(_picked(velocity, which, 1)[..., None, :] * times[..., None])[..., None, :, :]
         )
     return nearest, pairs
+
+
+def _least_look(profile: Array) -> Array:
+    """Least of the looks of each stretch, shape (..., STRETCHES, LOOKS); NumPy's own reductions of few are slow."""
+    looks = (profile[..., each] for each in range(LOOKS))
+    return functools.reduce(namespace_of(profile).minimum, looks)
+
+
+def _picked(values: Array, rows: Array, shared: int) -> Array:
+    """Some rows of each of many arrays, as NumPy takes them fastest: from one plain list.
+
+    Args:
+        values: Shape (*lead, n, ...), with `shared` axes in `lead`.
+        rows: Below n, shape (*lead, *some).
+        shared: Number of leading axes.
+
+    Returns:
+        Shape (*lead, *some, ...).
+    """
+    xp, count = namespace_of(values), values.shape[shared]
+    lead, rest = tuple(values.shape[:shared]), tuple(values.shape[shared + 1 :])
+    first = count * xp.reshape(xp.arange(math.prod(lead)), lead + (1,) * (rows.ndim - shared))
+    taken = xp.take(xp.reshape(values, (-1, *rest)), xp.reshape(rows + first, (-1,)), axis=0)
+    return xp.reshape(taken, (*rows.shape, *rest))
 
 
 def velocities(observation: Observation, like: Array) -> Array:
