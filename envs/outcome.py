@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,15 +88,15 @@ def measure(
         joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
     hand = _hand(record, joints, after, last, arm)
     moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
-    deviation = np.where(after, 0.0, ((hand - planned) ** 2).sum(axis=-1))
+    deviation = np.where(after, 0.0, _square(hand - planned))
     low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
-    within = (joints.min(axis=1) >= low - LIMIT_TOLERANCE) & (joints.max(axis=1) <= high + LIMIT_TOLERANCE)
+    within = (joints >= low - LIMIT_TOLERANCE) & (joints <= high + LIMIT_TOLERANCE)
     goal_error = norm(hand[last] - scenes.goal)
     collision: Any = contact.any(axis=-1)
     at_rest = moved[last] < REST_SPEED * timestep
     arrived = at_rest & (goal_error < GOAL_TOLERANCE)
     return blank(len(steps))._replace(
-        is_success=arrived & ~collision & ~record.unstable & within.all(axis=-1),
+        is_success=arrived & ~collision & ~record.unstable & within.all(axis=(1, 2)),
         collision=collision,
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
         min_clearance=_measured_clearance(record, hand, joints, last, scenes, arm, whole_arm=whole_arm),
@@ -180,7 +181,13 @@ def least_clearance(
 
 def norm(vectors: Float) -> Float:
     """Euclidean length along the last axis."""
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1)))
+    return np.asarray(np.sqrt(_square(vectors)))
+
+
+def _square(vectors: Float) -> Float:
+    """Squared length along the last axis: component by component, as sums of a few numbers each are slow."""
+    square = vectors * vectors
+    return np.asarray(functools.reduce(np.add, (square[..., i] for i in range(vectors.shape[-1]))))
 
 
 def _sum_in_order(values: Float) -> Float:
