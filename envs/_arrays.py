@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any
 
 import numpy as np
@@ -20,3 +22,9 @@ def clamp(values: Array, low: float, high: float) -> Array:
     """Values no less than `low` and no more than `high`; on small arrays much faster than `clip`."""
     xp = namespace_of(values)
     return xp.minimum(xp.maximum(values, low), high)
+
+
+def squared_length(vectors: Array) -> Array:
+    """Sum of squares along the last axis: component by component, as sums of a few numbers each are slow."""
+    square = vectors * vectors
+    return functools.reduce(operator.add, (square[..., i] for i in range(vectors.shape[-1])))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs._arrays import squared_length
 from viapoint.envs.approach import ends_of, nearest_approach
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import FAR, arm_clearance, hand_clearance
@@ -88,7 +88,7 @@ def measure(
         joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
     hand = _hand(record, joints, after, last, arm)
     moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
-    deviation = np.where(after, 0.0, _square(hand - planned))
+    deviation = np.where(after, 0.0, squared_length(hand - planned))
     low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
     within = (joints >= low - LIMIT_TOLERANCE) & (joints <= high + LIMIT_TOLERANCE)
     goal_error = norm(hand[last] - scenes.goal)
@@ -181,13 +181,7 @@ def least_clearance(
 
 def norm(vectors: Float) -> Float:
     """Euclidean length along the last axis."""
-    return np.asarray(np.sqrt(_square(vectors)))
-
-
-def _square(vectors: Float) -> Float:
-    """Squared length along the last axis: component by component, as sums of a few numbers each are slow."""
-    square = vectors * vectors
-    return np.asarray(functools.reduce(np.add, (square[..., i] for i in range(vectors.shape[-1]))))
+    return np.asarray(np.sqrt(squared_length(vectors)))
 
 
 def _sum_in_order(values: Float) -> Float:

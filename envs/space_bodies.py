@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs._arrays import squared_length
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import segment_distance_squared
 from viapoint.envs.nearness import Single, ball_bounds
@@ -89,7 +90,7 @@ class Bodies(NamedTuple):
         """Around the links at all times: centres, shape (N, 3, T B), and radii with a margin, shape (T B,), [m]."""
         first, second = self.ends[..., 0, :], self.ends[..., 1, :]
         link, centre = second - first, np.moveaxis(np.float32(0.5) * (first + second), -1, 1)
-        half = 0.5 * np.sqrt((link * link).sum(axis=-1).max(axis=(0, 1)))
+        half = 0.5 * np.sqrt(squared_length(link).max(axis=(0, 1)))
         around = np.tile(half + np.array(self.radii) + ROUNDING, self.ends.shape[1]) + margins
         return centre.reshape(len(centre), 3, -1), around.astype(np.float32)
 
@@ -133,7 +134,7 @@ class Swept(NamedTuple):
             Shape (N, K), [m].
         """
         ends = self.outer.ends[np.arange(len(phase))[:, None], phase]
-        apart = np.sqrt(((ends[..., :2] - place[:, :, None, None, :2]) ** 2).sum(axis=-1))
+        apart = np.sqrt(squared_length(ends[..., :2] - place[:, :, None, None, :2]))
         high = ends[..., 2] + np.array(self.outer.radii, np.float32)[:, None]
         return np.asarray(np.where(apart < ABOVE, high, place[:, :, None, None, 2]).max(axis=(-2, -1)))
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs._arrays import squared_length
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.space_bodies import Bodies, Swept
@@ -29,7 +30,7 @@ STRUCTURES, OTHERS = 4, 14
 ATTEMPTS = (1, 2, 4, *[8] * 400)
 """How many attempts are made at once, one time after the other: few are left after the first,
 but one in a hundred makes a tunnel."""
-TOGETHER = 256
+TOGETHER = 512
 """Attempts that are looked at together: only the first good one of a scene counts, so not all at once."""
 FAITHFUL = 8
 """How many times attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
@@ -239,7 +240,7 @@ class SpaceSampler:
         each = np.arange(len(path))[:, None]
         step = path[each, phase + 1] - path[each, phase - 1]
         step[..., 2] = 0.0
-        length = np.sqrt((step**2).sum(axis=-1, keepdims=True))
+        length = np.sqrt(squared_length(step))[..., None]
         heading = np.where(length > 1e-6, step / np.maximum(length, 1e-6), (1.0, 0.0, 0.0))
         place = path[each, phase]
         top = place[..., 2] if swept is None else swept.top(phase, place)
@@ -285,8 +286,8 @@ class SpaceSampler:
 
 def _within_bounds(rows: Float) -> Bool:
     """Which rows are no farther and no longer than scenes allow."""
-    near = np.abs(rows[..., :3]).max(axis=-1) < 1.0
-    return np.asarray(near & ((rows[..., 3:6] ** 2).sum(axis=-1) < LARGEST_HALF_AXIS**2))
+    x, y, z = (np.abs(rows[..., axis]) < 1.0 for axis in range(3))
+    return np.asarray(x & y & z & (squared_length(rows[..., 3:6]) < LARGEST_HALF_AXIS**2))
 
 
 def _pushed(rows: Float, place: Float, way: Float) -> Float:
@@ -294,7 +295,7 @@ def _pushed(rows: Float, place: Float, way: Float) -> Float:
     towards = place - rows[..., :3]
     standing = (rows[..., 3:5] == 0.0).all(axis=-1) & (rows[..., 5] > 0.0)
     towards[..., 2] = np.where(standing, 0.0, towards[..., 2])
-    length = np.sqrt((towards**2).sum(axis=-1))
+    length = np.sqrt(squared_length(towards))
     share = np.minimum(way, length) / np.maximum(length, 1e-9)
     return np.concatenate((rows[..., :3] + share[..., None] * towards, rows[..., 3:]), axis=-1)
 
