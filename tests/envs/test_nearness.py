@@ -1,0 +1,91 @@
+"""What is looked at only where it matters is what it would be, were everything looked at."""
+
+import numpy as np
+import pytest
+
+from viapoint.envs import space_sampling
+from viapoint.envs.arms import PANDA
+from viapoint.envs.clearance import point_distance_squared, segment_distance_squared
+from viapoint.envs.nearness import ball_bounds
+from viapoint.envs.space_bodies import Swept
+from viapoint.envs.space_distribution import SpaceDistribution
+from viapoint.envs.space_sampling import SpaceSampler
+
+N, TIMES, ROWS = 40, 16, 12
+
+
+def obstacles(generator):
+    """Spheres, posts and bars, and rows that are none."""
+    rows = np.concatenate(
+        (
+            generator.uniform((0.2, -0.5, 0.0), (0.8, 0.5, 0.8), (N, ROWS, 3)),
+            generator.normal(0.0, 0.1, (N, ROWS, 3)),
+            generator.uniform(0.01, 0.05, (N, ROWS, 1)),
+        ),
+        axis=-1,
+    )
+    rows[:, ::3, 3:6] = 0.0
+    rows[:, 1::3, 3:5] = 0.0
+    rows[generator.random((N, ROWS)) < 0.2] = 0.0
+    return rows
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(3)
+
+
+@pytest.fixture
+def bodies(generator):
+    """The links near the hand, on straight movements."""
+    low, high = (np.array(corner) for corner in PANDA.workspace)
+    start, goal = (low + (high - low) * generator.random((N, 1, 3)) for _ in range(2))
+    path = start + (goal - start) * np.linspace(0.0, 1.0, TIMES)[:, None]
+    return Swept.of(PANDA, path, whole_arm=True).outer
+
+
+def everything(bodies, rows):
+    """Clearance of all rows from all links at all times, shape (N, ROWS, TIMES)."""
+    single = rows.astype(np.float32)
+    each = [
+        np.sqrt(segment_distance_squared(bodies.ends[:, :, b, 0], bodies.ends[:, :, b, 1], single))
+        - np.float32(radius)
+        for b, radius in enumerate(bodies.radii)
+    ]
+    return np.where(rows[..., -1:] > 0.0, np.min(each, axis=0) - rows[..., -1:], np.inf)
+
+
+def test_balls_are_bounded_from_below_and_closely(generator):
+    rows, centres = obstacles(generator), generator.uniform(-1.0, 1.0, (N, 3, 50)).astype(np.float32)
+    radii = generator.uniform(0.0, 0.2, 50).astype(np.float32)
+    distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows)) - radii
+    slack = distance - ball_bounds(centres, radii, rows)
+    assert slack.min() > -1e-6
+    assert slack[distance > 0.1].max() < 1e-4
+
+
+@pytest.mark.parametrize("most", [-0.01, 1e-6, 0.05, np.inf])
+def test_least_clearance_is_exact_up_to_the_most_that_matters(generator, bodies, most):
+    rows, margin = obstacles(generator), generator.uniform(0.0, 0.02, TIMES)
+    plain = np.minimum((everything(bodies, rows) - margin).min(axis=-1), most)
+    assert (bodies.clearance(rows, most, margin) == plain).all()
+    assert (plain < most).any()
+
+
+def test_rows_that_belong_together_have_one_clearance(generator, bodies):
+    rows = obstacles(generator)
+    plain = np.minimum(everything(bodies, rows).reshape(N, ROWS // 4, -1).min(axis=-1), 0.03)
+    assert (bodies.clearance(rows, 0.03, together=4) == plain).all()
+    floored = bodies.clearance(rows, 0.03, together=4, floor=0.0)
+    assert (floored[plain >= 0.0] == plain[plain >= 0.0]).all()
+    assert (floored[plain < 0.0] < 0.0).all()
+    assert (floored != plain).any()
+
+
+def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
+    sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
+    for together in (1, 30, 10_000):
+        monkeypatch.setattr(space_sampling, "TOGETHER", together)
+        found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
+    for other in found[1:]:
+        assert all((mine == theirs).all() for mine, theirs in zip(found[0], other, strict=True))
