@@ -174,7 +174,8 @@ class Executor:
         trajectory = plan.take(rows).trajectory()
         time = self.simulator.timestep * np.arange(steps[rows].max() + 1)
         position, velocity, acceleration = trajectory.sample(time)
-        seen = position[:, :: round(LOOK_EVERY / self.simulator.timestep)]
+        every, settling = (round(span / self.simulator.timestep) for span in (LOOK_EVERY, SETTLING))
+        seen = position[:, : steps[rows].max() - settling + every + 1 : every]  # up to where all have ended
         return References(
             sims=sims,
             rows=rows,
