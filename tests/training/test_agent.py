@@ -9,6 +9,7 @@ import torch
 from viapoint.envs.arms import ARMS
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.task import Task
+from viapoint.training import sight
 from viapoint.training.anchors import Anchors
 from viapoint.training.features import foresee, look_at, scene_view
 from viapoint.training.policies import ViaPolicy
@@ -101,6 +102,22 @@ def test_the_obstacles_push_where_clearance_grows(trial):
     close = (seen.clearance < NEAR / 2) & (seen.clearance > 5e-3)
     assert close.any()
     assert (moved.clearance >= seen.clearance - 2e-4)[close].mean() > 0.9
+
+
+@pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
+def test_rows_are_picked_and_least_looks_found_as_indexing_says(library):
+    generator = np.random.default_rng(4)
+    hand, around = generator.normal(size=(3, 4, 48, 2)), generator.integers(0, 48, (3, 4, 16, 3))
+    present, which = generator.normal(size=(3, 5)) > 0.0, generator.integers(0, 5, (3, 4, 16))
+    scene, movement = np.arange(3)[:, None, None], np.arange(4)[None, :, None, None]
+    picked = [
+        sight._picked(library(hand), library(around), 2),
+        sight._picked(library(present), library(which), 1),
+    ]
+    np.testing.assert_array_equal(picked[0], hand[scene[..., None], movement, around])
+    np.testing.assert_array_equal(picked[1], present[scene, which])
+    profile = hand[..., 0].reshape(3, 4, 16, LOOKS)
+    np.testing.assert_array_equal(sight._least_look(library(profile)), profile.min(axis=-1))
 
 
 def test_foresight_has_finite_gradients_everywhere(trial):
