@@ -22,6 +22,8 @@ LOOK_EVERY = 0.008
 """Clearance and reach of the plan are looked at that often, which is every few millimetres, [s]."""
 PACED = 32
 """At how many evenly spaced times a movement is looked at for the arm's limits."""
+TOGETHER = 256
+"""Movements that are looked at together for the limits: as many steps of the inverse dynamics for many as for one."""
 GROUP = 64
 """Movements carried out together: few enough for the cache, many enough for the threads."""
 
@@ -158,8 +160,8 @@ class Executor:
         if not self.arm.velocity_limit:
             return np.ones(len(plan.durations))
         factors = []
-        for first in range(0, len(plan.durations), GROUP):
-            some = plan.take(slice(first, first + GROUP))
+        for first in range(0, len(plan.durations), TOGETHER):
+            some = plan.take(slice(first, first + TOGETHER))
             times = some.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, PACED)
             position, velocity, acceleration = some.trajectory().sample(times)
             reachable = (self.arm.reach_margin(position) >= 0.0).all(axis=-1)
