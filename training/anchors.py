@@ -70,7 +70,7 @@ class Anchors:
         scaled = xp.stack(frame(line), axis=-2) * distance
         hand = start[:, None, None] + xp.asarray(self.paths) @ scaled[:, None]
         actions = self.actions(observation)
-        log_jerk = xp.broadcast_to(xp.asarray(self.log_jerk), actions.shape[:2])
+        log_jerk = xp.zeros_like(actions[..., 0]) + xp.asarray(self.log_jerk)
         duration = xp.full_like(log_jerk, self.task.action.centre_duration)
         moves = Movements(hand, duration, log_jerk, effort_of(log_jerk, duration, self.task))
         return look_along(observation, actions, moves, self.task)

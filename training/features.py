@@ -44,6 +44,12 @@ class Look(NamedTuple):
     """How each would fare: clearance, reach, and where the nearest obstacle pushes in each stretch, shape (B, A, .)."""
     known: Array
     """The part of each one's reward that the plan alone decides, shape (B, A)."""
+    log_jerk: Array
+    """Log of the jerk cost relative to the straight movement of the same duration, shape (B, A)."""
+
+    def vector(self) -> Array:
+        """As :meth:`Foresight.vector`, which says part of the same."""
+        return _with_jerk(self.fares[..., :GEOMETRY], self.log_jerk)
 
     def at(self, some: Array) -> Look:
         """Only some of the movements, `some` of shape (B, n) in each scene."""
@@ -78,8 +84,7 @@ class Foresight(NamedTuple):
 
     def vector(self) -> Array:
         """The features as a network likes them, of size one, shape (B, H, GEOMETRY + 1)."""
-        xp = namespace_of(self.log_jerk)
-        return xp.concat((_sized(self.seen), 0.3 * self.log_jerk[..., None]), axis=-1)
+        return _with_jerk(_sized(self.seen), self.log_jerk)
 
 
 def fares_size(task: Task) -> int:
@@ -151,7 +156,7 @@ def look_along(observation: Observation, actions: Array, moves: Movements, task:
     axes = xp.stack(frame(direction(observation)), axis=-1)
     in_frame = xp.reshape(pushed @ axes[:, None], (*pushed.shape[:2], -1))
     known = known_reward(seen, moves, task, observation.get("time_left")).total()
-    return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known)
+    return Look(actions, xp.concat((_sized(seen), in_frame), axis=-1), known, moves.log_jerk)
 
 
 def known_reward(seen: Sight, moves: Movements, task: Task, time_left: Array = None) -> KnownReward:
@@ -188,6 +193,10 @@ def _hope(seen: Sight, spare: Array, task: Task) -> Array:
     clear = clamp(0.5 + least / SURE, 0.0, 1.0)
     in_time = clamp(spare / SETTLING - 1.0, 0.0, 1.0)
     return clear * in_time * task.weights.success - (1.0 - clear) * task.weights.collision
+
+
+def _with_jerk(geometry: Array, log_jerk: Array) -> Array:
+    return namespace_of(log_jerk).concat((geometry, 0.3 * log_jerk[..., None]), axis=-1)
 
 
 def _sized(seen: Sight) -> Array:

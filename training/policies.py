@@ -67,17 +67,18 @@ class ViaCritic(BaseModel):
     def judge(self, observation: Observation, actions: Tensor) -> Judgement:
         """What to expect of H actions in each of B scenes, shape (B, H)."""
         view = SceneView(*tensors(scene_view(arrays(observation), self.task), self.scene.weight))
-        return self.judge_seen(view, self.foresee(observation, actions), actions)
-
-    def judge_seen(self, view: SceneView, foresight: Foresight, actions: Tensor) -> Judgement:
-        """The same of scenes and movements that are seen already."""
-        features = foresight.vector() if self.sighted else torch.zeros_like(foresight.vector())
-        scene = self.scene(self.encoder(view)).unsqueeze(1)
-        learned = self.value(scene + self.movement(torch.cat((features, actions), dim=-1))).squeeze(-1)
-        known = foresight.reward
+        foresight = self.foresee(observation, actions)
+        learned, known = self.learned(view, foresight.vector(), actions), foresight.reward
         if not self.sighted:
             known = known._replace(clearance=torch.zeros_like(learned))
         return Judgement(learned, known)
+
+    def learned(self, view: SceneView, features: Tensor, actions: Tensor) -> Tensor:
+        """The part that no formula gives, of scenes and movements that are seen already, shape (B, H)."""
+        features = features if self.sighted else torch.zeros_like(features)
+        scene = self.scene(self.encoder(view)).unsqueeze(1)
+        learned: Tensor = self.value(scene + self.movement(torch.cat((features, actions), dim=-1)))
+        return learned.squeeze(-1)
 
     def foresee(self, observation: Observation, actions: Tensor) -> Foresight:
         """In torch where gradients are asked for, otherwise in NumPy, which deals with small arrays faster."""
@@ -200,10 +201,14 @@ class ViaPolicy(TD3Policy):
         others = actor.look_at(seen, self._spread(candidates).expand(len(scene), -1, -1))
         every = Look(*(torch.cat(parts, dim=1) for parts in zip(actor.look(seen), others, strict=True)))
         look = actor.look_at(seen, best(actor.improve(scene, every), -(-candidates // 2)))
-        actions = torch.cat((look.actions, actor.improve(scene, look).actions), dim=1)
-        return most(
-            actions, self.critic.judge_seen(view, self.critic.foresee(seen, actions), actions).reward()
-        )
+        further = actor.improve(scene, look).actions
+        actions = torch.cat((look.actions, further), dim=1)
+        if not self.critic.sighted:
+            return most(actions, self.critic.judge(seen, actions).reward())
+        foresight = self.critic.foresee(seen, further)
+        features = torch.cat((look.vector(), foresight.vector()), dim=1)
+        known = torch.cat((look.known, foresight.reward.total()), dim=1)
+        return most(actions, self.critic.learned(view, features, actions) + known)
 
     def set_training_mode(self, mode: bool) -> None:
         """As its base class; where nothing changes, the modules are not gone through one by one."""
