@@ -199,7 +199,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         prepared = self._prepare(self._decoded(actions))
         # The next scenes are drawn beside the physics, which waits for nothing but the first references.
         following = self._beside.submit(self._draw, self._generators, rows, {})
-        observation, reward, info = self._carry_out(prepared)
+        observation, reward, info = self._conclude(prepared)
         final = np.empty(self.num_envs, dtype=object)
         final[:] = [{name: part[i] for name, part in observation.items()} for i in range(self.num_envs)]
         masked = {**info, **{f"_{name}": everyone.copy() for name in info}}
@@ -229,7 +229,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             plan: Of num_envs movements, from the starts to the goals.
         """
         self._check_running()
-        return self._carry_out(self._prepare(plan))
+        return self._conclude(self._prepare(plan))
 
     def render(self) -> Any:
         """The last movement of each environment as the render mode says; after a reset, the scenes."""
@@ -265,7 +265,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         assert self.scenes is not None
         return self._executor.prepare(plan, self.scenes)
 
-    def _carry_out(self, prepared: Prepared) -> Decision:
+    def _conclude(self, prepared: Prepared) -> Decision:
         outcome, scenes = self._executor.carry_out(prepared), prepared.scenes
         terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
         joints = self._executor.final_joints(scenes)
