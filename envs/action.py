@@ -20,6 +20,8 @@ LOG_SPLIT = float(np.log(4.0))
 
 SHORTEST, LONGEST = 0.05, 60.0
 """Bounds of the duration range, [s]."""
+MOST_VIAS = 16
+"""Via-points of an action at most: more of them only say the same movement in more words."""
 
 
 class Plan(NamedTuple):
@@ -51,7 +53,7 @@ class ActionLayout:
     dimension: int = 2
     """Spatial dimension D."""
     n_via: int = 1
-    """Number of via-points K, 0 or more."""
+    """Number of via-points K, 0 to :data:`MOST_VIAS`."""
     timing: Timing = "optimal"
     """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: the action says."""
     duration_range: tuple[float, float] = (0.6, 1.2)
@@ -63,8 +65,9 @@ class ActionLayout:
         """Refuse what cannot be meant."""
         if self.dimension not in (2, 3):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
-        if not isinstance(self.n_via, int | np.integer) or isinstance(self.n_via, bool) or self.n_via < 0:
-            raise ValueError(f"n_via must be a whole number, 0 or more, got {self.n_via!r}")
+        whole = isinstance(self.n_via, int | np.integer) and not isinstance(self.n_via, bool)
+        if not (whole and 0 <= self.n_via <= MOST_VIAS):
+            raise ValueError(f"n_via must be a whole number, 0 to {MOST_VIAS}, got {self.n_via!r}")
         if self.timing not in get_args(Timing):
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
         check_increasing_pair("duration_range", self.duration_range)
@@ -72,8 +75,7 @@ class ActionLayout:
             raise ValueError(
                 f"duration_range must lie within {SHORTEST} to {LONGEST} s, got {self.duration_range!r}"
             )
-        if len(self.via_scale) < self.dimension or not all(scale > 0.0 for scale in self.via_scale):
-            raise ValueError(f"via_scale must be {self.dimension} positive numbers, got {self.via_scale!r}")
+        self._check_scale()
         low, high = self.duration_range
         object.__setattr__(self, "duration_range", (float(low), float(high)))
 
@@ -120,7 +122,12 @@ class ActionLayout:
             action: Shape (..., m), in [-1, 1].
             start: Shape (..., D), [m].
             goal: Shape (..., D), [m], apart from the start.
+
+        Raises:
+            ValueError: One of them has another shape.
         """
+        action, start, goal = _arrays(action, start, goal)
+        self._check_shapes(action.shape, start.shape, goal.shape)
         xp = namespace_of(action)
         line = goal - start
         axes = frame(line)
@@ -141,8 +148,22 @@ class ActionLayout:
         """The action that stands for a movement: the inverse of :meth:`decode`.
 
         Components outside [-1, 1] say that the movement lies outside the action space.
+
+        Raises:
+            ValueError: The movement has another dimension or another number of via-points.
         """
-        waypoints, durations = plan
+        waypoints, durations = _arrays(*plan)
+        rows = (self.n_via + 2, self.dimension)
+        if waypoints.shape[-2:] != rows:
+            raise ValueError(
+                f"waypoints must have shape (..., {rows[0]}, {rows[1]}), start, {self.n_via} via-points and goal, "
+                f"got {tuple(waypoints.shape)}"
+            )
+        wanted = (*waypoints.shape[:-2], self.n_via + 1)
+        if durations.shape != wanted:
+            raise ValueError(
+                f"durations must have shape {wanted}, one for each segment, got {tuple(durations.shape)}"
+            )
         xp = namespace_of(waypoints)
         start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
         line = goal - start
@@ -158,6 +179,32 @@ class ActionLayout:
             ratios = xp.log(durations[..., 1:] / durations[..., :-1])
             components += [(ratios[..., k] - r) / LOG_SPLIT for k, r in enumerate(self._straight_split)]
         return xp.stack(components, axis=-1)
+
+    def _check_scale(self) -> None:
+        try:
+            scale = tuple(float(each) for each in self.via_scale)
+        except (TypeError, ValueError):
+            scale = ()
+        if len(scale) < self.dimension or not all(0.0 < each < float("inf") for each in scale):
+            raise ValueError(
+                f"via_scale must be {self.dimension} positive finite numbers, got {self.via_scale!r}"
+            )
+
+    def _check_shapes(self, action: tuple[int, ...], start: tuple[int, ...], goal: tuple[int, ...]) -> None:
+        """Refuse what would be read as something else; numbers are not looked at, as a graph of tensors has none."""
+        if action[-1:] != (self.size,):
+            raise ValueError(
+                f"action must have shape (..., {self.size}) ({', '.join(self.names)}), got {tuple(action)}"
+            )
+        if start[-1:] != (self.dimension,) or goal != start:
+            raise ValueError(
+                f"start and goal must both have shape (..., {self.dimension}), got {tuple(start)} and {tuple(goal)}"
+            )
+        if action[:-1] != start[:-1]:
+            raise ValueError(
+                f"there must be a start and a goal for each action: actions have shape {tuple(action)}, "
+                f"starts {tuple(start)}"
+            )
 
     @property
     def _log_half_range(self) -> float:
@@ -195,6 +242,16 @@ def frame(line: Array) -> list[Array]:
     z = along[..., 2]
     above = xp.stack((-z * left_y, z * left_x, x * left_y - y * left_x), axis=-1)
     return [along, across, above]
+
+
+def _arrays(*values: Array) -> tuple[Array, ...]:
+    """Arrays and tensors as they are, anything else as an array of numbers."""
+    if all(hasattr(value, "shape") for value in values):
+        return values
+    try:
+        return tuple(v if hasattr(v, "shape") else np.asarray(v, dtype=np.float64) for v in values)
+    except (TypeError, ValueError):
+        raise ValueError(f"actions, places and durations must be arrays of numbers, got {values!r}") from None
 
 
 def check_increasing_pair(name: str, pair: Any) -> None:
