@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
 from viapoint.envs.arguments import checked_actions, refuse_unknown
-from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.arms import ADULT, Arm
 from viapoint.envs.execution import SETTLING, Rollout
 from viapoint.envs.many_steps import ManyStepEnv, ManyStepVectorEnv
 from viapoint.envs.observation import FARTHEST, ObservationLayout
@@ -73,7 +72,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
 
     Args:
         num_envs: Number of environments N.
-        arm: The arm that moves.
+        arm: The arm that moves, a record or the name of one.
         whole_arm: Whether the links must clear the obstacles, too, or the hand alone.
         n_obstacles: An exact number, or the fewest and the most.
         control_step: Time for which an action holds, [s].
@@ -91,7 +90,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         self,
         num_envs: int = 1,
         *,
-        arm: Arm = ADULT,
+        arm: Arm | str = ADULT,
         whole_arm: bool = False,
         n_obstacles: int | tuple[int, int] = (1, 5),
         control_step: float = 0.04,
@@ -113,7 +112,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
             raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
         super().__init__(num_envs, reward_weights=weights, **kwargs)
         EzPickle.__init__(self, num_envs, control_step=control_step, reward_weights=reward_weights, **kwargs)
-        timestep = self._simulator.timestep
+        arm, timestep = self.arm, self._simulator.timestep
         self.steering = Steering(dimension=arm.dimension, control_step=control_step, timestep=timestep)
         """What the components of an action mean."""
         limit = self.task.action.duration_range[1] + SETTLING

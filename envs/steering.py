@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ from viapoint.envs.action import frame
 Float = NDArray[np.float64]
 
 AXES = ("along", "across", "above")
+ROUNDING = 1e-6
+"""Relative difference that numbers of single precision may make."""
 
 
 class Motion(NamedTuple):
@@ -66,13 +69,20 @@ class Steering:
 
     def __post_init__(self) -> None:
         """Refuse a control step that is no multiple of the physics step."""
-        value: Any = self.control_step
-        number = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
-        steps = value / self.timestep if number else 0.0
-        if not (number and 1.0 - 1e-9 <= steps <= 500.0 and abs(steps - round(steps)) < 1e-6):
+        given: Any = self.control_step
+        number = isinstance(given, Real) and not isinstance(given, bool)
+        value = float(given) if number else 0.0
+        steps = value / self.timestep
+        if not (
+            1.0 - ROUNDING <= steps <= 500.0 * (1.0 + ROUNDING)
+            and abs(steps - round(steps)) < ROUNDING * steps
+        ):
             raise ValueError(
-                f"control_step must be 1 to 500 physics steps of {self.timestep} s, got {self.control_step!r}"
+                f"control_step must be 1 to 500 physics steps of {self.timestep} s, got {given!r}"
             )
+        exact = round(steps) * self.timestep
+        # A number of single precision stands for the multiple that it is nearest to.
+        object.__setattr__(self, "control_step", value if abs(value - exact) < 1e-12 else exact)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,11 +1,14 @@
 """The tasks with an action in every control step."""
 
 import itertools
+import pickle
+from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.execution import SETTLING
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import STEP_TASKS, twin_of
@@ -101,6 +104,35 @@ def test_encode_is_the_inverse_of_decode(steering):
 def test_a_control_step_is_some_physics_steps(control_step):
     with pytest.raises(ValueError, match="control_step must be 1 to 500 physics steps"):
         gym.make(STEP, control_step=control_step)
+
+
+def test_a_control_step_of_single_precision_is_the_multiple_that_it_stands_for():
+    for steps in range(1, 501):
+        given = steps * 0.002
+        assert Steering(control_step=np.float32(given)).control_step == pytest.approx(given, abs=1e-12)
+        assert Steering(control_step=given).control_step == given
+    assert Steering(control_step=np.float32(0.04)) == Steering(control_step=Fraction(1, 25)) == Steering()
+    env = gym.make(STEP, control_step=np.float32(0.04)).unwrapped
+    assert env.observation_layout == gym.make(STEP).unwrapped.observation_layout
+
+
+@pytest.mark.parametrize("record", [ADULT, PANDA], ids=lambda record: record.name)
+def test_an_arm_by_name_is_its_record(record):
+    """In space, too."""
+    results = []
+    for arm in (record, record.name):
+        env = pickle.loads(pickle.dumps(gym.make(STEP, arm=arm, whole_arm=True).unwrapped))
+        first, _ = env.reset(seed=3)
+        assert env.task.arm.name == record.name
+        assert env.action_space.shape == (record.dimension,)
+        results.append((first, env.step(np.full(record.dimension, 0.2, np.float32))))
+    (first, (seen, reward, *_, info)), (same, (like, paid, *_, told)) = results
+    for one, other in ((first, same), (seen, like)):
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+    assert (reward, info) == (paid, told)
+    with pytest.raises(ValueError, match=r"arm must be a record or one of planar, panda.*, got 'hand'"):
+        gym.make(STEP, arm="hand")
 
 
 def test_it_arrives_where_nothing_is_in_the_way():
