@@ -21,8 +21,10 @@ def register_arm(arm: Arm) -> None:
     Files of runs and models hold no more of an arm than its name: whoever loads one makes the arm known first.
 
     Raises:
+        TypeError: It is no record of an arm.
         ValueError: Another arm is known by that name.
     """
+    _check_record(arm)
     if ARMS.setdefault(arm.name, arm) != arm:
         raise ValueError(f"another arm is known as {arm.name!r}; give this one another name")
 
@@ -38,10 +40,14 @@ def arm_of(arm: Any) -> Arm:
         if arm not in ARMS:
             raise ValueError(f"arm must be a record or one of {', '.join(ARMS)}, got {arm!r}; {OF_ONES_OWN}")
         return ARMS[arm]
-    if not hasattr(arm, "reach_margin"):
-        raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
+    _check_record(arm)
     found: Arm = arm
     return found
+
+
+def _check_record(arm: Any) -> None:
+    if not hasattr(arm, "reach_margin") or not isinstance(getattr(arm, "name", None), str):
+        raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
 
 
 __all__ = ["ADULT", "ARMS", "PANDA", "Arm", "arm_of", "register_arm"]

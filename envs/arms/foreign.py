@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.arms.given import one_for_each, ranges_of
+
 Float = NDArray[np.float64]
 
 VELOCITY = 2.0
@@ -45,27 +47,29 @@ def read_foreign(
     """Read and check a file; see :func:`~viapoint.envs.arms.own_arm.from_mjcf`."""
     if not path.is_file():
         raise ValueError(f"there is no file {str(path)!r}")
-    spec = mujoco.MjSpec.from_file(str(path))
+    spec = _read(path)
     _known("site", (hand_site,), [site.name for site in spec.sites])
     _known("joint", joints, [joint.name for joint in spec.joints])
-    whole = spec.compile()
+    whole = _compiled(spec, path)
     ranges = _ranges(whole, joints, joint_range)
     torque = (
-        _torques(whole, joints) if torque_limit is None else _numbers("torque_limit", torque_limit, joints)
+        _torques(whole, joints)
+        if torque_limit is None
+        else one_for_each("torque_limit", torque_limit, joints)
     )
     if (
         velocity_limit is None
         and mujoco.mj_name2id(whole, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0
     ):
         velocity_limit = whole.numeric("velocity_limit").data
-    velocity = _numbers("velocity_limit", VELOCITY if velocity_limit is None else velocity_limit, joints)
+    velocity = one_for_each("velocity_limit", VELOCITY if velocity_limit is None else velocity_limit, joints)
     for name, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (np.isfinite(limit).all() and (limit > 0.0).all()):
             raise ValueError(f"{name} must be positive and finite, got {limit}")
     if home is None:
         address = [int(whole.joint(joint).qposadr[0]) for joint in joints]
         home = whole.key_qpos[0, address] if whole.nkey else ranges.mean(axis=1)
-    home = _numbers("home", home, joints)
+    home = one_for_each("home", home, joints)
     outside = [
         joint for joint, q, (low, high) in zip(joints, home, ranges, strict=True) if not low <= q <= high
     ]
@@ -74,6 +78,24 @@ def read_foreign(
     model = _alone(spec, joints)
     _check_order(model, joints, hand_site)
     return Foreign(model, joints, hand_site, home, ranges, torque, velocity)
+
+
+def _read(path: Path) -> mujoco.MjSpec:
+    """The file, in which something must be there to collide."""
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} is no MJCF file that MuJoCo can read: {error}") from None
+    if not spec.geoms:
+        raise ValueError(f"there are no geoms in {str(path)!r}: there is nothing to collide")
+    return spec
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo can make no model of {str(path)!r}: {error}") from None
 
 
 def _known(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
@@ -97,10 +119,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float
                 f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
             )
     if given is not None:
-        ranges = np.asarray(given, dtype=np.float64)
-        if ranges.shape != (len(joints), 2) or not (ranges[:, 0] < ranges[:, 1]).all():
-            raise ValueError(f"joint_range must be {len(joints)} pairs in increasing order, got {given!r}")
-        return ranges
+        return ranges_of(given, joints)
     return np.array([model.joint(name).range for name in joints])
 
 
@@ -132,15 +151,6 @@ def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
         gain = abs(float(model.actuator_gainprm[index, 0]))
         return gear * gain * float(np.abs(model.actuator_ctrlrange[index]).min())
     return np.nan
-
-
-def _numbers(name: str, values: Any, joints: tuple[str, ...]) -> Float:
-    try:
-        return np.array(np.broadcast_to(np.asarray(values, dtype=np.float64), (len(joints),)))
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} must be {len(joints)} numbers, one for each joint, got {values!r}"
-        ) from None
 
 
 def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjModel:

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.capsule_fit import around_points, surface
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.foreign import Foreign, read_foreign
+from viapoint.envs.arms.given import box_of, name_of, names_of, point_of, radius_of
 from viapoint.envs.arms.mjcf import serial_arm
 from viapoint.envs.arms.models import at_zero, chain_of, in_frame, joint_frames, moving_with, read_spec
 from viapoint.envs.arms.posture_map import Box, solve_map
 from viapoint.envs.arms.reachable import FIRST_OFF_TABLE, Body, Reachable
 from viapoint.envs.arms.serial import SerialArm
+from viapoint.envs.arms.sufficient import check_room, check_strength, postures_at_corners
 
 Float = NDArray[np.float64]
 Frames = list[tuple[Float, Float]]
@@ -64,32 +66,40 @@ def from_mjcf(
         hand_radius: [m].
 
     Raises:
-        ValueError: Something is missing, with what there is.
+        ValueError: Something is missing, with what there is, or the arm is too weak or has too little room.
     """
+    given = None if workspace is None else box_of(workspace)
+    there = None if origin is None else point_of("origin", origin)
+    hand_radius = radius_of(hand_radius)
+    name = name_of(Path(path).stem if name is None else name)
     foreign = read_foreign(
         Path(path),
         hand_site,
-        tuple(joints),
+        names_of(joints),
         home=home,
         joint_range=joint_range,
         torque_limit=torque_limit,
         velocity_limit=velocity_limit,
     )
     frames = joint_frames(foreign.model, foreign.joints)
-    zero = np.array([*frames[0][1][:2], 0.0]) if origin is None else np.asarray(origin, dtype=np.float64)
+    zero = np.array([*frames[0][1][:2], 0.0]) if there is None else there
     bodies = _bodies(foreign, frames, hand_radius)
     chain = chain_of(_written(foreign, frames, zero, bodies, [], hand_radius).compile(), foreign.joints)
     hand_at = in_frame(frames[-1], at_zero(foreign.model).site(hand_site).xpos)
     reachable = Reachable(chain, hand_at, foreign, bodies, hand_radius)
-    box = reachable.box(None if workspace is None else np.asarray(workspace, dtype=np.float64))
-    return serial_arm(
+    check_strength(foreign, chain, foreign.home[None], ["at home"])
+    box = reachable.box(given)
+    arm = serial_arm(
         _written(foreign, frames, zero, bodies, reachable.touching, hand_radius).to_xml(),
-        name=name or Path(path).stem,
+        name=name,
         joint_names=foreign.joints,
         hand_site="hand",
         place=solve_map(chain, hand_at, foreign.home, box),
-        workspace=_inside(box) if workspace is None else _box(workspace),
+        workspace=_inside(box) if given is None else _box(given),
     )
+    check_room(arm, box)
+    check_strength(foreign, chain, *postures_at_corners(arm))
+    return arm
 
 
 def _bodies(foreign: Foreign, frames: Frames, hand_radius: float) -> list[Body]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.chain import Chain, Constants
 from viapoint.envs.arms.foreign import Foreign
+from viapoint.envs.arms.given import BOUND
 from viapoint.envs.arms.posture_map import Box, hand_pose, solve_postures
 from viapoint.envs.clearance import segment_distance_squared
 
@@ -17,8 +18,6 @@ Bool = NDArray[np.bool_]
 
 SPACING, FAR = 0.05, 0.45
 """Of the places that are tried, and how far from home, [m]."""
-BOUND = 0.95
-"""Greatest coordinate, [m]: observations end at 1."""
 CLOSE, TURNED, SPARE = 2e-4, 0.35, 0.05
 """How near the hand must come [m], how far it may be turned [rad], how far inside their ranges joints stay [rad]."""
 ROOM = 0.01

@@ -154,6 +154,39 @@ def test_posture_in_torch_is_the_same_and_differentiable(arm):
         ({"torque_limit": -1.0}, "torque_limit must be positive"),
         ({"workspace": ((0.3, -0.2, 0.1), (1.2, 0.2, 0.3))}, r"does not get to \("),
         ({"home": (0.0, -1.57, 0.0, 0.0, 0.0, 0.0)}, "give another home"),
+        ({"workspace": (1, 2)}, r"workspace must be two opposite corners, .* got \(1, 2\)"),
+        ({"workspace": ((np.nan, 0.0, 0.1), (0.5, 0.2, 0.3))}, "workspace must be two opposite corners"),
+        ({"workspace": ((0.3, -0.2), (0.5, 0.2))}, "workspace must be two opposite corners"),
+        ({"workspace": "table"}, "workspace must be two opposite corners, .* got 'table'"),
+        ({"workspace": ((0.3, -1e9, 0.1), (0.5, 0.2, 0.3))}, r"does not get to \(0.3, -1e\+09, 0.1\) m"),
+        (
+            {"workspace": ((0.4, 0.1, 0.2), (0.45, 0.15, 0.25))},
+            "too small: start and goal are 0.3 to 0.5 m apart",
+        ),
+        ({"origin": (0.0, 0.0, np.nan)}, "origin must be three finite numbers, x, y and z in m, got"),
+        ({"origin": (0, 0)}, r"origin must be three finite numbers, .* got \(0, 0\)"),
+        ({"origin": "base"}, "origin must be three finite numbers, .* got 'base'"),
+        ({"joint_range": {}}, "joint_range must be 6 pairs of finite numbers in increasing order, got {}"),
+        ({"joint_range": [(-np.inf, np.inf)] * 6}, "joint_range must be 6 pairs of finite numbers"),
+        ({"joint_range": [(0.0, 1.0), (0.0,)]}, "joint_range must be 6 pairs of finite numbers"),
+        ({"velocity_limit": {}}, "velocity_limit must be 6 numbers"),
+        (
+            {"torque_limit": [1e-3] * 6},
+            "torque_limit of elbow is 0.001 N m, .* at home against gravity takes 21.6",
+        ),
+        (
+            {
+                "torque_limit": [150.0, 25.0, 25.0, 28.0, 28.0, 28.0]
+            },  # enough at home, where the elbow bears most
+            r"torque_limit of shoulder_lift is 25 N m, .* with its hand at \(0\..*\) m against gravity",
+        ),
+        ({"hand_radius": 0}, "hand_radius must be a positive number of m, .* got 0"),
+        ({"hand_radius": -1}, "hand_radius must be a positive number"),
+        ({"hand_radius": np.nan}, "hand_radius must be a positive number"),
+        ({"hand_radius": "small"}, "hand_radius must be a positive number"),
+        ({"joints": 5}, "joints must be names, in order from the base to the hand, got 5"),
+        ({"joints": "elbow"}, "joints must be names"),
+        ({"name": 5}, "name must be a string"),
     ],
 )
 def test_what_is_missing_is_named(changes, message):
@@ -183,6 +216,39 @@ def test_joints_need_limits_and_torques(tmp_path):
             Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
     with pytest.raises(ValueError, match="no file"):
         Arm.from_mjcf(tmp_path / "none.xml", hand_site="hand", joints=JOINTS)
+
+
+def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
+    arm = ur5e(workspace=((0.58, 0.4, 0.35), (0.3, -0.4, 0.1)))
+    assert arm == ur5e(workspace=((0.3, -0.4, 0.1), (0.58, 0.4, 0.35)))
+    assert arm.workspace == ((0.3, -0.4, 0.1), (0.58, 0.4, 0.35))
+    gym.make("viapoint/Reach-v0", arm=arm).reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda text: re.sub(r"<geom[^>]*/>", "", text),
+            "there are no geoms in .*: there is nothing to collide",
+        ),
+        (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo can make no model of .*arm.xml.*mass"),
+        (lambda text: text[:-20], "arm.xml' is no MJCF file that MuJoCo can read"),
+    ],
+)
+def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
+    path = tmp_path / "arm.xml"
+    path.write_text(change(UR5E.read_text(encoding="utf-8")), encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
+
+
+@pytest.mark.parametrize("thing", [3, None, "panda", Arm])
+def test_only_records_are_registered(thing):
+    known = dict(ARMS)
+    with pytest.raises(TypeError, match=r"arm must be a record of viapoint\.envs\.arms, got"):
+        register_arm(thing)
+    assert known == ARMS
 
 
 def test_goals_out_of_reach_and_obstacles_at_the_start_are_refused_with_the_reason(arm):
