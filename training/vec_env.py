@@ -68,12 +68,15 @@ class ViaVecEnv(VecEnv):
         return self._steps_before + int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
     def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
-        """Options of the next reset: batched as the environment takes them, or a list of one per copy."""
+        """Options of the next reset: batched as the environment takes them, or a list of one per copy.
+
+        Raises:
+            ValueError: There is not one mapping per copy, or they give different things.
+        """
         if options is None or isinstance(options, Mapping):
             self._batched_options = options
         else:
-            names = options[0] if options else {}
-            self._batched_options = {name: np.stack([each[name] for each in options]) for name in names}
+            self._batched_options = _batched(options, self.num_envs)
 
     def reset(self) -> Observation:
         """Start new episodes everywhere."""
@@ -195,3 +198,33 @@ class ViaVecEnv(VecEnv):
     def _rows(self, indices: Any) -> list[int]:
         chosen: Iterable[int] = self._get_indices(indices)
         return list(chosen)
+
+
+def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
+    """Options of each copy as those of all together."""
+    listed = isinstance(options, Sequence) and len(options) == num_envs
+    if not listed or not all(isinstance(each, Mapping) for each in options):
+        raise ValueError(
+            f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
+        )
+    names = list(options[0])
+    for copy, each in enumerate(options):
+        if set(each) != set(names):
+            raise ValueError(
+                f"options must give the same for every copy: {_listed(names)} for copy 0, "
+                f"but {_listed(each)} for copy {copy}"
+            )
+    batched = {}
+    for name in names:
+        parts = [np.asarray(each[name]) for each in options]
+        shapes = [part.shape for part in parts]
+        if len(set(shapes)) > 1:
+            raise ValueError(
+                f"options[{name!r}] must have the same shape for every copy, got {', '.join(map(str, shapes))}"
+            )
+        batched[name] = np.stack(parts)
+    return batched
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(map(repr, names)) or "nothing"

@@ -164,6 +164,27 @@ def test_seeds_options_and_attributes(env):
     assert env.env_method("__str__", indices=1) == [str(env.venv.unwrapped)]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([{"start": 0.0}, *[{}] * 5], "the same for every copy: 'start' for copy 0, but nothing for copy 1"),
+        ([*[{}] * 5, {"goal": 0.0}], "the same for every copy: nothing for copy 0, but 'goal' for copy 5"),
+        ([{}] * 5, "a list of 6, one for each copy"),
+        ([5] * 6, "a list of 6, one for each copy"),
+        (5, "options must be a mapping, or a list of 6, one for each copy, got 5"),
+        (
+            [{"obstacles": np.zeros((k % 2, 5))} for k in range(6)],
+            r"options\['obstacles'\] must have the same shape for every copy, got \(0, 5\), \(1, 5\)",
+        ),
+    ],
+)
+def test_options_that_copies_cannot_share_are_refused(env, options, message):
+    with pytest.raises(ValueError, match=message):
+        env.set_options(options)
+    env.set_options([{}] * 6)
+    env.reset()
+
+
 def test_a_restored_state_goes_on_alike(env):
     env.reset()
     env.step(actions(env))
