@@ -45,6 +45,13 @@ def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
         )
 
 
+def reset_options(options: Any) -> dict[str, Any]:
+    """A copy of what `reset(options=...)` was given."""
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
+    return dict(options or {})
+
+
 def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
     """The environments that a reset mask names; without a mask, all."""
     if mask is None:
@@ -63,9 +70,12 @@ def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
     """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
     shape = (num_envs, len(names))
     try:
-        array = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"action must be numbers of shape {shape}, got {actions!r}") from None
+        given = np.asarray(actions)
+    except (TypeError, ValueError):  # rows of different lengths, say
+        raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}") from None
+    if given.dtype.kind not in "fiu":
+        raise ValueError(f"action must be real numbers of shape {shape}, got {given.dtype}: {actions!r}")
+    array = given.astype(np.float64, copy=False)
     if array.shape != shape:
         raise ValueError(f"action must have shape {shape} ({', '.join(names)}), got {array.shape}")
     if not np.isfinite(array).all():

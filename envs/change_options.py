@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.courses import MOST_JUMPS
-from viapoint.envs.scene_options import numbers
+from viapoint.envs.scene_options import GIVEN, numbers, refuse_unknown_options
 
 Float = NDArray[np.float64]
 
@@ -30,8 +30,9 @@ def given_changes(
         n_rows: Obstacles of a scene at most, n.
 
     Raises:
-        ValueError: An array is not finite or has another shape, or a course belongs to no obstacle.
+        ValueError: An array is not finite or has another shape, a course belongs to no obstacle, or a name is unknown.
     """
+    refuse_unknown_options(options, (*GIVEN, *CHANGES))
     jumps, courses = None, None
     if "jumps" in options:
         jumps = _padded("jumps", options["jumps"], (number, MOST_JUMPS, dimension + 1))

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 from gymnasium.wrappers import RecordVideo
+
+EVERY_FRAME = "rgb_array_list"
+"""The render mode with all frames of a movement."""
 
 
 class RecordMovements(RecordVideo[Any, Any]):
@@ -14,13 +18,22 @@ class RecordMovements(RecordVideo[Any, Any]):
     last frame of the list, unless `render()` is called after `step()`. Here one step is a whole movement, and
     all frames of it are kept. The arguments are those of `RecordVideo`; moviepy must be installed.
 
+    Raises:
+        ValueError: The environment's `render_mode` is another than `rgb_array_list`.
+
     >>> import gymnasium as gym
     >>> env = gym.make("viapoint.envs:viapoint/PlanarReach-v0", render_mode="rgb_array_list")
     >>> env = RecordMovements(env, "videos")  # doctest: +SKIP
     """
 
+    def __init__(self, env: gym.Env[Any, Any], *args: Any, **kwargs: Any) -> None:
+        if env.render_mode != EVERY_FRAME:
+            raise ValueError(
+                f"RecordMovements films every frame of a movement and needs render_mode={EVERY_FRAME!r}, "
+                f"got {env.render_mode!r}; RecordVideo of Gymnasium keeps one frame of each step"
+            )
+        super().__init__(env, *args, **kwargs)
+
     def _capture_frame(self) -> None:
         frames: Any = self.env.render()
-        if not isinstance(frames, list):
-            frames = [frames]
         self.recorded_frames.extend(frames)

@@ -14,7 +14,7 @@ from viapoint.envs.scenes import Scenes, check_scenes, problems
 
 Float = NDArray[np.float64]
 
-GIVEN = {"start", "goal", "obstacles"}
+GIVEN = ("start", "goal", "obstacles")
 """What options may give."""
 ATTEMPTS = 50
 """How often start and goal are drawn until given obstacles leave room for them."""
@@ -46,7 +46,7 @@ def draw_given(
     given = given_scenes(options, nothing, arm)
     with np.errstate(invalid="ignore"):
         check_scenes(given, arm, whole_arm=whole_arm)  # comparisons with what is not given are false
-    if set(options) >= GIVEN:
+    if set(options) >= set(GIVEN):
         return given
     scenes = _drawn(options, sampler, generators, given)
     for _ in range(ATTEMPTS):
@@ -93,13 +93,9 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
     Raises:
         ValueError: An array is not finite or has another shape, or a name is unknown.
     """
-    unknown = set(options) - GIVEN
-    if unknown:
-        raise ValueError(
-            f"reset options know start, goal, obstacles and reset_mask, not {', '.join(sorted(map(repr, unknown)))}"
-        )
+    refuse_unknown_options(options, GIVEN)
     number, rows = sampled.obstacles.shape[:2]
-    fields = {name: getattr(sampled, name).copy() for name in ("start", "goal", "obstacles")}
+    fields = {name: getattr(sampled, name).copy() for name in GIVEN}
     for name in ("start", "goal"):
         if name in options:
             fields[name][:] = _broadcast(name, options[name], (number, arm.dimension))
@@ -117,6 +113,13 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
             "obstacles", given, (number, count, 2 * arm.dimension + 1)
         )
     return Scenes(**fields)
+
+
+def refuse_unknown_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse options that there are not, with those that there are."""
+    unknown = sorted(repr(name) for name in options if name not in known)
+    if unknown:
+        raise ValueError(f"reset options know {', '.join(known)} and reset_mask, not {', '.join(unknown)}")
 
 
 def _broadcast(name: str, value: Any, shape: tuple[int, ...]) -> Float:

@@ -1,0 +1,101 @@
+"""What is refused at the border, in one error that names the offender, what came and what is allowed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers.vector import FlattenObservation, NormalizeObservation
+
+import viapoint.envs
+from viapoint.envs.arguments import reset_options
+from viapoint.envs.recording import RecordMovements
+from viapoint.envs.registration import ONLINE_TASKS
+
+PLANAR = (
+    "viapoint/PlanarObstacles-v0",
+    "viapoint/PlanarObstaclesStep-v0",
+    "viapoint/PlanarMovingObstacles-v0",
+)
+"""One of each kind."""
+
+assert viapoint.envs, "importing it registers the environments"
+
+
+@pytest.fixture(params=PLANAR)
+def env_id(request):
+    return request.param
+
+
+@pytest.mark.parametrize(
+    "kind", [lambda a: a.astype(str), lambda a: a.astype(bool), lambda a: a + 0j, lambda a: a.astype(object)]
+)
+def test_actions_are_real_numbers(env_id, kind):
+    single, batch = gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1)
+    for env in (single, batch):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, \d\), got .*: "):
+            env.step(kind(np.ones(env.action_space.shape)))
+        env.step(np.zeros(env.action_space.shape, dtype=np.int8))  # nothing was done by it
+        env.close()
+
+
+def test_actions_of_different_lengths_are_refused_in_our_words(env_id):
+    env = gym.make_vec(env_id, num_envs=2, threads=1)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be real numbers of shape"):
+        env.step([[0.0], [0.0, 0.0]])
+    env.close()
+
+
+@pytest.mark.parametrize("options", [5, "abc", [1, 2], 0, np.zeros(2)])
+def test_options_are_a_mapping(env_id, options):
+    env = gym.make(env_id).unwrapped
+    with pytest.raises(ValueError, match="options must be a mapping from names to values, or None, got"):
+        env.reset(options=options)
+
+
+def test_options_are_copied():
+    given = {"start": (0.0, 0.4)}
+    reset_options(given).pop("start")
+    assert given == {"start": (0.0, 0.4)}
+    assert reset_options(None) == {}
+
+
+def test_an_unknown_option_is_answered_with_those_that_there_are(env_id):
+    known = "start, goal, obstacles"
+    known += ", jumps, courses" if env_id in ONLINE_TASKS else ""
+    env = gym.make_vec(env_id, num_envs=2, threads=1)
+    with pytest.raises(ValueError, match=f"^reset options know {known} and reset_mask, not 'speed'$"):
+        env.reset(options={"speed": 3})
+    env.close()
+
+
+def test_via_points_are_bounded_before_anything_is_made():
+    with pytest.raises(ValueError, match="n_via must be a whole number, 0 to 16, got 1000000000"):
+        gym.make(PLANAR[0], n_via=10**9)
+    env = gym.make(PLANAR[0], n_via=16).unwrapped
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", [None, "human", "rgb_array"])
+def test_movements_are_recorded_of_every_frame_or_not_at_all(mode, tmp_path):
+    env = gym.Wrapper(gym.Env())
+    env.env.render_mode = mode
+    with pytest.raises(ValueError, match=f"needs render_mode='rgb_array_list', got {mode!r}"):
+        RecordMovements(env, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "wrap", [FlattenObservation, lambda env: NormalizeObservation(FlattenObservation(env))]
+)
+def test_vector_wrappers_of_gymnasium_take_what_the_page_says(wrap):
+    with pytest.raises(ValueError, match="Expected autoreset_mode to be NEXT_STEP or DISABLED"):
+        wrap(gym.make_vec(PLANAR[0], num_envs=2, threads=1))
+    env = wrap(gym.make_vec(PLANAR[0], num_envs=2, vectorization_mode="sync"))
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (2, 36)
+    for _ in range(3):
+        seen, *_ = env.step(env.action_space.sample())
+        assert np.isfinite(seen).all()
+    env.close()
