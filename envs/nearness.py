@@ -10,7 +10,9 @@ Single = NDArray[np.float32]
 CACHED = 24_000
 """Bounds that are computed together: few enough for the cache."""
 ROUNDING = np.float32(4e-6)
-"""More than what rounding adds to a squared distance of places within two metres of the origin, [m^2]."""
+"""More than what rounding adds to a squared distance of places within NEAR of the origin, [m^2]."""
+NEAR = np.float32(2.0)
+"""Where places are expected; rounding grows with the square of their distance from the origin, [m]."""
 
 
 def ball_bounds(centres: Single, radii: Single, obstacles: NDArray[np.floating]) -> Single:
@@ -30,8 +32,10 @@ def ball_bounds(centres: Single, radii: Single, obstacles: NDArray[np.floating])
     points = np.concatenate((centres, square, np.ones_like(square)), axis=1)
     centre, axis = obstacles[..., :3].astype(np.float32), obstacles[..., 3:6].astype(np.float32)
     length = (axis * axis).sum(axis=-1, keepdims=True)
+    farthest = max(float(np.sqrt(square.max(initial=0.0))), np.abs(obstacles[..., :6]).max(initial=0.0))
+    rounding = ROUNDING * max(np.float32(1.0), np.square(np.float32(farthest) / NEAR))
     apart = np.concatenate(
-        (-2.0 * centre, np.ones_like(length), (centre * centre).sum(axis=-1, keepdims=True) - ROUNDING),
+        (-2.0 * centre, np.ones_like(length), (centre * centre).sum(axis=-1, keepdims=True) - rounding),
         axis=-1,
     )
     double = np.concatenate(

@@ -64,6 +64,13 @@ def test_balls_are_bounded_from_below_and_closely(generator):
     assert slack[distance > 0.1].max() < 1e-4
 
 
+def test_balls_far_from_the_origin_are_bounded_from_below(generator):
+    rows, centres = obstacles(generator), generator.uniform(49.0, 51.0, (N, 3, 50)).astype(np.float32)
+    rows[..., :3] += 50.0
+    distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows))
+    assert (ball_bounds(centres, np.zeros(50, np.float32), rows) <= distance + 1e-6).all()
+
+
 @pytest.mark.parametrize("most", [-0.01, 1e-6, 0.05, np.inf])
 def test_least_clearance_is_exact_up_to_the_most_that_matters(generator, bodies, most):
     rows, margin = obstacles(generator), generator.uniform(0.0, 0.02, TIMES)
