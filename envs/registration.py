@@ -34,6 +34,7 @@ OWN_ARM_TASKS: dict[str, str] = {
 STEP_TASKS: dict[str, str] = {
     "viapoint/PlanarObstaclesStep-v0": "viapoint/PlanarObstacles-v0",
     "viapoint/PlanarWholeArmStep-v0": "viapoint/PlanarWholeArm-v0",
+    "viapoint/PandaObstaclesStep-v0": "viapoint/PandaObstacles-v0",
 }
 """Every id of a task with an action in every control step, and its twin, whose keyword arguments it sets.
 
