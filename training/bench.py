@@ -62,6 +62,7 @@ def run(config: BenchConfig, console: Console | None = None) -> None:
         )
     (console or Console()).print(table)
     if config.json is not None:
+        config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, {ratio.name: ratio._asdict() for ratio in ratios})
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import tyro
 
@@ -15,39 +14,21 @@ from viapoint.envs.registration import STEP_TASKS
 from viapoint.training.config_checks import (
     DEFAULT_ENV,
     check_env,
+    check_env_kwargs,
+    check_file,
+    check_folder,
+    check_has_scenes,
+    check_methods,
     check_one_source,
     check_whole,
     check_whole_movements,
 )
 from viapoint.training.discount import check_discount_unit
+from viapoint.training.hyperparameters import check_hyperparameters
+from viapoint.training.named_values import NamedValues
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
 C = TypeVar("C")
-
-
-def _from_words(words: list[str]) -> dict[str, Any]:
-    """NAME=VALUE ... as a dictionary; values are JSON where they can be, otherwise words."""
-    result: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals:
-            raise ValueError(f"must be NAME=VALUE, got {word!r}")
-        try:
-            result[name] = json.loads(value)
-        except ValueError:
-            result[name] = value
-    return result
-
-
-_NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(
-    nargs="*",
-    metavar="NAME=VALUE",
-    instance_from_str=_from_words,
-    is_instance=lambda value: isinstance(value, dict),
-    str_from_instance=lambda value: [f"{name}={json.dumps(each)}" for name, each in value.items()],
-)
-NamedValues = Annotated[dict[str, Any], _NAMED_VALUES]
-"""On the command line: NAME=VALUE NAME=VALUE ..."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +51,8 @@ class TrainConfig:
     out: Path | None = None
     """Run folder; runs/<environment>-<algorithm>-<seed> if not given."""
     resume: bool = False
-    """Go on with the run in the folder from its last checkpoint."""
+    """Go on with the run in the folder from its last checkpoint, with its own configuration; --n-timesteps may extend
+    it, other flags must be those that it began with."""
     eval_every: int | None = None
     """Decisions between two evaluations on the validation scenes, 0 for none; as the preset says if not given."""
     eval_scenes: int = 500
@@ -78,9 +60,9 @@ class TrainConfig:
     checkpoint_every: int | None = None
     """Decisions between two checkpoints; as the preset says if not given."""
     env_kwargs: NamedValues = field(default_factory=dict)
-    """Of the environment, for example n_via=2 timing=learned."""
+    """Of the environment; values are words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
-    """Of the algorithm, instead of its preset's, for example batch_size=256."""
+    """Of the algorithm, instead of its preset's; as env_kwargs, for example batch_size=256."""
     discount_unit: float | None = None
     """Seconds that count the discount gamma, where decisions take different time and the environment tells it;
     as the preset says if not given."""
@@ -102,6 +84,8 @@ class TrainConfig:
         for name, least in (("n_timesteps", 1), ("n_envs", 1), ("eval_every", 0), ("checkpoint_every", 1)):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), least)
+        check_env_kwargs(self.env_kwargs)
+        check_hyperparameters(self.algo, self.hyperparameters)
         if self.discount_unit is not None:
             check_discount_unit(self.algo, self.discount_unit, self.env)
 
@@ -153,7 +137,8 @@ class EvaluateConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """agent, straight, constant, random, random16, random80, planner, ompl."""
+    """agent, straight, constant, random, random16, random80, planner, ompl; where plans are revised on the way
+    unrevised, too: the first plan alone."""
     candidates: int = 0
     """If not 0, the agent gets a second row, in which its critic ranks so many actions at each decision."""
     compiled: bool = False
@@ -167,18 +152,24 @@ class EvaluateConfig:
     failures: Path | None = None
     """Folder for the agent's failures, sorted by kind: counts and pictures; of its last row in the table."""
     env: str | None = None
-    """Id of the environment where no agent says it."""
+    """Id of the environment where neither a run nor a pretrained agent says it."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
+        check_methods(self.methods)
         if self.env is not None:
             check_env(self.env)
         check_one_source(self.run, self.pretrained, needed="agent" in self.methods)
-        if not self.methods:
-            raise ValueError("methods must name at least one method")
+        if self.run is None and self.pretrained is None and self.env is None:
+            raise ValueError("without an agent, --env must say which environment is meant")
         check_whole("candidates", self.candidates, 0)
         if self.n_scenes is not None:
             check_whole("n_scenes", self.n_scenes, 1)
+        check_file("json", self.json)
+        check_folder("failures", self.failures)
+        for name in ("candidates", "compiled", "failures"):
+            if getattr(self, name) and "agent" not in self.methods:
+                raise ValueError(f"{name} concerns the agent, which is not among the methods")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +184,7 @@ class PlayConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     video: Path = Path("movements.mp4")
-    """File to write."""
+    """File to write, an MP4."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int = 8
@@ -204,6 +195,7 @@ class PlayConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         check_one_source(self.run, self.pretrained, needed=True)
+        check_file("video", self.video, ".mp4")
         check_whole("n_scenes", self.n_scenes, 1)
         check_whole("candidates", self.candidates, 0)
 
@@ -230,6 +222,7 @@ class BenchConfig:
         check_whole_movements(self.env)
         check_whole("num_envs", self.num_envs, 1)
         check_whole("repeats", self.repeats, 1)
+        check_file("json", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,6 +238,11 @@ class PaperConfig:
     """Run folder of the agent that goes around the rows of lights; the shipped one, or the planner, if not given."""
     guide: Path | None = None
     """Folder for the small pictures of docs/flash-hogan.md."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        check_folder("out", self.out)
+        check_folder("guide", self.guide)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,6 +269,8 @@ class DemoConfig:
         """Refuse what cannot be meant."""
         check_env(self.env)
         check_whole_movements(self.env)
+        check_has_scenes(self.env)
+        check_folder("out", self.out)
         check_whole("seed", self.seed, 0)
         check_whole("candidates", self.candidates, 1)
         for name in ("n_timesteps", "n_scenes"):
@@ -317,6 +317,7 @@ class ImportConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         check_env(self.env)
+        check_folder("out", self.out)
 
 
 def as_json(config: Any) -> dict[str, Any]:

@@ -7,15 +7,20 @@ from pathlib import Path
 import pytest
 
 from viapoint.training import config as configs
+from viapoint.training.baselines import METHODS, ONLINE_METHODS
 from viapoint.training.config import (
     BenchConfig,
     DemoConfig,
     EvaluateConfig,
+    ImportConfig,
+    PaperConfig,
     PlayConfig,
     TrainConfig,
     as_json,
     from_json,
 )
+from viapoint.training.config_checks import ELSEWHERE
+from viapoint.training.config_checks import METHODS as MEASURABLE
 from viapoint.training.model_files import ALGORITHMS
 from viapoint.training.presets import PRESETS
 
@@ -73,7 +78,24 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"n_envs": True}, "n_envs"),
         (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
         (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viatd3 decides on whole movements"),
+        (
+            TrainConfig,
+            {"env": "CartPole-v1"},
+            "viapoint/Reach-v0, viapoint/Obstacles-v0, .*got 'CartPole-v1'",
+        ),
+        (TrainConfig, {"hyperparameters": {"batch_size": -3}}, "batch_size of viatd3 must be a whole number"),
+        *[(TrainConfig, {"env_kwargs": {name: 1}}, f"{name} cannot be among") for name in ELSEWHERE],
         (EvaluateConfig, {}, "name a run folder"),
+        (EvaluateConfig, {"methods": ("magic",)}, "agent, straight, .* got 'magic'"),
+        (EvaluateConfig, {"methods": ("straight",)}, "--env must say"),
+        *[
+            (
+                EvaluateConfig,
+                {"run": Path("a"), "methods": ("straight",), name: value},
+                f"{name} concerns the agent",
+            )
+            for name, value in (("candidates", 8), ("compiled", True), ("failures", Path("b")))
+        ],
         (EvaluateConfig, {"run": Path("a"), "pretrained": "b"}, "not both"),
         (EvaluateConfig, {"run": Path("a"), "methods": ()}, "methods"),
         (EvaluateConfig, {"methods": ("planner",), "env": "nothing"}, "env"),
@@ -83,11 +105,59 @@ def test_nothing_is_shared_between_two_configurations():
         (BenchConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "an action is a whole movement"),
         (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}, "viapoint/PlanarWholeArm-v0 for one"),
         (DemoConfig, {"candidates": 0}, "candidates"),
+        (DemoConfig, {"env": "viapoint/Reach-v0"}, "viapoint/PandaReach-v0 for one"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(kind, values, named):
     with pytest.raises(ValueError, match=named):
         kind(**values)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "needed"),
+    [
+        (EvaluateConfig, "json", {"run": Path("a")}),
+        (PlayConfig, "video", {"run": Path("a")}),
+        (BenchConfig, "json", {}),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_refused_before_there_is_anything_to_write(
+    kind, name, needed, tmp_path
+):
+    (tmp_path / "file.mp4").write_text("")
+    (tmp_path / "folder.mp4").mkdir()
+    for good in ("file.mp4", "new.mp4", "deeper/new.mp4"):
+        kind(**needed, **{name: tmp_path / good})
+    for bad, reason in (
+        (tmp_path / "folder.mp4", "is a folder"),
+        (tmp_path / "file.mp4" / "new.mp4", r"file\.mp4 is no folder"),
+        (tmp_path / "file.mp4" / "deeper" / "new.mp4", r"file\.mp4 is no folder"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} .*{reason}"):
+            kind(**needed, **{name: bad})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "needed"),
+    [
+        (EvaluateConfig, "failures", {"run": Path("a")}),
+        (PaperConfig, "out", {}),
+        (PaperConfig, "guide", {}),
+        (DemoConfig, "out", {}),
+        (ImportConfig, "out", {"file": Path("a.zip")}),
+    ],
+)
+def test_a_folder_that_cannot_be_written_to_is_refused(kind, name, needed, tmp_path):
+    (tmp_path / "file").write_text("")
+    for good in (tmp_path, tmp_path / "new" / "deeper"):
+        kind(**needed, **{name: good})
+    for bad in (tmp_path / "file", tmp_path / "file" / "new"):
+        with pytest.raises(ValueError, match=f"{name} .* cannot be written: .*file is no folder"):
+            kind(**needed, **{name: bad})
+
+
+def test_every_method_can_be_named():
+    assert set(MEASURABLE) == {"agent", *METHODS, *ONLINE_METHODS}
 
 
 def test_unknown_names_in_a_file_are_refused():

@@ -1,0 +1,63 @@
+"""The table knows every hyperparameter, lets through what the algorithms use, and stops what makes no sense."""
+
+import inspect
+import math
+
+import pytest
+
+from viapoint.training.hyperparameters import HYPERPARAMETERS, PARTICULAR, check_hyperparameters
+from viapoint.training.model_files import ALGORITHMS, _argument_names, _encode
+from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, SPACE_PRESETS, STEP_PRESETS
+
+
+def test_every_hyperparameter_is_in_the_table():
+    names = set().union(*(_argument_names(kind) for kind in ALGORITHMS.values()))
+    assert set(HYPERPARAMETERS) == names
+    assert set(PARTICULAR) <= set(ALGORITHMS)
+    assert all(set(table) <= names for table in PARTICULAR.values())
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_what_the_algorithms_and_the_presets_use_is_allowed(algo):
+    for table in (PRESETS, STEP_PRESETS, REACH_PRESETS, SPACE_PRESETS, ONLINE_PRESETS):
+        if algo in table:
+            check_hyperparameters(algo, table[algo].arguments())
+    defaults = {
+        each.name: _encode(each.default)
+        for each in inspect.signature(ALGORITHMS[algo]).parameters.values()
+        if each.name in HYPERPARAMETERS and each.default is not each.empty
+    }
+    assert len(defaults) > 8
+    check_hyperparameters(algo, defaults)
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf, "abc", -9, [], {"kind": "eval"}, "auto_0", "auto_1e"])
+def test_what_makes_no_sense_is_refused_with_what_is_allowed(value):
+    meant = {"target_entropy"} if value == -9 else {"policy_kwargs"} if isinstance(value, dict) else set()
+    for name in HYPERPARAMETERS.keys() - meant:
+        with pytest.raises(ValueError, match=f"hyperparameter {name} of sac must be .+, got"):
+            check_hyperparameters("sac", {name: value})
+
+
+@pytest.mark.parametrize(
+    ("algo", "name", "value"),
+    [
+        ("sac", "gamma", 7),
+        ("sac", "gamma", True),
+        ("viatd3", "gradient_steps", -9),
+        ("viatd3", "buffer_size", 0),
+        ("viatd3", "batch_size", 1.5),
+        ("viatd3", "batch_size", True),
+        ("viatd3", "learning_rate", 0.0),
+        ("viatd3", "learning_rate", {"kind": "linear", "start": 1.0}),
+        ("viatd3", "policy_kwargs", 3),
+        ("viatd3", "augment", 1),
+        ("ppo", "batch_size", 1),
+        ("ppo", "ent_coef", "auto"),
+        ("sac", "train_freq", [1, "episode"]),
+        ("sac", "action_noise", {"kind": "normal", "sigma": -0.1}),
+    ],
+)
+def test_ranges_and_types(algo, name, value):
+    with pytest.raises(ValueError, match=f"hyperparameter {name} of {algo} must be .+, got"):
+        check_hyperparameters(algo, {name: value})

@@ -1,0 +1,146 @@
+"""What hyperparameters may be, in one table: a value that makes no sense is refused before anything is made."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+
+class Allowed(NamedTuple):
+    """Values of one hyperparameter."""
+
+    words: str
+    """As an error says it, behind "must be"."""
+    fits: Callable[[Any], bool]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _whole(least: int) -> Allowed:
+    return Allowed(f"a whole number, {least} or more", lambda value: _is_whole(value, least))
+
+
+def _between(low: float, high: float) -> Allowed:
+    return Allowed(
+        f"a number from {low:g} to {high:g}", lambda value: _is_number(value) and low <= value <= high
+    )
+
+
+def _or(one: Allowed, other: Allowed) -> Allowed:
+    return Allowed(f"{one.words}, or {other.words}", lambda value: one.fits(value) or other.fits(value))
+
+
+def _is_linear(value: Any) -> bool:
+    return (
+        isinstance(value, Mapping)
+        and set(value) == {"kind", "start", "end", "end_fraction"}
+        and value["kind"] == "linear"
+        and all(_is_number(value[name]) and value[name] >= 0 for name in ("start", "end"))
+        and _is_number(value["end_fraction"])
+        and 0 < value["end_fraction"] <= 1
+    )
+
+
+def _is_normal(value: Any) -> bool:
+    named = isinstance(value, Mapping) and set(value) == {"kind", "sigma"} and value["kind"] == "normal"
+    return named and _is_number(value["sigma"]) and value["sigma"] >= 0
+
+
+def _is_automatic(value: Any) -> bool:
+    found = re.fullmatch(r"auto(_(?P<start>[0-9.]+(e-?[0-9]+)?))?", value) if isinstance(value, str) else None
+    try:
+        return found is not None and float(found["start"] or 1.0) > 0.0
+    except ValueError:
+        return False
+
+
+def _is_steps(value: Any) -> bool:
+    pair = isinstance(value, list | tuple) and len(value) == 2 and value[1] == "step"
+    return _is_whole(value, 1) or (pair and _is_whole(value[0], 1))
+
+
+FLAG = Allowed("true or false", lambda value: isinstance(value, bool))
+NONE = Allowed("null", lambda value: value is None)
+POSITIVE = Allowed("a number greater than 0", lambda value: _is_number(value) and value > 0)
+NOT_NEGATIVE = Allowed("a number, 0 or more", lambda value: _is_number(value) and value >= 0)
+FINITE = Allowed("a number", _is_number)
+LINEAR = Allowed('{"kind":"linear","start":S,"end":E,"end_fraction":F}', _is_linear)
+NORMAL = Allowed('{"kind":"normal","sigma":S}', _is_normal)
+AUTOMATIC = Allowed('"auto" or "auto_START"', _is_automatic)
+AUTO = Allowed('"auto"', lambda value: value == "auto")
+STEPS = Allowed('a whole number, 1 or more, or [N,"step"]', _is_steps)
+SETTINGS = Allowed('settings by name, {"net_arch":[256,256]}', lambda value: isinstance(value, Mapping))
+OBJECTIVE = Allowed("reward or log_success", lambda value: value in ("reward", "log_success"))
+SHARE = _between(0, 1)
+
+HYPERPARAMETERS: dict[str, Allowed] = {
+    "learning_rate": _or(POSITIVE, LINEAR),
+    "gamma": SHARE,
+    "batch_size": _whole(1),
+    "policy_kwargs": _or(SETTINGS, NONE),
+    # of algorithms with a replay buffer
+    "buffer_size": _whole(1),
+    "learning_starts": _whole(0),
+    "train_freq": STEPS,
+    "gradient_steps": _whole(-1),  # -1: as many as there were steps
+    "tau": SHARE,
+    "n_steps": _whole(1),
+    "action_noise": _or(NORMAL, NONE),
+    "optimize_memory_usage": FLAG,
+    # TD3
+    "policy_delay": _whole(1),
+    "target_policy_noise": NOT_NEGATIVE,
+    "target_noise_clip": NOT_NEGATIVE,
+    # SAC and TQC
+    "ent_coef": _or(NOT_NEGATIVE, AUTOMATIC),
+    "target_entropy": _or(FINITE, AUTO),
+    "target_update_interval": _whole(1),
+    "top_quantiles_to_drop_per_net": _whole(0),
+    "use_sde": FLAG,
+    "use_sde_at_warmup": FLAG,
+    "sde_sample_freq": _whole(-1),  # -1: at the beginning only
+    # PPO
+    "n_epochs": _whole(1),
+    "gae_lambda": SHARE,
+    "clip_range": _or(POSITIVE, LINEAR),
+    "clip_range_vf": _or(_or(POSITIVE, LINEAR), NONE),
+    "normalize_advantage": FLAG,
+    "vf_coef": NOT_NEGATIVE,
+    "max_grad_norm": POSITIVE,
+    "target_kl": _or(POSITIVE, NONE),
+    # ViaTD3
+    "explore_uniformly": SHARE,
+    "noise": NOT_NEGATIVE,
+    "temperature": POSITIVE,
+    "promising": _whole(1),
+    "others": _whole(0),
+    "further": _whole(0),
+    "fresh_scenes": _whole(1),
+    "augment": FLAG,
+    "objective": OBJECTIVE,
+    "smoothness": FLAG,
+}
+"""By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaTD3."""
+
+PARTICULAR: dict[str, dict[str, Allowed]] = {"ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)}}
+"""What is narrower for one algorithm."""
+
+
+def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
+    """Refuse values that make no sense; names that there are not are refused by whoever builds the model.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+    table = {**HYPERPARAMETERS, **PARTICULAR.get(algo, {})}
+    for name, value in values.items():
+        if name in table and not table[name].fits(value):
+            raise ValueError(f"hyperparameter {name} of {algo} must be {table[name].words}, got {value!r}")

@@ -1,0 +1,64 @@
+"""NAME=VALUE ... on the command line: names with values in JSON, or words."""
+
+from __future__ import annotations
+
+import ast
+import json
+from typing import Annotated, Any
+
+import tyro
+
+
+def from_words(words: list[str]) -> dict[str, Any]:
+    """NAME=VALUE ... as a dictionary; values are JSON where they can be, otherwise words.
+
+    Raises:
+        ValueError: A word has no name, a name is there twice, or a value is neither JSON nor a plain word.
+    """
+    result: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or not name:
+            raise ValueError(f"must be NAME=VALUE, got {word!r}")
+        if name in result:
+            raise ValueError(f"{name} is there twice, as {json.dumps(result[name])} and as {value}")
+        result[name] = _value(name, value)
+    return result
+
+
+def _value(name: str, text: str) -> Any:
+    try:
+        return json.loads(text, parse_constant=_refused)
+    except ValueError:
+        suggestion = _as_json(text)
+        if (
+            suggestion is None
+            and text[:1] not in tuple("[{(\"'")
+            and text.lower() not in ("nan", "inf", "-inf")
+        ):
+            return text
+    advice = f"{name}={suggestion}" if suggestion else "numbers, words, true, false, null, [1,8]"
+    raise ValueError(f"{name}={text} is no JSON, which values are written in: {advice}")
+
+
+def _as_json(text: str) -> str | None:
+    """JSON for what is a value in Python only, such as True and (1, 8)."""
+    try:
+        return json.dumps(ast.literal_eval(text), allow_nan=False, separators=(",", ":"))
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return None
+
+
+def _refused(constant: str) -> Any:
+    raise ValueError(f"{constant} is no JSON number")
+
+
+_NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=from_words,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda value: [f"{name}={json.dumps(each)}" for name, each in value.items()],
+)
+NamedValues = Annotated[dict[str, Any], _NAMED_VALUES]
+"""On the command line: NAME=VALUE NAME=VALUE ..."""
