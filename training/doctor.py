@@ -229,7 +229,9 @@ def processors() -> str:
 
 def disk(folder: Path) -> str:
     """Write a file where runs are to be, or would be made."""
-    place = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+    place = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    if not place.is_dir():
+        raise NotADirectoryError(f"{place} is no folder")
     with tempfile.NamedTemporaryFile(dir=place) as file:
         file.write(bytes(1 << 20))
         file.flush()

@@ -77,13 +77,16 @@ def film(
         pause: How long each result stays, [s].
 
     Raises:
-        ValueError: The environment renders otherwise, or there is nothing to film.
+        ValueError: The path is of another kind, the environment renders otherwise, or there is nothing to film.
     """
+    path = Path(path)
+    if path.suffix.lower() != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {path}")
     if env.render_mode != "rgb_array_list":
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
-    camera, path = Camera(env), Path(path)
+    camera = Camera(env)
     part = path.with_name(f".{path.stem}.part.mp4")
     try:
         count = _write(part, _scenes(camera, scenes, decide, name, pause * speed), camera.fps * speed)

@@ -102,6 +102,14 @@ def test_a_disk_that_cannot_be_written_or_is_full(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_is_no_place_for_runs(tmp_path):
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "runs"):
+        finding = doctor.attempt("disk", lambda place=place: doctor.disk(place), "")
+        assert not finding.works
+        assert f"{tmp_path / 'file'} is no folder" in finding.found
+
+
 @pytest.fixture
 def broken(tmp_path):
     """What an upgrade of MuJoCo 3 in place leaves: a record of files that are gone, and a package without content."""

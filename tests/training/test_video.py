@@ -98,6 +98,9 @@ def test_without_opengl_a_film_is_drawn_and_one_line_names_the_package(env, tmp_
 
 
 def test_a_film_needs_lists_of_frames_and_a_scene(env, tmp_path):
+    for name in ("film.gif", "film.foo", "film"):
+        with pytest.raises(ValueError, match=rf"must end in \.mp4, got .*{name}"):
+            film(tmp_path / name, env, scenes_of(env, 1), straight)
     with pytest.raises(ValueError, match="rgb_array_list"):
         film(tmp_path / "film.mp4", gym.make(OBSTACLES), scenes_of(env, 1), straight)
     with pytest.raises(ValueError, match="at least one scene"):
