@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import importlib
 import io
@@ -70,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = [word for word in words if word != "--debug"]
     try:
         config = parse(words)
+        if isinstance(config, TrainConfig) and config.resume:
+            _check_resumed(config, words)
         next(command for command in COMMANDS.values() if type(config) is command.config)(config)
     except KeyboardInterrupt:
         _leave("stopped", 130)
@@ -79,14 +82,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _leave(_one_line(error), getattr(error, "exit_code", 2))
 
 
-def parse(words: Sequence[str]) -> Any:
+def parse(words: Sequence[str], usual: Any = None) -> Any:
     """The configuration that a command line stands for.
+
+    Args:
+        words: Of the command line, without the program's name.
+        usual: Of the command's configuration, what stands for everything that is not told; its defaults if not given.
 
     Raises:
         SystemExit: Help was asked for; code 0.
         UsageError: A word is not understood or not allowed.
     """
-    kinds = [Annotated[command.config, tyro.conf.subcommand(name=name)] for name, command in COMMANDS.items()]
+    kinds = [
+        Annotated[
+            command.config,
+            tyro.conf.subcommand(name=name, default=usual)
+            if isinstance(usual, command.config)
+            else tyro.conf.subcommand(name=name),
+        ]
+        for name, command in COMMANDS.items()
+    ]
     union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time
     complaint = io.StringIO()
     try:
@@ -102,6 +117,16 @@ def parse(words: Sequence[str]) -> Any:
         if not end.code:
             raise
         raise UsageError(_unboxed(complaint.getvalue())) from None
+
+
+def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
+    """Refuse flags that are not those of the run to resume, also where they say what is usual otherwise."""
+    from viapoint.training.runs import Run
+    from viapoint.training.train import check_unchanged
+
+    run = Run(config.folder)
+    usual = dataclasses.replace(run.config, out=config.out, resume=True)
+    check_unchanged(run, parse(words, usual), usual)
 
 
 def _unboxed(text: str) -> str:

@@ -25,6 +25,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.config import TrainConfig, as_json, from_json
+from viapoint.training.config_checks import check_folder
 from viapoint.training.files import (
     UNFINISHED,
     BadFileError,
@@ -36,7 +37,7 @@ from viapoint.training.files import (
 )
 from viapoint.training.model_files import load_model, save_model
 
-__all__ = ["BadFileError", "Run", "find_model", "load_model", "save_model", "versions"]
+__all__ = ["BadFileError", "Run", "check_free", "find_model", "load_model", "save_model", "versions"]
 
 KEPT_CHECKPOINTS = 2
 PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
@@ -54,7 +55,8 @@ class Run:
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise BadFileError(folder, "is no run folder: there is no such folder")
+            what = "it is a file" if folder.exists() else "there is no such folder"
+            raise BadFileError(folder, f"is no run folder: {what}")
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder
@@ -77,10 +79,10 @@ class Run:
             BadFileError: There is a run in it already, or something else.
         """
         folder = config.folder
-        _check_free(folder)
+        check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with _held(folder):
-            _check_free(folder)  # another process may have been faster
+            check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
             _write_config(folder, config)
         return cls(folder)
@@ -209,13 +211,17 @@ def _held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _check_free(folder: Path) -> None:
-    """Refuse a folder that holds more than a start left that got no further."""
+def check_free(folder: Path) -> None:
+    """Refuse a folder that cannot take a new run.
+
+    Raises:
+        BadFileError: It holds more than a start left that got no further, or is a file.
+        ValueError: It cannot be written to.
+    """
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
-    if not folder.exists():
-        return
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
+    check_folder("run folder", folder)
+    names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
     if names - begun - {"versions.json", "lock", "lock.pid"}:
         raise BadFileError(folder, "is not empty and is no run folder")

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from viapoint.training.config import TrainConfig
+from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.training.config import TrainConfig, as_json
+from viapoint.training.discount import ELAPSED
+from viapoint.training.files import BadFileError
 from viapoint.training.model_files import build
 from viapoint.training.monitor import Monitor, TrainingStoppedError
-from viapoint.training.runs import Run, versions
+from viapoint.training.runs import Run, check_free, versions
 from viapoint.training.timed_buffers import TellElapsed
 from viapoint.training.vec_env import ViaVecEnv
 
-__all__ = ["TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train"]
+__all__ = [
+    "TrainingFailedError", "TrainingStoppedError", "check_unchanged", "new_model", "one_thread", "resolved", "train",
+]  # fmt: skip
+
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
+"""What a call that resumes a run may tell anew."""
 
 
 class TrainingFailedError(Exception):
@@ -33,26 +44,26 @@ def train(config: TrainConfig) -> Run:
 
     Raises:
         BadFileError: The folder cannot take the run, or does not hold the one to resume.
+        ValueError: There is no such environment or model; nothing is left in the folder.
         TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
         TrainingFailedError: A file could not be written.
     """
-    run = Run(config.folder) if config.resume else Run.create(resolved(config))
-    with run.locked(), one_thread():
+    with one_thread():
         if config.resume:
-            _take_up(run, config)
-        env = ViaVecEnv(run.config.env, run.config.copies, **run.config.env_kwargs)
-        try:
-            model = new_model(run.config, env)
-            with _logging(model, run), Monitor(run) as monitor:
-                _learn(model, run, monitor)
-        except OSError as error:
-            raise TrainingFailedError(
-                f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
-                f"{run.decisions}, and viapoint train --resume goes on from there"
-            ) from error
-        finally:
-            env.close()
-    return run
+            run = Run(config.folder)
+            with run.locked():
+                _take_up(run, config)
+                with _built(run.config) as model:
+                    _carry_on(run, model)
+            return run
+        check_free(config.folder)
+        begun = resolved(config)
+        with _built(begun) as model:  # before there is a folder: what cannot be built leaves none
+            _check_tells_time(begun)
+            run = Run.create(begun)
+            with run.locked():
+                _carry_on(run, model)
+        return run
 
 
 def resolved(config: TrainConfig) -> TrainConfig:
@@ -80,6 +91,34 @@ def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     )
 
 
+def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
+    """Refuse to resume a run with settings that are not its own.
+
+    Args:
+        run: To be resumed.
+        config: What was asked for.
+        usual: What stands for everything that was not.
+
+    Raises:
+        BadFileError: Something was asked for that the run did not begin with.
+    """
+    begun, asked, default = (as_json(each) for each in (run.config, config, usual))
+    others = []
+    for name in asked.keys() - MAY_CHANGE:
+        values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}
+        known = begun[name] if isinstance(asked[name], dict) else begun
+        if asked[name] != default[name]:
+            others += [(name, each) for each in values if each not in known or known[each] != values[each]]
+    if others:
+        had = ", ".join(_told(begun, *each) for each in sorted(others))
+        wanted = ", ".join(_told(asked, *each) for each in sorted(others))
+        raise BadFileError(
+            run.folder,
+            f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
+            "leave these flags out, or name another folder",
+        )
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Run torch on one thread: fastest for small networks, and the same numbers on any number of cores."""
@@ -91,9 +130,80 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextmanager
+def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
+    """The untrained model that a resolved configuration asks for, on environments of its own.
+
+    Raises:
+        ValueError: There is no such environment or model.
+    """
+    try:
+        env = ViaVecEnv(config.env, config.copies, **config.env_kwargs)
+    except TypeError as error:
+        raise ValueError(f"env_kwargs of {config.env}: {error}") from error
+    try:
+        try:
+            model = new_model(config, env)
+        except (TypeError, AssertionError, KeyError, AttributeError) as error:
+            raise ValueError(f"{config.algo} cannot be made with these hyperparameters: {error}") from error
+        yield model
+    finally:
+        env.close()
+
+
+def _check_tells_time(config: TrainConfig) -> None:
+    """Refuse discounts by time where the first decision does not tell how long it took."""
+    if config.discount_unit is None:
+        return
+    env = ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)
+    try:
+        env.reset()
+        *_, infos = env.step(np.zeros((1, *(env.action_space.shape or ())), dtype=np.float32))
+    finally:
+        env.close()
+    if ELAPSED not in infos[0]:
+        raise ValueError(
+            f"discount_unit must be left out for {config.env}: its info does not tell as {ELAPSED!r} how long a "
+            f"decision took; that of {', '.join(ONLINE_TASKS)} does"
+        )
+
+
+def _carry_on(run: Run, model: BaseAlgorithm) -> None:
+    """Train from where the run is to its end.
+
+    Raises:
+        TrainingFailedError: A file could not be written.
+    """
+    try:
+        with _logging(model, run), Monitor(run) as monitor:
+            _learn(model, run, monitor)
+    except OSError as error:
+        raise TrainingFailedError(
+            f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
+            f"{run.decisions}, and viapoint train --resume goes on from there"
+        ) from error
+
+
+def _told(record: dict[str, Any], field: str, name: str) -> str:
+    """A setting as it is said: a field, or one name in a field of several."""
+    values = record if field == name else record[field]
+    return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
+
+
 def _take_up(run: Run, config: TrainConfig) -> None:
-    """Go on with a run's own configuration but for what this call may change."""
+    """Go on with a run's own configuration but for what this call may change.
+
+    Raises:
+        BadFileError: The call asks for something else, or for fewer decisions than there are.
+    """
+    check_unchanged(run, config, TrainConfig())
     if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
+        if config.n_timesteps < run.decisions:
+            raise BadFileError(
+                run.folder,
+                f"holds a run of {run.decisions} decisions already; n_timesteps must be as many or more, "
+                f"got {config.n_timesteps}",
+            )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         run.write_config()
     run.config = dataclasses.replace(run.config, progress=config.progress)

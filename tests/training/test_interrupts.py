@@ -185,14 +185,14 @@ def test_a_start_that_got_no_further_can_be_repeated(tmp_path):
 
 def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
     """The second finds a free folder, but the first is faster."""
-    folder, check = tmp_path / "run", runs._check_free
+    folder, check = tmp_path / "run", runs.check_free
 
     def slow(path):
         check(path)
-        monkeypatch.setattr(runs, "_check_free", check)
+        monkeypatch.setattr(runs, "check_free", check)
         Run.create(config(path, seed=1))
 
-    monkeypatch.setattr(runs, "_check_free", slow)
+    monkeypatch.setattr(runs, "check_free", slow)
     with pytest.raises(BadFileError, match="holds a run already"):
         Run.create(config(folder, seed=2))
     assert Run(folder).config.seed == 1

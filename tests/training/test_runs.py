@@ -232,6 +232,11 @@ def test_a_run_comes_back_with_its_configuration(run):
 def test_what_is_no_run_is_refused_by_name(run, tmp_path):
     with pytest.raises(BadFileError, match="no such folder"):
         Run(tmp_path / "nothing")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadFileError, match="it is a file"):
+        Run(tmp_path / "file")
+    with pytest.raises(ValueError, match="file is no folder"):
+        Run.create(TrainConfig(out=tmp_path / "file"))
     with pytest.raises(BadFileError, match=r"holds no config\.json"):
         Run(tmp_path)
     with pytest.raises(BadFileError, match="holds a run already"):

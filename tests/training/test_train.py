@@ -161,10 +161,37 @@ def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch)
 def test_what_cannot_be_trained_is_refused(tmp_path):
     with pytest.raises(BadFileError, match="no run folder"):
         train(TrainConfig(out=tmp_path / "nothing", resume=True))
-    with pytest.raises(ValueError, match="no hyperparameter 'speed'"):
-        train(config(tmp_path / "run", hyperparameters={"speed": 1}))
-    with pytest.raises(TypeError, match="colour"):
-        train(config(tmp_path / "other", env_kwargs={"colour": 1}))
+    for changes, words in (
+        ({"hyperparameters": {"speed": 1}}, "no hyperparameter 'speed'"),
+        ({"hyperparameters": {"policy_kwargs": {"speed": 1}}}, "cannot be made.*speed"),
+        ({"env_kwargs": {"colour": 1}}, "env_kwargs of .*colour"),
+        (
+            {"algo": "sac", "discount_unit": 1.0},
+            "discount_unit must be left out .* viapoint/PlanarTargetJump-v0",
+        ),
+    ):
+        with pytest.raises(ValueError, match=words):
+            train(config(tmp_path / "run", **changes))
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_resumed_with_its_own_settings_only(tmp_path):
+    run = train(config(tmp_path / "run", "sac", seed=3, n_timesteps=64, eval_every=0))
+    before = (run.folder / "config.json").read_bytes()
+    for changes, words in (
+        ({"algo": "ppo"}, 'algo "sac", not with algo "ppo"'),
+        ({"seed": 7}, "seed 3, not with seed 7"),
+        ({"env": "viapoint/PlanarReach-v0"}, "PlanarObstacles-v0.*not with.*PlanarReach-v0"),
+        ({"n_envs": 8}, "n_envs 16, not with n_envs 8"),
+        ({"env_kwargs": {"n_via": 2}}, "the usual n_via, not with n_via 2"),
+        ({"hyperparameters": {"batch_size": 8}}, "batch_size 16, not with batch_size 8"),
+        ({"n_timesteps": 32}, "64 decisions already.*got 32"),
+    ):
+        with pytest.raises(BadFileError, match=words):
+            train(TrainConfig(out=run.folder, resume=True, progress=False, **changes))
+        assert (run.folder / "config.json").read_bytes() == before
+    same = config(run.folder, "sac", seed=3, n_timesteps=64, eval_every=0, resume=True)
+    assert train(same).decisions == 64
 
 
 def test_shipped_validation_scenes_are_used(shipped, tmp_path):
