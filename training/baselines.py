@@ -150,13 +150,26 @@ ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
 """Those where plans are revised on the way."""
 
 
+def check_method(name: str, env_id: str) -> None:
+    """Refuse what cannot be measured in an environment.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    known = _known(env_id)
+    if name not in known and name != "agent":
+        raise ValueError(f"method must be agent or one of {', '.join(known)} in {env_id}, got {name!r}")
+
+
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """A baseline for an environment made with `kwargs`.
 
     Raises:
         ValueError: There is none of that name.
     """
-    known = ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS
-    if name not in known:
-        raise ValueError(f"method must be agent or one of {', '.join(known)} in {env_id}, got {name!r}")
-    return known[name](new_trial(env_id, **kwargs))
+    check_method(name, env_id)
+    return _known(env_id)[name](new_trial(env_id, **kwargs))
+
+
+def _known(env_id: str) -> dict[str, Callable[[Any], Method]]:
+    return ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS

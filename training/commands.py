@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -16,12 +16,12 @@ from tqdm import tqdm
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training import report
 from viapoint.training import train as training
-from viapoint.training.baselines import Method, agent_method, make_method
+from viapoint.training.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.config import EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.drawn_scenes import scenes_for
 from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
-from viapoint.training.frozen_scenes import load
 from viapoint.training.online_methods import Unrevised
 from viapoint.training.online_trial import OnlineTrial
 from viapoint.training.runs import Run, find_model, load_model
@@ -90,7 +90,8 @@ def train(config: TrainConfig) -> None:
     """Train, and say where everything is."""
     if config.resume:
         run = Run(config.folder)
-        print(f"going on with {run.config.algo} on {run.config.env} after {run.decisions} decisions")
+        what = f"{run.config.algo} on {run.config.env}, seed {run.config.seed},"
+        print(f"going on with {what} after {run.decisions} decisions")
     run = training.train(config)
     last = run.curve[-1] if run.curve else None
     reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
@@ -99,29 +100,10 @@ def train(config: TrainConfig) -> None:
 
 def evaluate(config: EvaluateConfig) -> None:
     """Measure, print the table, and write the results."""
-    agent = find_agent(config.run, config.pretrained) if "agent" in config.methods else None
-    env_id = agent.env_id if agent else config.env
-    if env_id is None:
-        raise ValueError("without an agent, --env must say which environment is meant")
-    if config.failures is not None and (is_step_wise(env_id) or env_id in ONLINE_TASKS):
-        raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
-    env_id, env_kwargs = whole_task(env_id, agent.env_kwargs if agent else {})
-    frozen = load(config.scenes, env_id).take(slice(0, config.n_scenes))
-    methods: list[Method] = []
-    for name in config.methods:
-        if name == "unrevised" and agent:
-            methods.append(Unrevised(agent.method(), OnlineTrial(env_id, **env_kwargs)))
-        elif name != "agent":
-            methods.append(make_method(name, env_id, **env_kwargs))
-        elif agent:
-            for count in sorted({0, config.candidates}):
-                methods.append(agent.method(count))
-                if config.compiled:
-                    print(
-                        f"{methods[-1].name}: compiling its decision, which takes a minute or two",
-                        file=sys.stderr,
-                    )
-                    agent.compile_decisions(count)
+    agent = find_agent(config.run, config.pretrained) if config.run or config.pretrained else None
+    env_id, env_kwargs = _task_of(config, agent)
+    frozen = scenes_for(config.scenes, env_id, env_kwargs).take(slice(0, config.n_scenes))
+    methods = _methods(config, agent, env_id, env_kwargs)
     with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
         result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()
@@ -143,12 +125,54 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
 
+def _task_of(config: EvaluateConfig, agent: Agent | None) -> tuple[str, dict[str, Any]]:
+    """Id and arguments of the environment to measure in.
+
+    Raises:
+        ValueError: The agent is for another one than was named, or what was asked for cannot be had there.
+    """
+    mine = agent.env_id if agent else str(config.env)
+    env_id, env_kwargs = whole_task(mine, agent.env_kwargs if agent else {})
+    if config.env not in (None, mine, env_id):
+        raise ValueError(
+            f"env must be {mine}, on which the agent of {config.run or config.pretrained} was trained, or be left "
+            f"out, got {config.env!r}"
+        )
+    if config.failures is not None and (is_step_wise(mine) or env_id in ONLINE_TASKS):
+        raise ValueError(f"failures are sorted where one action is a whole movement; in {mine} it is not")
+    for name in config.methods:
+        check_method(name, env_id)
+    return env_id, env_kwargs
+
+
+def _methods(
+    config: EvaluateConfig, agent: Agent | None, env_id: str, env_kwargs: Mapping[str, Any]
+) -> list[Method]:
+    """What is measured, in the order in which it was named."""
+    methods: list[Method] = []
+    for name in config.methods:
+        if name == "unrevised" and agent:
+            methods.append(Unrevised(agent.method(), OnlineTrial(env_id, **env_kwargs)))
+        elif name != "agent":
+            methods.append(make_method(name, env_id, **env_kwargs))
+        elif agent:
+            for count in sorted({0, config.candidates}):
+                methods.append(agent.method(count))
+                if config.compiled:
+                    print(
+                        f"{methods[-1].name}: compiling its decision, which takes a minute or two",
+                        file=sys.stderr,
+                    )
+                    agent.compile_decisions(count)
+    return methods
+
+
 def play(config: PlayConfig) -> None:
     """Film an agent's movements."""
     from viapoint.training.video import film
 
     agent = find_agent(config.run, config.pretrained)
-    scenes = load(config.scenes, whole_task(agent.env_id, {})[0]).scenes
+    scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
     rows = spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     method = agent.method(config.candidates)

@@ -200,7 +200,7 @@ def _evaluate_one(
         outcomes={name: np.concatenate([piece[name] for piece in pieces]) for name in names} or _nothing(),
         actions=np.concatenate(actions) if actions else np.zeros((0, trial.task.action.size)),
         decision_times=times,
-        band=np.where(np.isnan(frozen.share), -1, frozen.band)[:done],
+        band=frozen.band[:done],
         family=frozen.family[:done],
         distance=np.linalg.norm(frozen.scenes.goal - frozen.scenes.start, axis=-1)[:done],
         partial=interrupted and done < number,

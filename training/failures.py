@@ -218,4 +218,5 @@ def _entries(
 def _title(failures: Failures, index: int) -> str:
     depth = 1e3 * failures.depth[index]
     where = f"{depth:.1f} mm deep" if depth > 0.0 else f"{-depth:.1f} mm clear"
-    return f"{where}, share {BANDS[failures.frozen.band[failures.rows[index]]]}"
+    band = failures.frozen.band[failures.rows[index]]
+    return where if band < 0 else f"{where}, share {BANDS[band]}"

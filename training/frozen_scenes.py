@@ -42,7 +42,8 @@ class FrozenScenes:
     scenes: Any
     """N :class:`~viapoint.envs.scenes.Scenes`, or :class:`~viapoint.envs.courses.ChangingScenes`."""
     share: Float
-    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,)."""
+    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,); NaN where
+    nobody measured it."""
     solution: Float
     """An action that the planner found and the simulation confirmed, shape (N, m)."""
     family: Any = DRAWN
@@ -58,8 +59,8 @@ class FrozenScenes:
 
     @property
     def band(self) -> NDArray[np.int64]:
-        """Index into BANDS, shape (N,)."""
-        return bands(self.share)
+        """Index into BANDS, shape (N,); -1 where the share is unknown."""
+        return np.where(np.isnan(self.share), -1, bands(self.share))
 
     @property
     def sha256(self) -> str:

@@ -13,11 +13,10 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
-from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training.baselines import agent_method
+from viapoint.training.drawn_scenes import drawn, frozen_fit
 from viapoint.training.evaluate import MethodResult, evaluate
-from viapoint.training.frozen_scenes import BANDS, FrozenScenes, load, shipped_path
-from viapoint.training.online_trial import new_trial
+from viapoint.training.frozen_scenes import BANDS, FrozenScenes, load
 from viapoint.training.runs import Run
 from viapoint.training.step_agent import whole_task
 from viapoint.training.vec_env import ViaVecEnv
@@ -26,8 +25,6 @@ LOG_EVERY = 1_000
 """Decisions between two entries of the log."""
 RECENT = 20
 """Steps of all environments over which outcomes are averaged for log and progress bar."""
-DRAWN_SEED = 1_000_003
-"""Of validation scenes that are drawn where none are shipped; far from the seeds people train with."""
 TIMED_DECISIONS = 11
 """Single decisions that are timed at each validation."""
 OUTCOMES = {
@@ -53,10 +50,6 @@ BAND_TAGS = {
     for band, words in zip(BANDS, ("above_20", "5_to_20", "1_to_5", "below_1"), strict=True)
 }
 """Tags of the success by band."""
-ACTION_ARGUMENTS = frozenset(
-    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
-)
-"""Arguments of an environment that leave its scenes as they are."""
 
 
 class TrainingStoppedError(Exception):
@@ -268,15 +261,6 @@ def validation_scenes(run: Run) -> FrozenScenes:
     """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
     config = run.config
     env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
-    if shipped_path("validation", env_id).is_file() and set(env_kwargs) <= ACTION_ARGUMENTS:
+    if frozen_fit("validation", env_id, env_kwargs):
         return load("validation", env_id).take(slice(0, config.eval_scenes))
-    trial = new_trial(env_id, 64 if env_id in ONLINE_TASKS else 1, **env_kwargs)
-    scenes = trial.draw(config.eval_scenes, DRAWN_SEED)
-    trial.close()
-    return FrozenScenes(
-        name="drawn",
-        env_id=env_id,
-        scenes=scenes,
-        share=np.full(config.eval_scenes, np.nan),
-        solution=np.zeros((config.eval_scenes, trial.task.action.size)),
-    )
+    return drawn("validation", env_id, env_kwargs, config.eval_scenes)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training import frozen_scenes, monitor
+from viapoint.training import drawn_scenes, frozen_scenes
 from viapoint.training.frozen_scenes import FrozenScenes
 from viapoint.training.trial import Trial
 
@@ -42,7 +42,7 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     """The small scenes in place of every shipped set."""
     path = tmp_path / "shipped.npz"
     small_scenes.save(path)
-    for module in (frozen_scenes, monitor):
+    for module in (frozen_scenes, drawn_scenes):
         monkeypatch.setattr(module, "shipped_path", lambda name, env_id: path)
     return small_scenes
 

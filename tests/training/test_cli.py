@@ -8,7 +8,7 @@ import pytest
 from viapoint.training import cli
 from viapoint.training.config import EvaluateConfig, TrainConfig
 
-ENV = "viapoint/PlanarObstacles-v0"
+ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
 
 
 def run(*words):
@@ -60,9 +60,22 @@ def test_help_is_short_and_has_an_example(words, capsys):
         ("train --algo dqn", "dqn"),
         ("train --seed x", "--seed"),
         ("train --speed 3", "--speed"),
+        ("train --env CartPole-v1", "viapoint/Reach-v0, viapoint/Obstacles-v0"),
         ("train --env-kwargs n_via", "NAME=VALUE"),
+        ("train --env-kwargs n_via=2 n_via=3", "n_via is there twice, as 2 and as 3"),
+        ("train --env-kwargs whole_arm=True", "whole_arm=True is no JSON"),
+        ("train --env-kwargs num_envs=4", "--n-envs"),
+        ("train --hyperparameters gamma=7", "gamma of viatd3 must be a number from 0 to 1, got 7"),
         ("evaluate", "name a run folder"),
         ("evaluate nowhere", "no run folder"),
+        ("evaluate /etc/passwd", "it is a file"),
+        ("evaluate --methods magic", "unrevised, got 'magic'"),
+        (f"evaluate --pretrained {REACH} --env {ENV}", f"env must be {REACH}"),
+        (f"evaluate --pretrained {REACH} --methods agent unrevised", "got 'unrevised'"),
+        (f"evaluate --env {ENV} --methods straight --failures there", "failures concerns the agent"),
+        (f"evaluate --env {ENV} --methods straight --json /", "json must be a file"),
+        (f"play --pretrained {REACH} --video film.gif", "video must end in .mp4, got film.gif"),
+        ("paper --out /etc/passwd", "out /etc/passwd cannot be written"),
         ("evaluate --pretrained viapoint/Nothing-v0", "no pretrained agent for 'viapoint/Nothing-v0'"),
         (f"evaluate --methods magic --env {ENV} --scenes test", "magic"),
         (f"evaluate --methods straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
@@ -120,6 +133,72 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     assert counts["method"] == "agent, ranks 8"
     kept = json.loads((trained / "evaluations" / "test.json").read_text())
     assert list(kept["methods"]) == ["agent", "agent, ranks 8"]
+
+
+def test_the_environment_is_that_of_the_run_or_of_the_pretrained_agent(trained, shipped, capsys):
+    run("evaluate", trained, "--methods", "straight", "--n-scenes", 2)
+    assert ENV in capsys.readouterr().out
+    run("evaluate", "--pretrained", ENV, "--env", ENV, "--methods", "straight", "--n-scenes", 2)
+    assert ENV in capsys.readouterr().out
+    assert f"env must be {ENV}" in failed(
+        capsys, "evaluate", trained, "--env", REACH, "--methods", "straight"
+    )
+
+
+def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
+    folder = tmp_path / "run"
+    run(
+        "train", "--out", folder, "--n-timesteps", 32, "--n-envs", 32, "--eval-every", 0, "--no-progress",
+        "--env-kwargs", "n_obstacles=3", "threads=1",
+    )  # fmt: skip
+    capsys.readouterr()
+    run("evaluate", folder, "--methods", "agent", "straight", "--n-scenes", 3)
+    assert "with n_obstacles=3: they are drawn" in capsys.readouterr().err
+    record = json.loads((folder / "evaluations" / "test.json").read_text())
+    assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
+    run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
+    assert (tmp_path / "film.mp4").stat().st_size > 1000
+    capsys.readouterr()
+    assert "validation, test" in failed(capsys, "evaluate", folder, "--scenes", "hard")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("--env-kwargs n_vi=2", "n_vi"),
+        ("--hyperparameters foo=2", "'foo'"),
+        ('--hyperparameters policy_kwargs={"foo":2}', "foo"),
+        ("--algo sac --discount-unit 1", "discount_unit must be left out"),
+    ],
+)
+def test_what_is_mistyped_leaves_nothing_in_the_way_of_the_corrected_command(words, named, tmp_path, capsys):
+    folder = tmp_path / "runs" / "one"
+    assert named in failed(capsys, "train", "--out", folder, "--n-timesteps", 1, *words.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_flags_of_another_run_are_refused_and_the_same_ones_are_not(tmp_path, capsys):
+    folder = tmp_path / "run"
+    begun = [
+        "train", "--out", folder, "--seed", 3, "--env", REACH, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 0,
+        "--no-progress", "--env-kwargs", "threads=1", "--hyperparameters", "gradient_steps=1",
+    ]  # fmt: skip
+    run(*begun)
+    before = (folder / "config.json").read_bytes()
+    for words, named in (
+        ("--seed 7 --algo ppo", ("algo", "seed 3", "seed 7")),
+        ("--seed 0", ("seed 0",)),  # as usual, but not here
+        (f"--env {ENV}", (ENV,)),
+        ("--env-kwargs threads=2", ("threads 1", "threads 2")),
+        ("--hyperparameters tau=0.1", ("the usual tau", "tau 0.1")),
+        ("--n-timesteps 32", ("64 decisions", "got 32")),
+    ):
+        told = failed(capsys, "train", "--out", folder, "--resume", *words.split())
+        assert all(name in told for name in named), told
+        assert (folder / "config.json").read_bytes() == before
+    run(*begun, "--resume")
+    run("train", "--out", folder, "--resume", "--n-timesteps", 96, "--no-progress")
+    assert "trained for 96 decisions" in capsys.readouterr().out
 
 
 def test_a_second_training_in_the_folder_is_refused(trained, capsys):
