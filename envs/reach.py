@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium.utils import EzPickle
 
 from viapoint.envs.action import Plan
-from viapoint.envs.arguments import reset_options
 from viapoint.envs.execution import Rollout
 from viapoint.envs.reach_vector import METADATA, Observation, ReachVectorEnv
 
@@ -65,7 +64,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
-        observation, info = self.batch.reset(seed=seed, options=reset_options(options))
+        observation, info = self.batch.reset(seed=seed, options=options)
         self._np_random, self._np_random_seed = self.batch._np_random, self.batch._np_random_seed
         if self.render_mode == "human":
             self.batch.render()

@@ -20,6 +20,7 @@ from viapoint.envs.arguments import (
     fewest_and_most,
     masked_rows,
     refuse_unknown,
+    reset_options,
     seeds_of,
     whole_number,
 )
@@ -176,12 +177,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A given scene is impossible; nothing has changed then.
         """
-        options = dict(options or {})
+        options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
         seeded = self._seeded(seed, rows)
         scenes = self._draw(seeded, rows, options)
-        self._generators = seeded
-        self._np_random = seeded[0]
+        self._generators, self._np_random = seeded, seeded[0]
         if seed is not None:
             self._np_random_seed = seeds_of(seed, self.num_envs)[0]
         self._last = self._last if len(rows) < self.num_envs else None

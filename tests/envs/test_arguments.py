@@ -48,9 +48,10 @@ def test_actions_of_different_lengths_are_refused_in_our_words(env_id):
 
 @pytest.mark.parametrize("options", [5, "abc", [1, 2], 0, np.zeros(2)])
 def test_options_are_a_mapping(env_id, options):
-    env = gym.make(env_id).unwrapped
-    with pytest.raises(ValueError, match="options must be a mapping from names to values, or None, got"):
-        env.reset(options=options)
+    for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1).unwrapped):
+        with pytest.raises(ValueError, match="options must be a mapping from names to values, or None, got"):
+            env.reset(options=options)
+        env.close()
 
 
 def test_options_are_copied():
