@@ -7,7 +7,8 @@ torch is imported by array-api-compat, and only when the caller hands in tensors
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias
@@ -37,27 +38,31 @@ Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 """A given boundary value, None for rest (zero), or FREE."""
 
 _PLAIN = (int, float, list, tuple, np.generic, np.ndarray)
-_NOT_NUMBERS = (None, FREE)
 
 
-def as_floats(**named: Any) -> tuple[Namespace, list[Any]]:
-    """Bring all arguments to one array library and one floating dtype; None and FREE pass through.
+def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
+    """Bring all arguments to one array library and one floating dtype.
 
     Args:
-        **named: arrays, numbers or nested lists by argument name.
+        optional: further arguments by name; of these None and FREE pass through.
+        **required: arrays, numbers or nested lists by argument name.
 
     Returns:
-        The namespace and the arrays in the order given. The dtype is the widest floating dtype among the
-        arrays (numbers, lists and integer arrays do not count, and are float64 if nothing else is there).
+        The namespace and the arrays in the order given, first the required ones. The dtype is the widest
+        floating dtype among the arrays (numbers, lists and integer arrays do not count, and are float64 if
+        nothing else is there).
 
     Raises:
-        ValueError: an argument is not numeric, or not finite.
+        ValueError: an argument is missing, not numeric, or not finite.
     """
-    values = [value for value in named.values() if not _is_marker(value)]
-    if all(isinstance(value, _PLAIN) for value in values):
+    for name, value in required.items():
+        if _is_marker(value):
+            raise ValueError(f"{name} must be an array of real numbers, got {value!r}")
+    named = {**required, **optional} if optional else required
+    if all(isinstance(value, _PLAIN) or _is_marker(value) for value in named.values()):
         xp, arrays = np, _numpy_floats(named)
     else:
-        xp, arrays = _foreign_floats(named, values)
+        xp, arrays = _foreign_floats(named)
     for name, array in zip(named, arrays, strict=True):
         if not _is_marker(array):
             require(xp, xp.isfinite(array), name, array, "must be finite")
@@ -92,30 +97,33 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
             if array.dtype.kind not in "fiu":
                 raise TypeError(f"dtype {array.dtype}")
             arrays.append(array if array.dtype == dtype else array.astype(dtype))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"{name} must be an array of real numbers, got {value!r} ({error})") from None
     return arrays
 
 
-def _foreign_floats(named: dict[str, Any], values: list[Any]) -> tuple[Namespace, list[Any]]:
-    from array_api_compat import array_namespace, device
+def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
+    from array_api_compat import array_namespace, device, is_array_api_obj
 
-    foreign = [value for value in values if not isinstance(value, _PLAIN)]
+    foreign = {n: v for n, v in named.items() if not isinstance(v, _PLAIN) and is_array_api_obj(v)}
+    if not foreign:
+        return np, _numpy_floats(named)
     try:
-        xp = array_namespace(*foreign)
+        xp = array_namespace(*foreign.values())
     except TypeError as error:
-        names = ", ".join(named)
+        names = ", ".join(foreign)
         raise ValueError(f"{names} must be NumPy arrays or torch tensors of one kind ({error})") from None
-    place = device(foreign[0])
-    floating = [value.dtype for value in foreign if xp.isdtype(value.dtype, "real floating")]
+    place = device(next(iter(foreign.values())))
+    floating = [value.dtype for value in foreign.values() if xp.isdtype(value.dtype, "real floating")]
     dtype = xp.result_type(*floating) if floating else xp.float64
     arrays: list[Any] = []
     for name, value in named.items():
         if _is_marker(value):
             arrays.append(value)
-        elif isinstance(value, _PLAIN):
-            plain = _numpy_floats({name: value})[0]
-            arrays.append(xp.asarray(np.ascontiguousarray(plain), dtype=dtype, device=place))
+        elif name not in foreign:
+            # A copy: torch would share the caller's memory, and takes neither read-only arrays nor long doubles.
+            plain = np.array(_numpy_floats({name: value})[0], dtype=np.float64, order="C")
+            arrays.append(xp.asarray(plain, dtype=dtype, device=place))
         elif xp.isdtype(value.dtype, ("real floating", "integral")):
             arrays.append(value if value.dtype == dtype else xp.astype(value, dtype))
         else:
@@ -153,19 +161,60 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(f"leading dimensions do not broadcast: {listed}") from None
 
 
+def refuse_free(**named: Any) -> None:
+    """Raise ValueError for an argument that is FREE where a movement cannot leave it open."""
+    for name, value in named.items():
+        if value is FREE:
+            raise ValueError(
+                f"{name} cannot be FREE: only the goal's velocity and acceleration may be left open"
+            )
+
+
+def is_whole(value: Any) -> bool:
+    """Whether `value` is a whole number of at least 0."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
+
+
+def whole_order(nu: int) -> int:
+    """Return one order of derivative, or raise ValueError."""
+    if not is_whole(nu):
+        raise ValueError(f"nu must be a whole number of at least 0, got {nu!r}")
+    return int(nu)
+
+
 def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
     """Return orders of derivative as a tuple, or raise ValueError."""
-    orders = tuple(nu) if isinstance(nu, Sequence | np.ndarray) else (nu,)
-    if not orders or any(not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 0 for n in orders):
+    orders = tuple(nu) if isinstance(nu, Sequence) or (isinstance(nu, np.ndarray) and nu.ndim) else (nu,)
+    if not orders or not all(is_whole(order) for order in orders):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
     return tuple(int(order) for order in orders)
 
 
-def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...]) -> None:
-    """Raise ValueError unless `out` are `count` arrays of the shape."""
+def as_number(value: Any) -> float:
+    """Return a single real number as a float; anything else as NaN, which lies in no range."""
+    try:
+        single = not isinstance(value, str | bytes | bool) and np.ndim(value) == 0
+        return float(value) if single else math.nan
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return math.nan
+
+
+def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: Namespace) -> None:
+    """Raise ValueError unless `out` are `count` arrays of the library and shape that numbers can be written to."""
+    try:
+        is_own = all(namespace_of(buffer) is xp for buffer in out)
+    except TypeError:
+        is_own = False
+    if not is_own:
+        raise ValueError(f"out must be {count} arrays of the trajectory's own kind, got {type(out).__name__}")
     shapes = [tuple(buffer.shape) for buffer in out]
     if shapes != [shape] * count:
         raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")
+    for buffer in out:
+        if not xp.isdtype(buffer.dtype, "real floating"):
+            raise ValueError(f"out must be of a floating dtype, got {buffer.dtype}")
+        if isinstance(buffer, np.ndarray) and not buffer.flags.writeable:
+            raise ValueError(f"out must be writeable, got a read-only array of shape {shape}")
 
 
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
@@ -179,7 +228,14 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
         return array
     if hasattr(array, "detach"):
         array = array.detach().cpu()
+        if str(array.dtype) == "torch.bfloat16":  # a dtype that NumPy lacks; float32 holds it exactly
+            array = array.float()
     return np.asarray(array)
+
+
+def own(array: Array) -> Array:
+    """Return the same numbers in memory that no caller shares, within the same gradient."""
+    return 1.0 * array
 
 
 def detach(array: Array) -> Array:

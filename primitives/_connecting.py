@@ -7,7 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import FREE, Array, Boundary, Namespace, broadcast_to, constant, like, to_numpy
+from ._arrays import (
+    FREE,
+    Array,
+    Boundary,
+    Namespace,
+    broadcast_to,
+    constant,
+    is_whole,
+    like,
+    own,
+    refuse_free,
+    to_numpy,
+)
 from ._banded import States, solve_states
 from ._hermite import ORDERS, coefficient_table
 from .trajectory import Trajectory
@@ -20,11 +32,7 @@ def boundary_values(
     goal_acceleration: Boundary,
 ) -> dict[str, Boundary]:
     """Return the boundary arguments by name; FREE is refused where a movement cannot leave it open."""
-    for name, value in (("start_velocity", start_velocity), ("start_acceleration", start_acceleration)):
-        if value is FREE:
-            raise ValueError(
-                f"{name} cannot be FREE: only the goal's velocity and acceleration may be left open"
-            )
+    refuse_free(start_velocity=start_velocity, start_acceleration=start_acceleration)
     return {
         "start_velocity": start_velocity,
         "start_acceleration": start_acceleration,
@@ -35,7 +43,7 @@ def boundary_values(
 
 def check_order(order: int, start_acceleration: Boundary = None, goal_acceleration: Boundary = None) -> None:
     """Raise ValueError for an order that does not exist, or one that has no boundary accelerations."""
-    if isinstance(order, bool) or order not in ORDERS:
+    if not is_whole(order) or order not in ORDERS:
         raise ValueError(f"order must be 2 (acceleration), 3 (jerk) or 4 (snap), got {order!r}")
     if order == 2:
         for name, value in (
@@ -73,6 +81,7 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
         durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
         states: per knot, its derivatives (FREE where the cost decides).
     """
+    durations = own(durations)
     if (durations <= 0).any():
         return _connect_without_empty(xp, order, waypoints, durations, states)
     return Trajectory.from_segments(_coefficients(xp, order, waypoints, durations, states), durations, xp)
@@ -98,7 +107,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     batch = data.shape[:-2]
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
     coefficients = xp.matmul(constant(coefficient_table(order), data), data)
-    return xp.reshape(coefficients, (*batch, 2 * order, segments, -1))
+    return xp.reshape(coefficients, (*batch, 2 * order, segments, shape[-1]))
 
 
 def _scaled_states(states: States, lengths: Sequence[Any], rest: Array, order: int) -> list[Array]:
@@ -119,6 +128,9 @@ def _connect_without_empty(
     *batch, knots, dimension = waypoints.shape
     count = int(np.prod(batch, dtype=int))
     durations = broadcast_to(xp, durations, (*batch, knots - 1))
+    if not count:
+        nothing = like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
+        return Trajectory.from_segments(nothing, durations, xp, some_empty=True)
     flat_points = xp.reshape(waypoints, (count, knots, dimension))
     flat_durations = xp.reshape(durations, (count, knots - 1))
     empty = to_numpy(flat_durations) <= 0

@@ -7,13 +7,15 @@ well.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from math import frexp
 from typing import Any
 
 import numpy as np
 
 from ._arrays import Array, Namespace, like, to_numpy
-from ._polynomial import Floats, differentiate, evaluate, multiply, root_candidates
+from ._polynomial import Floats, differentiate, evaluate, multiply, root_candidates, unit_size
 from ._sampling import derivative_coefficients
 
 
@@ -44,10 +46,10 @@ class Pieces:
     end: Array
     namespace: Namespace
 
-    def polynomials(self) -> Floats:
-        """Return the coefficients as (..., S, D, n) NumPy float64."""
-        numbers = to_numpy(self.coefficients).astype(np.float64)
-        return np.ascontiguousarray(np.moveaxis(numbers, -3, -1))
+    def polynomials(self) -> tuple[Floats, Any]:
+        """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
+        numbers, exponent = unit_size(to_numpy(self.coefficients).astype(np.float64), (-3, -2, -1))
+        return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
 
 
 def pieces_of(coefficients: Array, starts: Array, rates: Array, end: Array, nu: int, xp: Namespace) -> Pieces:
@@ -59,7 +61,7 @@ def pieces_of(coefficients: Array, starts: Array, rates: Array, end: Array, nu: 
 
 def axis_extrema(pieces: Pieces) -> Extrema:
     """Return the extremes of every component."""
-    polynomials = pieces.polynomials()
+    polynomials, _ = pieces.polynomials()
     u = _with_ends(root_candidates(differentiate(polynomials)))
     values = evaluate(polynomials[..., None, :], u)
     low = _read(pieces, _best(pieces, u, -values, per_axis=True))
@@ -70,13 +72,17 @@ def axis_extrema(pieces: Pieces) -> Extrema:
 def largest_norm(pieces: Pieces) -> Array:
     """Return (...,) the largest Euclidean norm."""
     xp = pieces.namespace
-    polynomials = pieces.polynomials()
+    polynomials, exponent = pieces.polynomials()
     square = _over_axes(multiply(polynomials, polynomials))
     change = _over_axes(multiply(polynomials, differentiate(polynomials)))
     u = _with_ends(root_candidates(change))
     place = _best(pieces, u, evaluate(square[..., None, :], u), per_axis=False)
     values, _ = _read(pieces, place)
-    return xp.linalg.vector_norm(values, axis=-1)
+    largest = min(float(xp.finfo(values.dtype).max), sys.float_info.max)
+    limit = frexp(largest)[1] - 2  # powers of two up to this one, and their inverses, are of full precision
+    exponent = np.clip(exponent, -limit, limit)
+    down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
+    return xp.linalg.vector_norm(values * down, axis=-1) * up[..., 0]
 
 
 def _over_axes(polynomials: Floats) -> Floats:
@@ -101,7 +107,7 @@ def _best(pieces: Pieces, u: Floats, score: Floats, *, per_axis: bool) -> tuple[
     else:
         u, score = u[..., None, :, :], score[..., None, :, :]
     count = u.shape[-1]
-    u, score = (np.reshape(a, (*a.shape[:-2], -1)) for a in (u, score))
+    u, score = (np.reshape(a, (*a.shape[:-2], a.shape[-2] * count)) for a in (u, score))
     chosen = np.argmax(score, axis=-1)
     return chosen // count, np.take_along_axis(u, chosen[..., None], axis=-1)[..., 0]
 

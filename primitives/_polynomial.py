@@ -43,6 +43,16 @@ def multiply(p: Floats, q: Floats) -> Floats:
     return product
 
 
+def unit_size(array: Any, axis: tuple[int, ...]) -> tuple[Any, Any]:
+    """Bring an array to a size of about 1 along the axes, so that no square over- or underflows.
+
+    Returns:
+        The array times a power of two, which changes no digit, and the exponent of that which was taken out.
+    """
+    exponent = np.frexp(np.abs(array).max(axis=axis, keepdims=True))[1]
+    return np.ldexp(array, -exponent), exponent
+
+
 def root_candidates(coefficients: Floats) -> Floats:
     """Return points of [0, 1] among which are all real roots there, (..., n) ascending.
 

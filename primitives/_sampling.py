@@ -182,7 +182,7 @@ def _blocks(coefficients: Any, starts: Any, time: Any) -> Iterator[tuple[Any, tu
     if not plain or not fitting or not any(own):
         yield ..., (..., ...)
         return
-    each = coefficients[0, ..., 0].size * time.shape[-1] * coefficients.itemsize
+    each = math.prod(coefficients.shape[1:3]) * time.shape[-1] * coefficients.itemsize
     size = max(1, _BLOCK_BYTES // max(1, each))
     for where in blocks(count, size):
         yield where, (where if own[0] else ..., where if own[1] else ...)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ._arrays import Array, as_floats, broadcast_batch, require
+from ._arrays import Array, broadcast_batch, refuse_free, require
 from .trajectory import Trajectory
 
 
@@ -36,7 +36,8 @@ def minimum_duration(
     named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
     if all(limit is None for limit in named.values()):
         raise ValueError("give at least one limit: velocity, acceleration or jerk")
-    xp, (*limits, _) = as_floats(**named, coefficients=trajectory.coefficients)
+    refuse_free(**named)
+    xp, limits = trajectory.namespace, trajectory.floats(named)
     factor = 0.0 * trajectory.duration
     for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):
         if limit is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 from ._arrays import (
@@ -9,9 +10,10 @@ from ._arrays import (
     Array,
     Boundary,
     Namespace,
-    as_floats,
+    as_number,
     broadcast_batch,
     broadcast_to,
+    refuse_free,
     require,
     require_vectors,
 )
@@ -59,14 +61,17 @@ def retarget(
         The movement from `time` on; its own clock starts at 0.
 
     Raises:
-        ValueError: time lies before the start or not before the old or the new arrival; other bad arguments.
+        ValueError: time lies before the start or not before the old or the new arrival; freeze is negative
+            or not finite; other bad arguments.
     """
     named = {"goal_velocity": goal_velocity, "goal_acceleration": goal_acceleration}
     if trajectory.order != 3:
         raise ValueError(f"trajectory must have order 3 to be continued, got order {trajectory.order}")
-    xp, (time, goal, arrival, via, *ends, _) = as_floats(
-        time=time, goal=goal, arrival=arrival, via=via, **named, coefficients=trajectory.coefficients
-    )
+    refuse_free(via=via)
+    if not 0 <= as_number(freeze) < inf:
+        raise ValueError(f"freeze must be a finite number of at least 0, got {freeze!r}")
+    arrays = trajectory.floats({"via": via, **named}, time=time, goal=goal, arrival=arrival)
+    xp, (time, goal, arrival, via, *ends) = trajectory.namespace, arrays
     targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
     batch = _common_batch(trajectory, time, arrival, targets, via)
     time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)

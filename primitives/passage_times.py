@@ -52,14 +52,14 @@ def passage_durations(
             their durations are the best found.
     """
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
-    xp, arrays = as_floats(waypoints=waypoints, duration=duration, **named)
+    xp, arrays = as_floats(named, waypoints=waypoints, duration=duration)
     waypoints, duration = arrays[:2]
     boundary = dict(zip(named, arrays[2:], strict=True))
     batch = check_waypoints(waypoints, boundary, duration=duration)
     require(xp, duration > 0, "duration", duration, "must be positive")
     points = _flat(waypoints, batch, 2)
     ends = _unit_time_ends(boundary, duration, batch)
-    fractions = like(xp, _fractions(points, ends).reshape(*batch, -1), waypoints)
+    fractions = like(xp, _fractions(points, ends).reshape(*batch, waypoints.shape[-2] - 1), waypoints)
     if xp is not np and follows_gradient(waypoints, duration, *boundary.values()):
         waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
         fractions = _passage_gradient.attach(fractions, waypoints, duration, boundary, xp)
@@ -90,8 +90,8 @@ def _unit_time_ends(boundary: dict[str, Boundary], duration: Array, batch: tuple
 def _fractions(points: Any, ends: list[Any]) -> Any:
     """(N, S) fractions of the duration; movements with the same kind of problem are solved together."""
     count, knots, _ = points.shape
-    if knots == 2:
-        return np.ones((count, 1))
+    if knots == 2 or not count:
+        return np.ones((count, knots - 1))
     distinct = (points[:, 1:] != points[:, :-1]).any(axis=-1)
     moving = np.zeros(count, dtype=bool)
     for value in ends:

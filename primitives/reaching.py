@@ -42,7 +42,7 @@ def point_to_point(
     """
     check_order(order, start_acceleration, goal_acceleration)
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
-    xp, arrays = as_floats(start=start, goal=goal, duration=duration, **named)
+    xp, arrays = as_floats(named, start=start, goal=goal, duration=duration)
     start, goal, duration = arrays[:3]
     boundary = dict(zip(named, arrays[3:], strict=True))
     require_vectors("start", start)

@@ -13,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import Array, error_state, like, to_numpy
-from ._polynomial import differentiate, multiply, root_candidates
+from ._arrays import Array, as_number, error_state, is_whole, like, to_numpy
+from ._polynomial import differentiate, multiply, root_candidates, unit_size
 from .trajectory import Trajectory
 
 _SPECTRUM_SAMPLES = 1000
 """Instants at which the spectral arc length takes the speed, whatever the duration: far beyond a movement's
 bandwidth."""
+
+_MOST_PADDING = 16
+"""Beyond it the spectrum of a single movement takes gigabytes of memory."""
 
 
 @dataclass(frozen=True)
@@ -97,17 +100,36 @@ def spectral_arc_length(
         cutoff: highest frequency [Hz]; the measure is 0 for movements so brief that the first frequency
             exceeds it.
         threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
-        padding: powers of two of zero padding.
+        padding: powers of two of zero padding, 0 to 16.
 
     Raises:
-        ValueError: cutoff or threshold is out of range, or padding is negative.
+        ValueError: cutoff or threshold is out of range, or padding is not a whole number from 0 to 16.
     """
-    if not cutoff > 0 or not 0 <= threshold < 1 or padding < 0:
-        raise ValueError(
-            f"need cutoff > 0, 0 <= threshold < 1, padding >= 0, got {cutoff!r}, {threshold!r}, {padding!r}"
-        )
+    if not as_number(cutoff) > 0:
+        raise ValueError(f"cutoff must be a number above 0, got {cutoff!r}")
+    if not 0 <= as_number(threshold) < 1:
+        raise ValueError(f"threshold must be a number of at least 0 and below 1, got {threshold!r}")
+    if not is_whole(padding) or padding > _MOST_PADDING:
+        raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
+    xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
+    if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
+        return xp.astype(_arc_length(_in_single_precision(trajectory), cutoff, threshold, padding), dtype)
+    return _arc_length(trajectory, cutoff, threshold, padding)
+
+
+def _in_single_precision(trajectory: Trajectory) -> Trajectory:
+    xp, t = trajectory.namespace, trajectory
+    coefficients, *times = (
+        xp.astype(array, xp.float32) for array in (t.coefficients, t.durations, t.starts, t.rates, t.end)
+    )
+    return Trajectory(coefficients, times[0], t.order, *times[1:])
+
+
+def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
     xp = trajectory.namespace
-    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + padding)
+    if 0 in trajectory.batch_shape:  # libraries differ on whether nothing can be transformed
+        return 0.0 * trajectory.duration
+    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
     spectrum = xp.abs(xp.fft.rfft(xp.linalg.vector_norm(velocity, axis=-1), n=length, axis=-1))
     with error_state(xp):
@@ -151,12 +173,13 @@ def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
 def _turning_times(trajectory: Trajectory) -> Any:
     """All times (..., Q), ascending, at which the speed may have an extreme: roots of v . a, and knots."""
     coefficients = np.moveaxis(to_numpy(trajectory.coefficients).astype(float), -3, -1)  # (..., S, D, 2m)
-    velocity = differentiate(coefficients)
+    velocity = differentiate(unit_size(coefficients, (-3, -2, -1))[0])
     power = multiply(velocity, differentiate(velocity)).sum(axis=-2)
     u = root_candidates(power)
     knots = to_numpy(trajectory.knots)
     times = knots[..., :-1, None] + u * np.diff(knots, axis=-1)[..., None]
-    times = np.concatenate([times.reshape(*times.shape[:-2], -1), knots], axis=-1)
+    times = times.reshape(*times.shape[:-2], times.shape[-2] * times.shape[-1])
+    times = np.concatenate([times, knots], axis=-1)
     return np.sort(times, axis=-1)
 
 
@@ -164,7 +187,7 @@ def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
     """Whether the speed falls (-1) or rises (1) before and after each of `times`; 0 outside the movement."""
     middle = (times[..., 1:] + times[..., :-1]) / 2
     sampled = trajectory.sample(like(trajectory.namespace, middle, trajectory.coefficients), (1, 2))
-    velocity, acceleration = (to_numpy(value) for value in sampled)
+    velocity, acceleration = (unit_size(to_numpy(value), (-2, -1))[0] for value in sampled)
     rate = (velocity * acceleration).sum(axis=-1)
     size = np.abs(velocity).max(axis=(-2, -1)) * np.abs(acceleration).max(axis=(-2, -1))
     wide = (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,12 @@ from ._arrays import (
     constant,
     error_state,
     namespace_of,
+    own,
+    refuse_free,
     require,
     require_vectors,
+    to_numpy,
+    whole_order,
     whole_orders,
 )
 from ._extremes import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
@@ -33,6 +37,8 @@ class Trajectory:
 
     Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in its own unit time u = (t - t_s) / h_s, so
     that no duration, short or long, over- or underflows.
+
+    A trajectory takes its arrays over: NumPy's become read-only, and nobody should write into torch's.
 
     Attributes:
         coefficients: (..., 2 order, S, D), c_k of segment s [m].
@@ -50,6 +56,15 @@ class Trajectory:
     starts: Array
     rates: Array
     end: Array
+
+    def __post_init__(self) -> None:
+        if isinstance(self.coefficients, np.ndarray):
+            for array in (self.coefficients, self.durations, self.starts, self.rates, self.end):
+                array.flags.writeable = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle by construction, so that copies are read-only too."""
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     @classmethod
     def from_segments(
@@ -118,8 +133,8 @@ class Trajectory:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
         if isinstance(time, int | float | np.generic):
-            return self.sample([time], nu)[0][..., 0, :]
-        return self.sample(time, nu)[0]
+            return self.sample([time], whole_order(nu))[0][..., 0, :]
+        return self.sample(time, whole_order(nu))[0]
 
     def sample(
         self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
@@ -138,7 +153,7 @@ class Trajectory:
             One array (..., T, D) per order [m/s^nu], the given buffers if there are any.
 
         Raises:
-            ValueError: bad time or nu, or buffers of a wrong number or shape.
+            ValueError: bad time or nu, or buffers of a wrong number, kind, shape or dtype.
         """
         xp = self.namespace
         orders = whole_orders(nu)
@@ -146,7 +161,7 @@ class Trajectory:
         batch = broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
         shape = (*batch, time.shape[-1], self.dimension)
         if out is not None:
-            check_buffers(out, len(orders), shape)
+            check_buffers(out, len(orders), shape, xp)
         kept = [min(order, 2 * self.order - 1) for order in orders]
         results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
         return tuple(
@@ -173,12 +188,20 @@ class Trajectory:
             return time, None
         return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
 
-    def _own_floats(self, **named: Any) -> list[Any]:
-        """Return the arguments as arrays of the trajectory's own library and dtype; None passes through."""
-        xp, (*arrays, _) = as_floats(**named, coefficients=self.coefficients[..., 0, 0, 0])
+    def floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
+        """Return arguments as arrays of the trajectory's own library, required ones first (see as_floats)."""
+        optional = optional or {}
+        reference = {"coefficients": self.coefficients[..., 0, 0, 0]}
+        xp, (*arrays, _) = as_floats({**optional, **reference}, **required)
         if xp is not self.namespace:
-            raise ValueError(f"{', '.join(named)} must be of the trajectory's own kind, not of {xp.__name__}")
-        dtype = self.coefficients.dtype
+            given = [*required, *(name for name, value in optional.items() if value is not None)]
+            raise ValueError(f"{', '.join(given)} must be of the trajectory's own kind, not of {xp.__name__}")
+        return arrays
+
+    def _own_floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
+        """Return the same, of the trajectory's own dtype."""
+        xp, dtype = self.namespace, self.coefficients.dtype
+        arrays = self.floats(optional, **required)
         return [a if a is None or a.dtype == dtype else xp.astype(a, dtype) for a in arrays]
 
     def _held(self, value: Array, order: int, inside: Array | None, in_place: bool) -> Array:
@@ -198,10 +221,10 @@ class Trajectory:
     def energy(self, nu: int) -> Array:
         """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], exact, as a sum of squares."""
         xp = self.namespace
-        if not 0 <= nu < 2 * self.order:
+        if whole_order(nu) >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
         upper = self.coefficients[..., nu:, :, :]
-        flat = xp.reshape(upper, (*upper.shape[:-2], -1))
+        flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
         modes = xp.reshape(xp.matmul(constant(energy_table(self.order, nu), flat), flat), upper.shape)
         scale = self.durations if nu == 0 else self.rates
         for _ in range(2 * nu - 2):
@@ -216,12 +239,25 @@ class Trajectory:
         return axis_extrema(self._pieces(nu))
 
     def peak(self, nu: int = 0) -> Array:
-        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]."""
+        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu].
+
+        Raises:
+            ValueError: nu is not a whole number, or the movement is so short that the derivative overflows.
+        """
         return largest_norm(self._pieces(nu))
 
     def _pieces(self, nu: int) -> Pieces:
-        (nu,) = whole_orders(nu)
-        return pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, self.namespace)
+        xp, nu = self.namespace, whole_order(nu)
+        with error_state(xp):
+            pieces = pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, xp)
+        if not xp.isfinite(pieces.coefficients).all():
+            durations = to_numpy(self.durations)
+            shortest = durations[durations > 0].min()
+            raise ValueError(
+                f"derivative {nu} of the trajectory overflows {self.coefficients.dtype}: its shortest segment "
+                f"lasts {shortest:g} s"
+            )
+        return pieces
 
     def stretched(self, duration: Array) -> Trajectory:
         """Return the same path at another pace, scaled to a new total duration (...,) [s].
@@ -233,7 +269,7 @@ class Trajectory:
         (duration,) = self._own_floats(duration=duration)
         require(xp, duration > 0, "duration", duration, "must be positive")
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
-        end = duration[..., None]
+        end = own(duration)[..., None]
         factor = end / self.end
         empty = self.rates <= 0
         with error_state(xp):
@@ -255,10 +291,11 @@ class Trajectory:
             ValueError: an argument is not finite or has a wrong shape.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
+        refuse_free(**named)
         xp, moved = self.namespace, self.coefficients
-        rotation, translation, scale = self._own_floats(**named)
+        rotation, translation, scale = self._own_floats(named)
         if rotation is not None:
-            if rotation.ndim < 2 or rotation.shape[-1] != self.dimension:
+            if rotation.ndim < 2 or rotation.shape[-1] != self.dimension or rotation.shape[-2] < 1:
                 raise ValueError(
                     f"rotation must have shape (..., D, {self.dimension}), got {tuple(rotation.shape)}"
                 )

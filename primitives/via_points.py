@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from ._arrays import FREE, Array, Boundary, Namespace, as_floats, broadcast_batch, broadcast_to, require
+from ._arrays import (
+    FREE,
+    Array,
+    Boundary,
+    Namespace,
+    as_floats,
+    broadcast_batch,
+    broadcast_to,
+    refuse_free,
+    require,
+)
 from ._banded import States
 from ._connecting import boundary_values, check_boundary_shapes, check_order, connect, end_states
 from .trajectory import Trajectory
@@ -45,7 +55,9 @@ def through(
     """
     check_order(order, start_acceleration, goal_acceleration)
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
-    xp, arrays = as_floats(waypoints=waypoints, durations=durations, via_velocities=via_velocities, **named)
+    refuse_free(via_velocities=via_velocities)
+    optional = {"via_velocities": via_velocities, **named}
+    xp, arrays = as_floats(optional, waypoints=waypoints, durations=durations)
     waypoints, durations, via_velocities = arrays[:3]
     boundary = dict(zip(named, arrays[3:], strict=True))
     batch = check_waypoints(waypoints, boundary, durations=durations)

@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.primitives import FREE, passage_durations, point_to_point, through
+from viapoint.primitives import (
+    FREE,
+    dimensionless_jerk,
+    minimum_duration,
+    minimum_jerk_coefficients,
+    passage_durations,
+    point_to_point,
+    retarget,
+    spectral_arc_length,
+    speed_valleys,
+    through,
+)
 
 RNG = np.random.default_rng(40)
 START = RNG.bit_generator.state
@@ -95,3 +106,44 @@ def test_a_trajectory_is_asked_in_its_own_kind():
             call()
     tensors = point_to_point(torch.zeros(1), torch.ones(1), 1.0)
     assert tensors(np.array([0.5])).dtype == torch.float32
+
+
+@pytest.mark.parametrize("number", [float, np.float64, np.float32, np.array])
+def test_a_number_beside_tensors_adds_no_dimension(number):
+    reach = point_to_point(torch.zeros(2), torch.ones(2), number(1.0))
+    many = point_to_point(torch.zeros(3, 2), torch.ones(2), number(1.0))
+    waypoints = torch.rand(3, 2)
+    assert reach.duration.shape == reach.cost().shape == ()
+    assert many.duration.shape == (3,)
+    assert passage_durations(waypoints, number(0.9)).shape == (2,)
+    assert passage_durations(torch.rand(5, 3, 2), number(0.9)).shape == (5, 2)
+    numbers = [number(value) for value in (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)]
+    assert minimum_jerk_coefficients(torch.tensor(0.0), *numbers).shape == (6,)
+    assert reach.stretched(number(2.0)).duration.shape == ()
+    assert many.stretched(number(2.0)).duration.shape == (3,)
+    assert reach.transformed(scale=number(2.0)).cost().shape == ()
+    assert retarget(reach, number(0.3), torch.ones(2), number(1.0)).duration.shape == ()
+    assert minimum_duration(reach, velocity=number(1.0)).shape == ()
+    assert reach(0.5).shape == (2,)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_gives_what_single_precision_gives_within_its_rounding(dtype):
+    waypoints = torch.tensor([[0.0, 0.0], [0.5, 0.75], [1.0, 0.0]])
+    half, single = (
+        through(points, passage_durations(points, 1.0)) for points in (waypoints.to(dtype), waypoints)
+    )
+    asked = {
+        "peak": lambda movement: movement.peak(1),
+        "extrema": lambda movement: movement.extrema(1).maximum,
+        "smoothness": spectral_arc_length,
+        "valleys": lambda movement: speed_valleys(movement).time,
+        "jerk": dimensionless_jerk,
+        "limits": lambda movement: minimum_duration(movement, velocity=1.0, acceleration=[4.0, 4.0]),
+        "duration": lambda movement: movement.durations,
+    }
+    for name, ask in asked.items():
+        assert ask(half).dtype == dtype, name
+        torch.testing.assert_close(ask(half).float(), ask(single), rtol=0.05, atol=0.02)
+    dropped = through(torch.tensor([[0.0], [0.0], [1.0]], dtype=dtype), [0.0, 1.0])
+    torch.testing.assert_close(dropped.cost().float(), torch.tensor(360.0), rtol=0.01, atol=0.0)
