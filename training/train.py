@@ -30,6 +30,10 @@ __all__ = [
 
 MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """What a call that resumes a run may tell anew."""
+UNFIT = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip
+"""What libraries raise where a network or a buffer cannot be as it was asked for."""
 
 
 class TrainingFailedError(Exception):
@@ -144,8 +148,15 @@ def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     try:
         try:
             model = new_model(config, env)
-        except (TypeError, AssertionError, KeyError, AttributeError) as error:
-            raise ValueError(f"{config.algo} cannot be made with these hyperparameters: {error}") from error
+        except UNFIT as error:
+            usual, asked = config.preset.arguments(), config.hyperparameters
+            given = [
+                f"{name}={json.dumps(asked[name], default=str)}"
+                for name in asked
+                if usual.get(name) != asked[name]
+            ]
+            made = f"made with {', '.join(given)}" if given else f"made for {config.env}"
+            raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
         yield model
     finally:
         env.close()

@@ -163,7 +163,18 @@ def test_what_cannot_be_trained_is_refused(tmp_path):
         train(TrainConfig(out=tmp_path / "nothing", resume=True))
     for changes, words in (
         ({"hyperparameters": {"speed": 1}}, "no hyperparameter 'speed'"),
-        ({"hyperparameters": {"policy_kwargs": {"speed": 1}}}, "cannot be made.*speed"),
+        (
+            {"hyperparameters": {"policy_kwargs": {"speed": 1}}},
+            'cannot be made with policy_kwargs={"speed": 1}: ',
+        ),
+        (
+            {"hyperparameters": {"policy_kwargs": {"heads": -1}}},
+            'cannot be made with policy_kwargs={"heads": -1}: ',
+        ),
+        (
+            {"algo": "sac", "hyperparameters": {"policy_kwargs": {"net_arch": [-3]}}},
+            'with policy_kwargs={"net_arch"',
+        ),
         ({"env_kwargs": {"colour": 1}}, "env_kwargs of .*colour"),
         (
             {"algo": "sac", "discount_unit": 1.0},
