@@ -37,7 +37,8 @@ FREE: Final = Free.FREE
 Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 """A given boundary value, None for rest (zero), or FREE."""
 
-_PLAIN = (int, float, list, tuple, np.generic, np.ndarray)
+_PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
+_PLAIN_OR_OPEN = (*_PLAIN, type(None), Free)
 
 
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
@@ -56,15 +57,15 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
         ValueError: an argument is missing, not numeric, or not finite.
     """
     for name, value in required.items():
-        if _is_marker(value):
+        if value is None or value is FREE:
             raise ValueError(f"{name} must be an array of real numbers, got {value!r}")
     named = {**required, **optional} if optional else required
-    if all(isinstance(value, _PLAIN) or _is_marker(value) for value in named.values()):
+    if all(isinstance(value, _PLAIN_OR_OPEN) for value in named.values()):
         xp, arrays = np, _numpy_floats(named)
     else:
         xp, arrays = _foreign_floats(named)
     for name, array in zip(named, arrays, strict=True):
-        if not _is_marker(array):
+        if array is not None and array is not FREE:
             require(xp, xp.isfinite(array), name, array, "must be finite")
     return xp, arrays
 
@@ -78,10 +79,6 @@ def namespace_of(array: Array) -> Namespace:
     return array_namespace(array)
 
 
-def _is_marker(value: Any) -> bool:
-    return value is None or value is FREE
-
-
 def _numpy_floats(named: dict[str, Any]) -> list[Any]:
     floating = [v.dtype for v in named.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f"]
     dtype = floating[0] if floating else np.dtype(np.float64)
@@ -89,7 +86,7 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
         dtype = dtype if other == dtype else np.promote_types(dtype, other)
     arrays: list[Any] = []
     for name, value in named.items():
-        if _is_marker(value):
+        if value is None or value is FREE:
             arrays.append(value)
             continue
         try:
@@ -118,7 +115,7 @@ def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
     dtype = xp.result_type(*floating) if floating else xp.float64
     arrays: list[Any] = []
     for name, value in named.items():
-        if _is_marker(value):
+        if value is None or value is FREE:
             arrays.append(value)
         elif name not in foreign:
             # A copy: torch would share the caller's memory, and takes neither read-only arrays nor long doubles.
@@ -211,9 +208,10 @@ def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: 
     if shapes != [shape] * count:
         raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")
     for buffer in out:
-        if not xp.isdtype(buffer.dtype, "real floating"):
+        is_floating = buffer.dtype.kind == "f" if xp is np else xp.isdtype(buffer.dtype, "real floating")
+        if not is_floating:
             raise ValueError(f"out must be of a floating dtype, got {buffer.dtype}")
-        if isinstance(buffer, np.ndarray) and not buffer.flags.writeable:
+        if xp is np and not buffer.flags.writeable:
             raise ValueError(f"out must be writeable, got a read-only array of shape {shape}")
 
 
@@ -235,7 +233,7 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
 
 def own(array: Array) -> Array:
     """Return the same numbers in memory that no caller shares, within the same gradient."""
-    return 1.0 * array
+    return array.copy(order="K") if isinstance(array, np.ndarray) else 1.0 * array
 
 
 def detach(array: Array) -> Array:

@@ -60,7 +60,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         if isinstance(self.coefficients, np.ndarray):
             for array in (self.coefficients, self.durations, self.starts, self.rates, self.end):
-                array.flags.writeable = False
+                array.setflags(write=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle by construction, so that copies are read-only too."""

@@ -55,7 +55,8 @@ def through(
     """
     check_order(order, start_acceleration, goal_acceleration)
     named = boundary_values(start_velocity, start_acceleration, goal_velocity, goal_acceleration)
-    refuse_free(via_velocities=via_velocities)
+    if via_velocities is not None:
+        refuse_free(via_velocities=via_velocities)
     optional = {"via_velocities": via_velocities, **named}
     xp, arrays = as_floats(optional, waypoints=waypoints, durations=durations)
     waypoints, durations, via_velocities = arrays[:3]
