@@ -84,17 +84,22 @@ def _rows(numbers: Numbers, name: str, about: Numbers) -> Rows:
     for entry in numbers["methods"]:
         for way, found in entry["sets"].get(name, {}).items():
             label = f"{entry['label']}, {'policy alone' if way == ALONE else 'ranked candidates'}"
-            time = numbers["decision_time"].get(f"{entry['name']} {way}")
+            time = _times(numbers, f"{entry['name']} {way}")
             seeds = str(len(entry["seeds"]))
-            rows.append([label, seeds, *_success(found, bands), *_beside(found), _ms(time), *_effort(entry)])
+            rows.append([label, seeds, *_success(found, bands), *_beside(found), time, *_effort(entry)])
     for entry in numbers["baselines"]:
         if name in entry["sets"]:
             found = entry["sets"][name]
-            time = numbers["decision_time"].get("planner" if entry["name"] == "stored" else entry["name"])
-            rows.append(
-                [entry["label"], "-", *_success(found, bands), *_beside(found), _ms(time), *["-"] * 3]
-            )
+            time = _times(numbers, "planner" if entry["name"] == "stored" else entry["name"])
+            rows.append([entry["label"], "-", *_success(found, bands), *_beside(found), time, *["-"] * 3])
     return [head, *rows] if rows else []
+
+
+def _times(numbers: Numbers, name: str) -> str:
+    """Of one decision, and as machine code where that was timed."""
+    times = numbers["decision_time"]
+    code = f" ({_ms(times[name + ' compiled'])})" if f"{name} compiled" in times else ""
+    return _ms(times.get(name)) + code
 
 
 def _success(found: Numbers, bands: Sequence[str]) -> list[str]:

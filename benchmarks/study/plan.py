@@ -98,7 +98,7 @@ FREEDOM_LABELS = {each.name: each.label for each in FREEDOM} | {WHOLE.name: "K =
 class Study:
     """Train, evaluate, and write docs/results.md with its figures; a second call goes on where the first stopped.
 
-    Example: python benchmarks/learning.py --jobs 2
+    Example: python benchmarks/learning.py --jobs 2 --compiled
     """
 
     out: Path = Path("runs/study")
@@ -123,6 +123,8 @@ class Study:
     """Of the results; `stored` is the planner's solutions from the files of scenes, `planner` searches anew."""
     candidates: int = 80
     """Actions that the critic ranks in the second row of an agent."""
+    compiled: bool = False
+    """Time the decisions of viatd3 as machine code, too: a minute or two for each, and a C++ compiler."""
     n_timesteps: int | None = None
     """Decisions of each training; as the preset says if not given. For trials."""
     n_scenes: int | None = None

@@ -4,7 +4,7 @@ INTRODUCTION = """# Results
 
 This page is made by one command from files that the trainings left; no number in it is typed by hand.
 
-    python benchmarks/learning.py --jobs 2
+    python benchmarks/learning.py --jobs 2 --compiled
 
 It trains every method with every seed, measures each agent on the frozen `test` and `hard` scenes, measures the
 baselines on the same scenes, and writes this page, its figures and [results.json](results.json), which holds every
@@ -19,9 +19,10 @@ kept. Of several seeds the number is the interquartile mean (of five seeds: the 
 bands). A method without seeds has the interval over scenes. The bands are those of the *solution share*, the
 fraction of uniformly random actions that solve a scene: easy scenes prove little. Jerk and duration are those of
 successes as multiples of the planner's in the same scene: the median over scenes, then over seeds. Jerk is taken at
-equal duration. Decision: the median time of one decision on one thread; of the planner, of a search; of an agent
-that acts in every control step, of one step. Minutes: wall time of a training without validation, median over
-seeds, with the cores it could use; what else ran on the machine makes it longer, never shorter.
+equal duration. Decision: the median time of one decision on one thread, in brackets as machine code
+(`compile_decisions`); of the planner, of a search; of an agent that acts in every control step, of one step. Minutes:
+wall time of a training without validation, median over seeds, with the cores it could use; what else ran on the
+machine makes it longer, never shorter.
 """
 
 KNOWLEDGE = """## What the critic knows, and what it must learn

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from study.plan import FREEDOM, Cell, Study, Variant, sets_of, short
+from study.plan import FREEDOM, WHOLE, Cell, Study, Variant, sets_of, short
 from viapoint.training.baselines import Method, agent_method, make_method
+from viapoint.training.compiled import CannotCompileError
 from viapoint.training.config import TrainConfig, as_json
 from viapoint.training.demo import Certified
 from viapoint.training.evaluate import MethodResult, evaluate
@@ -211,8 +212,12 @@ def time_decisions(study: Study) -> str:
         for name, source, method in _to_time(env, study):
             if times.get(name, {}).get("source") == source:
                 continue
-            with one_thread():
-                result = evaluate([method()], frozen, env, env_kwargs={"threads": 1}).results[0]
+            try:
+                with one_thread():
+                    result = evaluate([method()], frozen, env, env_kwargs={"threads": 1}).results[0]
+            except CannotCompileError as error:
+                print(f"{short(env)}: {error}", flush=True)
+                continue
             times[name] = {"source": source, "median": float(np.median(result.decision_times))}
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, times)
@@ -238,7 +243,17 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
         for way, count in ways.items():
             method = lambda way=way, model=model, count=count: agent_method(way, model, count)  # noqa: E731
             found.append((f"{variant.name} {way}", f"{source} {count}", method))
+            if study.compiled and variant == WHOLE:
+                code = lambda way=way, folder=folder, count=count: _compiled(way, folder, count)  # noqa: E731
+                found.append((f"{variant.name} {way} compiled", f"{source} {count}", code))
     return found
+
+
+def _compiled(way: str, folder: Path, count: int) -> Method:
+    """An agent whose single decisions are machine code."""
+    model: Any = load_model(folder)
+    model.policy.compile_decisions(count)
+    return agent_method(way, model, count)
 
 
 def scenes(name: str, env: str, study: Study) -> FrozenScenes:

@@ -14,7 +14,9 @@ from PIL import Image
 from study import gather, page, work
 from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, placed
 
+from viapoint.training.compiled import CannotCompileError
 from viapoint.training.files import read_json
+from viapoint.training.policies import ViaPolicy
 from viapoint.training.runs import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -135,6 +137,23 @@ def test_decisions_are_timed_once(done):
     assert gather.gather(study)["environments"][ENV]["decision_time"]["random16"] == pytest.approx(
         times["random16"]["median"], abs=1e-6
     )
+
+
+def test_what_cannot_be_compiled_is_passed_over(done, monkeypatch, capsys):
+    def refused(*_):
+        raise CannotCompileError("no compiler here")
+
+    monkeypatch.setattr(ViaPolicy, "compile_decisions", refused)
+    study = study_of(done, baselines=("random16",), compiled=True)
+    work.time_decisions(study)
+    assert "no compiler here" in capsys.readouterr().out
+    assert set(read_json(work.timings_path(ENV, study))) == {"random16", "viatd3 alone", "viatd3 ranked"}
+
+
+def test_times_as_machine_code_stand_in_brackets():
+    times = {"agent": 0.004, "agent compiled": 0.0007, "other": 0.2}
+    shown = [page._times({"decision_time": times}, name) for name in ("agent", "other", "none")]
+    assert shown == ["4 ms (0.7 ms)", "200 ms", "-"]
 
 
 def test_failures_add_up(done):
