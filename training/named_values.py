@@ -31,14 +31,19 @@ def _value(name: str, text: str) -> Any:
         return json.loads(text, parse_constant=_refused)
     except ValueError:
         suggestion = _as_json(text)
-        if (
-            suggestion is None
-            and text[:1] not in tuple("[{(\"'")
-            and text.lower() not in ("nan", "inf", "-inf")
-        ):
+        if suggestion is None and text[:1] not in tuple("[{(\"'") and not _is_number(text):
             return text
     advice = f"{name}={suggestion}" if suggestion else "numbers, words, true, false, null, [1,8]"
     raise ValueError(f"{name}={text} is no JSON, which values are written in: {advice}")
+
+
+def _is_number(text: str) -> bool:
+    """Whether Python reads a number, such as nan and Infinity, which are none in JSON."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _as_json(text: str) -> str | None:
