@@ -3,7 +3,7 @@
     python benchmarks/reliability_fuzz.py [--ids ID ...] [--actions N] [--scenes N] [--calls N] [--json FILE]
 
 For every environment: 100,000 actions at and beyond the edges of their space; 10,000 scenes with obstacles that touch,
-contain and repeat each other, as large, thin and short as can be written; and 20,000 calls of reset, partial reset,
+contain and repeat each other, as large, thin and short as can be written; and 5,000 calls of reset, partial reset,
 step and close in random order, with good and with bad arguments. A call either does what it should or raises
 `ValueError` or `gymnasium.error.ResetNeeded`; what it returns is finite and within its space; memory does not grow.
 """
@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument("--ids", nargs="+", default=IDS, choices=IDS)
     parser.add_argument("--actions", type=int, default=100_000)
     parser.add_argument("--scenes", type=int, default=10_000)
-    parser.add_argument("--calls", type=int, default=20_000)
+    parser.add_argument("--calls", type=int, default=5_000)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     results: dict[str, dict[str, Any]] = {}
