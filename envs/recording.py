@@ -26,6 +26,8 @@ class RecordMovements(RecordVideo[Any, Any]):
     >>> env = RecordMovements(env, "videos")  # doctest: +SKIP
     """
 
+    recorded_frames: list[Any] = []  # noqa: RUF012 - Gymnasium asks for it when one that was refused is deleted
+
     def __init__(self, env: gym.Env[Any, Any], *args: Any, **kwargs: Any) -> None:
         if env.render_mode != EVERY_FRAME:
             raise ValueError(

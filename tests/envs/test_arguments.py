@@ -91,8 +91,6 @@ def test_movements_are_recorded_of_every_frame_or_not_at_all(mode, tmp_path):
     "wrap", [FlattenObservation, lambda env: NormalizeObservation(FlattenObservation(env))]
 )
 def test_vector_wrappers_of_gymnasium_take_what_the_page_says(wrap):
-    with pytest.raises(ValueError, match="Expected autoreset_mode to be NEXT_STEP or DISABLED"):
-        wrap(gym.make_vec(PLANAR[0], num_envs=2, threads=1))
     env = wrap(gym.make_vec(PLANAR[0], num_envs=2, vectorization_mode="sync"))
     seen, _ = env.reset(seed=0)
     assert seen.shape == (2, 36)
