@@ -1,12 +1,10 @@
-"""What the commands can be told: plain records, checked when made, that become the command line and JSON."""
+"""What the commands can be told: plain records, checked when made, that become the command line."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 import tyro
 
@@ -27,8 +25,6 @@ from viapoint.training.discount import check_discount_unit
 from viapoint.training.hyperparameters import check_hyperparameters
 from viapoint.training.named_values import NamedValues
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
-
-C = TypeVar("C")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,32 +314,3 @@ class ImportConfig:
         """Refuse what cannot be meant."""
         check_env(self.env)
         check_folder("out", self.out)
-
-
-def as_json(config: Any) -> dict[str, Any]:
-    """A configuration as plain values; :func:`from_json` is the inverse."""
-    return {each.name: _plain(getattr(config, each.name)) for each in dataclasses.fields(config)}
-
-
-def from_json(kind: type[C], record: Mapping[str, Any]) -> C:
-    """A configuration from plain values.
-
-    Raises:
-        ValueError: A name is unknown or a value is not allowed.
-    """
-    fields = {each.name: str(each.type) for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    unknown = sorted(set(record) - set(fields))
-    if unknown:
-        raise ValueError(f"{kind.__name__} knows {', '.join(fields)}, not {unknown[0]!r}")
-    values = {}
-    for name, value in record.items():
-        if "Path" in fields[name] and isinstance(value, str):
-            value = Path(value)
-        values[name] = tuple(value) if isinstance(value, list) else value
-    return kind(**values)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Path):
-        return str(value)
-    return list(value) if isinstance(value, tuple) else value

@@ -24,8 +24,9 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
-from viapoint.training.config import TrainConfig, as_json, from_json
+from viapoint.training.config import TrainConfig
 from viapoint.training.config_checks import check_folder
+from viapoint.training.config_json import as_json, from_json
 from viapoint.training.files import (
     UNFINISHED,
     BadFileError,

@@ -15,7 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.training.config import TrainConfig, as_json
+from viapoint.training.config import TrainConfig
+from viapoint.training.config_json import as_json
 from viapoint.training.discount import ELAPSED
 from viapoint.training.files import BadFileError
 from viapoint.training.model_files import build

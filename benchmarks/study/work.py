@@ -14,7 +14,8 @@ import numpy as np
 from study.plan import FREEDOM, WHOLE, Cell, Study, Variant, sets_of, short
 from viapoint.training.baselines import Method, agent_method, make_method
 from viapoint.training.compiled import CannotCompileError
-from viapoint.training.config import TrainConfig, as_json
+from viapoint.training.config import TrainConfig
+from viapoint.training.config_json import as_json
 from viapoint.training.demo import Certified
 from viapoint.training.evaluate import MethodResult, evaluate
 from viapoint.training.failures import sort_out

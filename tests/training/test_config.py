@@ -16,11 +16,10 @@ from viapoint.training.config import (
     PaperConfig,
     PlayConfig,
     TrainConfig,
-    as_json,
-    from_json,
 )
 from viapoint.training.config_checks import ELSEWHERE
 from viapoint.training.config_checks import METHODS as MEASURABLE
+from viapoint.training.config_json import as_json, from_json
 from viapoint.training.model_files import ALGORITHMS
 from viapoint.training.presets import PRESETS
 
