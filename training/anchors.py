@@ -46,8 +46,9 @@ class Anchors:
         plan = layout.decode(np.concatenate((vias, np.zeros((len(vias), 1))), axis=-1), 0.0 * goal, goal)
         trajectory, duration = plan.trajectory(), plan.durations.sum(axis=-1)
         self.task = task
-        self.paths = trajectory(duration[:, None] * INSTANTS).astype(np.float32)
-        """In the frame of start and goal, shape (A, PHASES, D), for a distance of 1 m."""
+        path = trajectory(duration[:, None] * INSTANTS).astype(np.float32)
+        self.paths = np.ascontiguousarray(np.moveaxis(path, -1, 0))
+        """In the frame of start and goal, shape (D, A, PHASES), for a distance of 1 m."""
         ratio = trajectory.cost() * duration**5 / 360.0
         self.log_jerk = np.log(np.maximum(ratio, 1.0)).astype(np.float32)
         """Of their jerk cost relative to the straight movement's, shape (A,)."""
@@ -60,20 +61,29 @@ class Anchors:
         """Via components of their actions, shape (A, K D), for a distance of 1 m."""
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.vias)
 
     def look(self, observation: Observation) -> Look:
         """See how they would fare in each of B scenes."""
         start, line = observation["hand"], observation["goal"] - observation["hand"]
         xp = namespace_of(line)
         distance = xp.sqrt(xp.sum(line * line, axis=-1))[:, None, None]
-        scaled = xp.stack(frame(line), axis=-2) * distance
-        hand = start[:, None, None] + xp.asarray(self.paths) @ scaled[:, None]
+        hand = self._paths(start, xp.stack(frame(line), axis=-2) * distance)
         actions = self.actions(observation)
         log_jerk = xp.zeros_like(actions[..., 0]) + xp.asarray(self.log_jerk)
         duration = xp.full_like(log_jerk, self.task.action.centre_duration)
         moves = Movements(hand, duration, log_jerk, effort_of(log_jerk, duration, self.task))
         return look_along(observation, actions, moves, self.task)
+
+    def _paths(self, start: Array, axes: Array) -> Array:
+        """Of the hand, shape (B, A, PHASES, D), each component by itself in memory, as they are dealt with."""
+        xp = namespace_of(start)
+        paths = xp.asarray(self.paths)
+        parts = [
+            start[:, i, None, None] + sum(paths[j] * axes[:, j, i, None, None] for j in range(len(paths)))
+            for i in range(len(paths))
+        ]
+        return xp.moveaxis(xp.stack(parts, axis=0), 0, -1)
 
     def actions(self, observation: Observation) -> Array:
         """In each of B scenes, shape (B, A, m), inside (-1, 1)."""

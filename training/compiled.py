@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch._inductor import aoti_compile_and_package, aoti_load_package
 
 from viapoint.training import graphs, sight
+from viapoint.training.lowering import SETTINGS, lowered
 from viapoint.training.sight import Observation
 
 if TYPE_CHECKING:
@@ -51,18 +53,25 @@ class CompiledDecision:
             )
         require_compiler()
         decision = _Decision(policy, candidates)
+        self._shapes = {name: box.shape for name, box in decision.boxes.items()}
         self._weights = [*policy.parameters()]
         self._versions = self._now()
-        self._names, self._run = decision.names, _translated(decision)
+        self._run = _translated(decision)
 
-    def fits(self, observation: Observation) -> bool:
-        """Whether it is made for that: one scene, and the weights it was made of."""
-        return len(observation[self._names[0]]) == 1 and self._now() == self._versions
+    def __call__(self, observation: Observation) -> NDArray[np.float32] | None:
+        """The action as `predict` returns it, or None where it must be decided otherwise.
 
-    def __call__(self, observation: Observation) -> Tensor:
-        """The action, shape (1, m)."""
-        action: Tensor = self._run(*(observation[name].float() for name in self._names))
-        return action
+        It is made for one scene, with or without an axis of scenes, and for the weights it was made of.
+        """
+        shapes = {name: np.shape(part) for name, part in observation.items()}
+        lead = () if shapes == self._shapes else (1,)
+        fits = not lead or shapes == {name: (1, *shape) for name, shape in self._shapes.items()}
+        if not fits or self._now() != self._versions:
+            return None
+        parts = (np.array(observation[name], dtype=np.float32).reshape(1, -1) for name in self._shapes)
+        (action,) = self._run([torch.from_numpy(part) for part in parts])
+        found: NDArray[np.float32] = action.numpy().reshape(*lead, -1)
+        return found
 
     def _now(self) -> list[int]:
         """What changes whenever a weight does."""
@@ -76,28 +85,31 @@ class _Decision(nn.Module):
         super().__init__()
         self.policy, self.candidates = policy, candidates
         space: Any = policy.observation_space
-        self.boxes, self.names = space.spaces, tuple(space.spaces)
+        actions: Any = policy.action_space
+        self.boxes = space.spaces
+        self.low, self.high = torch.as_tensor(actions.low), torch.as_tensor(actions.high)
 
     def forward(self, *parts: Tensor) -> Tensor:
-        return self.policy.decide(dict(zip(self.names, parts, strict=True)), self.candidates)
+        action = self.policy.decide(dict(zip(self.boxes, parts, strict=True)), self.candidates)
+        return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
 
     def example(self) -> tuple[Tensor, ...]:
         """Some observation of one scene."""
         generator = np.random.default_rng(0)
-        drawn = (generator.uniform(self.boxes[name].low, self.boxes[name].high) for name in self.names)
+        drawn = (generator.uniform(box.low, box.high) for box in self.boxes.values())
         return tuple(torch.tensor(part[None], dtype=torch.float32) for part in drawn)
 
 
 def _translated(decision: _Decision) -> Any:
-    """Machine code on one thread, as a function of the same arguments."""
+    """Machine code on one thread, as a function from a list of the same arguments to a list of the action."""
     example, folder = decision.example(), tempfile.TemporaryDirectory(prefix="viapoint-")
     with torch.no_grad(), graphs.drawn(), warnings.catch_warnings(), folder:
         warnings.simplefilter("ignore")  # of torch's own parts about each other
         decision(*example)  # constants must be there before a graph is drawn: within one they are no numbers
-        graph = torch.export.export(decision, example)
-        file = Path(folder.name) / "decision.pt2"
-        path = aoti_compile_and_package(graph, package_path=str(file), inductor_configs={"cpp.threads": 1})
-        return aoti_load_package(path)
+        graph = lowered(torch.export.export(decision, example))
+        file = str(Path(folder.name) / "decision.pt2")
+        path = aoti_compile_and_package(graph, package_path=file, inductor_configs=SETTINGS)
+        return aoti_load_package(path).loader.boxed_run
 
 
 def require_compiler() -> None:

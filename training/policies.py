@@ -157,10 +157,15 @@ class ViaPolicy(TD3Policy):
         spaces_: Any = (self.observation_space, self.action_space)
         return ViaCritic(*spaces_, task=self.task, **self._both).to(self.device)
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """As its base class; in machine code where there is some."""
         compiled = self._compiled.get(self.candidates)
-        if compiled is not None and compiled.fits(observation):
-            return cast(Tensor, compiled(observation))
+        action = compiled(observation) if compiled is not None and isinstance(observation, dict) else None
+        if action is None:
+            return super().predict(observation, state, *args, **kwargs)
+        return action, state
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         return self.decide(observation, self.candidates)
 
     def decide(self, observation: Observation, candidates: int) -> Tensor:

@@ -28,8 +28,16 @@ STRETCHES = 16
 LOOKS = 3
 """How often a movement is looked at in each of them."""
 PHASES = STRETCHES * LOOKS
-INSTANTS = np.arange(1, PHASES + 1, dtype=np.float32) / PHASES
-"""Fractions of the duration at which a movement is looked at, shape (PHASES,)."""
+_ORDER = np.arange(PHASES).reshape(STRETCHES, LOOKS).T.ravel()
+INSTANTS = (_ORDER + 1).astype(np.float32) / PHASES
+"""Fractions of the duration at which a movement is looked at, the first looks of all stretches first, shape (PHASES,).
+
+So looks of different stretches, of which the least is asked for, are far apart in memory, and each kind is together.
+"""
+_PLACE = np.argsort(_ORDER)
+"""Of each instant among them, in the order of time, shape (PHASES,)."""
+_BESIDE = _PLACE[np.clip(np.add.outer([-1, 0, 1], _ORDER), 0, PHASES - 1)]
+"""Numbers of the instants just before, at and after each, shape (3, PHASES)."""
 NEAR = 0.06
 """Clearance from which on an obstacle no longer matters, [m]."""
 _STEP = 1e-3
@@ -57,11 +65,14 @@ def see(observation: Observation, hand: Array, task: Task, duration: Array = Non
     xp = namespace_of(hand)
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
-        return Sight(xp.full_like(hand[..., LOOKS - 1 :: LOOKS, 0], FAR), margin)
+        return Sight(xp.full_like(hand[..., -STRETCHES:, 0], FAR), margin)
     if among_links(task):
         return Sight(_seen_of_links(observation, hand, task, duration), margin)
-    nearest, pairs = _nearest(observation, hand, task, duration)
-    return Sight(_lowest(_clearance(nearest, pairs, task)[..., 0, :]), margin)
+    near = _nearest(observation, hand, task, duration)
+    if getattr(hand, "requires_grad", False):
+        around = _picked(hand, near.instants, 2)
+        return Sight(_lowest(_beside(around, near, observation, task, duration)), margin)
+    return Sight(_lowest(near.clearance), margin)
 
 
 def push(observation: Observation, hand: Array, task: Task, duration: Array = None) -> tuple[Sight, Array]:
@@ -73,21 +84,17 @@ def push(observation: Observation, hand: Array, task: Task, duration: Array = No
     xp = namespace_of(hand)
     margin = xp.min(task.arm.reach_margin(hand), axis=-1)
     if "obstacles" not in observation:
-        at_ends = hand[..., LOOKS - 1 :: LOOKS, :]
+        at_ends = hand[..., -STRETCHES:, :]
         return Sight(xp.full_like(at_ends[..., 0], FAR), margin), xp.zeros_like(at_ends)
     if among_links(task):
         near = _approaches(observation, hand, task, duration, NEAR)
         return Sight(near.clearance, margin), near.gradient * _nearness(near.clearance)
-    nearest, pairs = _nearest(observation, hand, task, duration)
-    moves = xp.asarray(_STEP * np.eye(hand.shape[-1]), dtype=hand.dtype)
-    around = xp.concat((nearest, nearest[..., 1:2, :] + moves), axis=-2)
-    if pairs.drift is not None:
-        same = xp.broadcast_to(pairs.drift[..., 1:2, :], (*pairs.drift.shape[:-2], *moves.shape))
-        pairs = pairs._replace(drift=xp.concat((pairs.drift, same), axis=-2))
-    clearance = _clearance(around, pairs, task)[..., 0, :]
-    gradient = (clearance[..., 3:] - clearance[..., 1:2]) / _STEP
-    lowest = _lowest(clearance[..., :3])
-    return Sight(lowest, margin), gradient * _nearness(lowest)
+    nearest = _nearest(observation, hand, task, duration)
+    lowest, at = _lowest(nearest.clearance), nearest.only_at()
+    moves = xp.asarray(_STEP * np.eye(hand.shape[-1])[:, None], dtype=hand.dtype)
+    moved = _picked(hand, at.instants, 2) + moves
+    gradient = (_beside(moved, at, observation, task, duration) - at.clearance) / _STEP
+    return Sight(lowest, margin), xp.moveaxis(gradient, 2, -1) * _nearness(lowest)
 
 
 def _nearness(clearance: Array) -> Array:
@@ -104,7 +111,7 @@ def _seen_of_links(observation: Observation, hand: Array, task: Task, duration: 
     """Clearance in each stretch; with respect to the hand it is differentiated as if it changed in proportion."""
     if namespace_of(hand) is np:
         return _approaches(observation, hand, task, duration, -np.inf).clearance
-    middle = hand[..., LOOKS // 2 :: LOOKS, :]
+    middle = hand[..., LOOKS // 2 * STRETCHES :, :][..., :STRETCHES, :]
     near = _approaches(observation, hand, task, duration, NEAR if middle.requires_grad else -np.inf)
     clearance, gradient = (middle.new_tensor(part) for part in near)
     return clearance + (gradient * (middle - middle.detach())).sum(-1)
@@ -120,7 +127,8 @@ def _approaches(
         velocity = _numbers(observation["obstacle_velocities"]).reshape(rows.centre.shape)
         taken = _numbers(duration)
     obstacles = Obstacles.packed(together, rows.present > 0.5, velocity)
-    return approaches(task.arm, _numbers(hand), obstacles, STRETCHES, within, taken)
+    in_order = _numbers(hand)[..., _PLACE, :]
+    return approaches(task.arm, in_order, obstacles, STRETCHES, within, taken)
 
 
 def _numbers(part: Array) -> Any:
@@ -138,39 +146,75 @@ class _Others(NamedTuple):
     """How far each has moved at each time, shape (..., n, T, D), [m]; None where they stand."""
 
 
-def _nearest(observation: Observation, hand: Array, task: Task, duration: Array) -> tuple[Array, _Others]:
-    """Nearest approach of each stretch: the hand just before, at and after it, and the obstacle it is to.
+class _Nearest(NamedTuple):
+    """The nearest approach of each stretch, just before, at and after it."""
 
-    Shapes (B, H, STRETCHES, 3, D), and of obstacles (B, H, STRETCHES, 1, .).
-    """
+    clearance: Array
+    """Shape (B, H, 3, STRETCHES), [m]."""
+    instants: Array
+    """Numbers of the instants of the path, shape (B, H, 3, STRETCHES)."""
+    obstacle: Array
+    """Number of the one it is to, shape (B, H, STRETCHES)."""
+
+    def only_at(self) -> _Nearest:
+        """Not before and after."""
+        return _Nearest(self.clearance[:, :, 1:2], self.instants[:, :, 1:2], self.obstacle)
+
+
+def _nearest(observation: Observation, hand: Array, task: Task, duration: Array) -> _Nearest:
+    """Searched for without gradients, over every obstacle and instant."""
     xp = namespace_of(hand)
-    rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
-    obstacles = xp.concat((rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1)
-    present, moving = rows.present > 0.5, "obstacle_velocities" in observation
-    every = _Others(obstacles[:, None], present[:, None], None)
-    if moving:
-        velocity = velocities(observation, rows.centre)
+    rows, present = _rows(observation, task)
+    every = _Others(rows[:, None], present[:, None], None)
+    if "obstacle_velocities" in observation:
+        velocity = velocities(observation, rows[..., : hand.shape[-1]])
         times = _still(duration)[..., None] * xp.asarray(INSTANTS, dtype=hand.dtype)
         every = every._replace(drift=velocity[:, None, :, None] * times[:, :, None, :, None])
     profile = _clearance(_still(hand), every, task)
-    profile = xp.reshape(profile, (*profile.shape[:3], STRETCHES, LOOKS))
-    which = xp.argmin(_least_look(profile), axis=2)
-    look = xp.argmin(xp.min(profile, axis=2), axis=-1)
-    phase = LOOKS * xp.arange(STRETCHES) + look
-    around = clamp(phase[..., None] + xp.arange(-1, 2), 0, PHASES - 1)
-    nearest = _picked(hand, around, 2)
-    pairs = _Others(_picked(obstacles, which, 1)[..., None, :], _picked(present, which, 1)[..., None], None)
-    if moving:
-        times = duration[..., None, None] * xp.asarray(INSTANTS, dtype=hand.dtype)[around]
-        pairs = pairs._replace(
-            drift=(_picked(velocity, which, 1)[..., None, :] * times[..., None])[..., None, :, :]
-        )
-    return nearest, pairs
+    looks = xp.reshape(profile, (*profile.shape[:3], LOOKS, STRETCHES))
+    which = xp.argmin(_least_look(looks), axis=2)
+    look = xp.argmin(xp.min(looks, axis=2), axis=2)
+    at = STRETCHES * look + xp.arange(STRETCHES)
+    instants = xp.moveaxis(xp.asarray(_BESIDE)[:, at], 0, 2)
+    by_pair = xp.reshape(profile, (*profile.shape[:2], -1))
+    return _Nearest(_picked(by_pair, PHASES * which[:, :, None] + instants, 2), instants, which)
+
+
+def _beside(places: Array, near: _Nearest, observation: Observation, task: Task, duration: Array) -> Array:
+    """Clearance of places of the hand from the obstacle of their stretch at some instants of the path.
+
+    Args:
+        places: Shape (B, H, M, STRETCHES, D), [m].
+        near: With instants of shape (B, H, M, STRETCHES), or of one for all M.
+        observation: Of B scenes.
+        task: The environment's.
+        duration: Of the movements, shape (B, H), [s].
+
+    Returns:
+        Shape (B, H, M, STRETCHES), [m].
+    """
+    xp, (rows, present) = namespace_of(places), _rows(observation, task)
+    chosen, shown = (_picked(part, near.obstacle, 1)[:, :, None, :, None] for part in (rows, present))
+    drift = None
+    if "obstacle_velocities" in observation:
+        velocity = _picked(velocities(observation, rows[..., : places.shape[-1]]), near.obstacle, 1)
+        times = duration[..., None, None] * xp.asarray(INSTANTS, dtype=places.dtype)[near.instants]
+        drift = (velocity[:, :, None] * times[..., None])[..., None, None, :]
+    return _clearance(places[..., None, :], _Others(chosen, shown, drift), task)[..., 0, 0]
+
+
+def _rows(observation: Observation, task: Task) -> tuple[Array, Array]:
+    """Obstacles, shape (B, n, 2 D + 1), [m], and which are there, shape (B, n)."""
+    rows: ObstacleRows = task.observation.obstacles(observation["obstacles"])
+    together = namespace_of(rows.centre).concat(
+        (rows.centre, rows.half_axis, rows.radius[..., None]), axis=-1
+    )
+    return together, rows.present > 0.5
 
 
 def _least_look(profile: Array) -> Array:
-    """Least of the looks of each stretch, shape (..., STRETCHES, LOOKS); NumPy's own reductions of few are slow."""
-    looks = (profile[..., each] for each in range(LOOKS))
+    """Least of the looks of each stretch, shape (..., LOOKS, STRETCHES); NumPy's own reductions of few are slow."""
+    looks = (profile[..., each, :] for each in range(LOOKS))
     return functools.reduce(namespace_of(profile).minimum, looks)
 
 
@@ -203,9 +247,9 @@ def _still(values: Array) -> Array:
 
 
 def _lowest(three: Array) -> Array:
-    """Lowest point of the parabola through three neighbouring values, shape (..., 3), where it lies between them."""
+    """Lowest point of the parabola through neighbouring values, shape (B, H, 3, .), where it lies between them."""
     xp = namespace_of(three)
-    before, at, after = three[..., 0], three[..., 1], three[..., 2]
+    before, at, after = three[:, :, 0], three[:, :, 1], three[:, :, 2]
     slope, curvature = 0.5 * (after - before), after - 2.0 * at + before
     between = curvature > xp.abs(slope)
     drop = 0.5 * slope * slope / xp.where(between, curvature, xp.ones_like(curvature))

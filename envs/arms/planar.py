@@ -137,7 +137,8 @@ class PlanarArm:
         distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
         near, far = self.reach
         low, high = self.joint_range[0]
-        shoulder = self.posture(hand)[..., 0]
+        (cosine, sine), _ = self._directions(hand)
+        shoulder = xp.atan2(sine, cosine)
         arc = xp.minimum(shoulder - low, high - shoulder) * distance
         return xp.minimum(xp.minimum(distance - near, far - distance), arc)
 
@@ -178,6 +179,13 @@ class PlanarArm:
     def _postures(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
         """Joint angles, unit vectors along upper arm and forearm, and the sine of the elbow angle."""
         xp = namespace_of(hand)
+        (c1, s1), (cosine, sine) = self._directions(hand)
+        joints = xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine)), axis=-1)
+        return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
+
+    def _directions(self, hand: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Cosine and sine of the shoulder's angle, and of the elbow's."""
+        xp = namespace_of(hand)
         l1, l2 = self.lengths
         low, high = self.joint_range[1]
         x, y = hand[..., 0], hand[..., 1]
@@ -186,9 +194,8 @@ class PlanarArm:
         sine = xp.sqrt(1.0 - cosine * cosine)
         along, across = l1 + l2 * cosine, l2 * sine
         scale = 1.0 / (along * along + across * across)
-        c1, s1 = (along * x + across * y) * scale, (along * y - across * x) * scale
-        joints = xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine)), axis=-1)
-        return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
+        shoulder = (along * x + across * y) * scale, (along * y - across * x) * scale
+        return shoulder, (cosine, sine)
 
     def _rates(
         self,

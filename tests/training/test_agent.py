@@ -98,7 +98,7 @@ def test_the_obstacles_push_where_clearance_grows(trial):
     ).trajectory()
     hand = trajectory(np.asarray(trajectory.duration)[..., None] * INSTANTS)
     seen, pushed = push(observation, hand, task)
-    moved = see(observation, hand + 2e-3 * np.repeat(pushed, LOOKS, axis=2), task)
+    moved = see(observation, hand + 2e-3 * np.tile(pushed, (1, 1, LOOKS, 1)), task)
     close = (seen.clearance < NEAR / 2) & (seen.clearance > 5e-3)
     assert close.any()
     assert (moved.clearance >= seen.clearance - 2e-4)[close].mean() > 0.9
@@ -116,8 +116,8 @@ def test_rows_are_picked_and_least_looks_found_as_indexing_says(library):
     ]
     np.testing.assert_array_equal(picked[0], hand[scene[..., None], movement, around])
     np.testing.assert_array_equal(picked[1], present[scene, which])
-    profile = hand[..., 0].reshape(3, 4, 16, LOOKS)
-    np.testing.assert_array_equal(sight._least_look(library(profile)), profile.min(axis=-1))
+    profile = hand[..., 0].reshape(3, 4, LOOKS, 16)
+    np.testing.assert_array_equal(sight._least_look(library(profile)), profile.min(axis=-2))
 
 
 def test_foresight_has_finite_gradients_everywhere(trial):

@@ -14,6 +14,7 @@ from viapoint.training.sight import INSTANTS, LOOKS, STRETCHES
 from viapoint.training.trial import Trial
 
 SCENES, PLANS, FINE = 16, 8, 10
+IN_ORDER = np.sort(INSTANTS)
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +49,8 @@ def exact(hand, scenes):
 
 
 def test_the_nearest_approach_is_that_of_an_exact_look_ten_times_as_often(trial, scenes):
-    hand, inside = paths(trial, scenes, INSTANTS)
-    often, _ = paths(trial, scenes, np.arange(1, FINE * len(INSTANTS) + 1) / (FINE * len(INSTANTS)))
+    hand, inside = paths(trial, scenes, IN_ORDER)
+    often, _ = paths(trial, scenes, np.arange(1, FINE * len(IN_ORDER) + 1) / (FINE * len(IN_ORDER)))
     truth = exact(often, scenes).min(axis=-1)
     packed = Obstacles.packed(scenes.obstacles.astype(np.float32), scenes.present)
     found = approaches(PANDA, hand.astype(np.float32), packed, STRETCHES, -np.inf)
@@ -62,7 +63,7 @@ def test_the_nearest_approach_is_that_of_an_exact_look_ten_times_as_often(trial,
 
 
 def test_what_becomes_of_a_movement_does_not_depend_on_the_others(trial, scenes):
-    hand = paths(trial, scenes, INSTANTS)[0].astype(np.float32)
+    hand = paths(trial, scenes, IN_ORDER)[0].astype(np.float32)
     packed = Obstacles.packed(scenes.obstacles.astype(np.float32), scenes.present)
     every = approaches(PANDA, hand, packed, STRETCHES, 0.06)
     for i in (0, 7):
@@ -73,7 +74,7 @@ def test_what_becomes_of_a_movement_does_not_depend_on_the_others(trial, scenes)
 
 
 def test_where_nothing_stands_everything_is_far(trial, scenes):
-    hand = paths(trial, scenes, INSTANTS)[0].astype(np.float32)
+    hand = paths(trial, scenes, IN_ORDER)[0].astype(np.float32)
     nothing = Scenes(scenes.start, scenes.goal, np.zeros_like(scenes.obstacles))
     packed = Obstacles.packed(nothing.obstacles.astype(np.float32), nothing.present)
     found = approaches(PANDA, hand, packed, STRETCHES, 0.06)

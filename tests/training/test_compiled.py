@@ -94,6 +94,8 @@ def test_machine_code_decides_the_same_in_single_scenes_until_a_weight_changes()
     np.testing.assert_allclose(policy.predict(observation)[0], before, atol=1e-5)
     alone = {name: part[0] for name, part in observation.items()}
     np.testing.assert_allclose(policy.predict(alone)[0], before[0], atol=1e-5)
+    with pytest.raises(ValueError, match="mixing Gym API"):
+        policy.predict((alone, {}))
     np.testing.assert_allclose(one_by_one(copy.deepcopy(policy), observation), before, atol=1e-5)
     assert len(calls) == NUMBER + 1, "many scenes at once, and copies, are not its business"
     with torch.no_grad():
@@ -107,14 +109,15 @@ def test_machine_code_decides_the_same_in_single_scenes_until_a_weight_changes()
 
 
 class Counted:
-    """Machine code that tells how often it was asked."""
+    """Machine code that tells how often it decided."""
 
     def __init__(self, made, calls):
-        self.fits, self.made, self.calls = made.fits, made, calls
+        self.made, self.calls = made, calls
 
     def __call__(self, observation):
-        self.calls.append(observation)
-        return self.made(observation)
+        action = self.made(observation)
+        self.calls += [] if action is None else [observation]
+        return action
 
 
 def test_without_a_compiler_it_says_so(monkeypatch, capsys):
