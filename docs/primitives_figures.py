@@ -53,7 +53,7 @@ def family() -> None:
         speeds.plot(valley.time, valley.speed, "v", color=colour, ms=5)
         inner = time[20:-20]
         bends.plot(inner, -curvature(movement, inner), color=colour)
-    paths.set(title="path [m]", aspect="equal")
+    paths.set(title="path [m]", xlabel="along the straight line [m]")
     speeds.set(title="speed [m/s], valleys marked", xlabel="time [s]")
     bends.set(title="curvature [1/m]", xlabel="time [s]", ylim=(-1, 12))
     save(figure, "family")

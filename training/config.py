@@ -35,11 +35,11 @@ class TrainConfig:
     """
 
     env: str = DEFAULT_ENV
-    """Id of the environment."""
+    """Id of the environment; an unknown one is answered with all that there are."""
     algo: Algorithm = "viatd3"
-    """Learning algorithm; presets.py holds the settings of each."""
+    """Learning algorithm; training/presets.py holds the settings of each."""
     seed: int = 0
-    """Of everything that is random: equal seeds give equal agents on one machine."""
+    """Seed of everything that is random: equal seeds give equal agents on one machine."""
     n_timesteps: int | None = None
     """Decisions in all; as the preset says if not given."""
     n_envs: int | None = None
@@ -52,16 +52,16 @@ class TrainConfig:
     eval_every: int | None = None
     """Decisions between two evaluations on the validation scenes, 0 for none; as the preset says if not given."""
     eval_scenes: int = 500
-    """Validation scenes used by each, at most."""
+    """Validation scenes used in each evaluation, at most."""
     checkpoint_every: int | None = None
     """Decisions between two checkpoints; as the preset says if not given."""
     env_kwargs: NamedValues = field(default_factory=dict)
-    """Of the environment; values are words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
+    """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
-    """Of the algorithm, instead of its preset's; as env_kwargs, for example batch_size=256."""
+    """Settings of the algorithm in place of its preset's, in the same form: batch_size=256."""
     discount_unit: float | None = None
-    """Seconds that count the discount gamma, where decisions take different time and the environment tells it;
-    as the preset says if not given."""
+    """Seconds that are discounted by gamma once, where decisions differ in length and the environment tells it; as
+    the preset says if not given."""
     progress: bool = True
     """Whether to show a progress bar."""
 
@@ -133,20 +133,20 @@ class EvaluateConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """agent, straight, constant, random, random16, random80, planner, ompl; where plans are revised on the way
-    unrevised, too: the first plan alone."""
+    """Some of agent, straight, constant, random, random16, random80, planner, ompl and, where plans are revised on
+    the way, unrevised: the first plan alone."""
     candidates: int = 0
-    """If not 0, the agent gets a second row, in which its critic ranks so many actions at each decision."""
+    """If not 0, the agent gets a second row, in which its critic ranks that many actions at each decision."""
     compiled: bool = False
-    """Whether single decisions are made into machine code first: a minute or two for each row of the agent."""
+    """Make machine code of single decisions first: a minute or two for each row of the agent."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int | None = None
-    """Only the first so many."""
+    """Only the first so many scenes; all if not given."""
     json: Path | None = None
-    """File for all results, scene by scene."""
+    """File for all results, scene by scene, as JSON."""
     failures: Path | None = None
-    """Folder for the agent's failures, sorted by kind: counts and pictures; of its last row in the table."""
+    """Folder for counts and pictures of the agent's failures by kind; those of its last row in the table."""
     env: str | None = None
     """Id of the environment where neither a run nor a pretrained agent says it."""
 
@@ -253,7 +253,7 @@ class DemoConfig:
     env: str = DEFAULT_ENV
     """Id of the environment."""
     seed: int = 0
-    """Of the training."""
+    """Seed of the training."""
     n_timesteps: int | None = None
     """Decisions to train for; two thirds of the preset's if not given, so that nobody waits for long."""
     n_scenes: int | None = None
@@ -306,9 +306,9 @@ class ImportConfig:
     out: Path
     """Folder for the model; must be new."""
     algo: Literal["sac", "td3", "ppo", "tqc"] | None = None
-    """Its algorithm; as the archive looks if not given."""
+    """Its algorithm; recognised from the archive if not given."""
     trust: bool = False
-    """Open it without a question: it is known where it comes from."""
+    """Open it without asking: you know where it comes from."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,16 +20,16 @@ from viapoint.training.frozen_scenes import load
 Float = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 
-SEEDS = {"PlanarReach": (4,), "PlanarObstacles": (15, 5, 12, 6), "PlanarWholeArm": (1,)}
-"""Scenes that show what a task is about; the first of each is its picture."""
+SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
+"""Scenes that show what a task is about."""
 FILES = {
     "PlanarReach": "planar_reach.png",
     "PlanarObstacles": "planar_obstacles.png",
     "PlanarWholeArm": "planar_whole_arm.png",
 }
-IN_SPACE = "viapoint/PandaObstacles-v0"
-PASSAGES = (14, 21)
-"""Scenes of its set `test` that the shipped agent is shown in: a slot, and a shelf among spheres."""
+IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
+PASSAGES = {IN_PLANE: (29, 8, 10, 37), IN_SPACE: (14, 21)}
+"""Scenes of their sets `test` that the shipped agents are shown in; in space a slot, and a shelf among spheres."""
 MOMENTS = (0.3, 0.45, 0.6, 1.0)
 """Of a movement, as parts of its duration."""
 ATTEMPTS = 400
@@ -39,6 +40,8 @@ SAFE = 0.012
 """Least clearance of a movement that is shown, [m]."""
 SPEED = 0.5
 """Of the animation, relative to real time."""
+GAP = 6
+"""Between frames side by side, [pixels]."""
 PAUSE = 700
 """After each movement of the animation, [ms]."""
 
@@ -89,15 +92,15 @@ def perform(env: gym.Env[Any, Any], solved: Solved) -> Any:
 def picture(task: str, path: Path) -> None:
     """One movement of a task."""
     env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array")
-    frame = perform(env, solve(env, SEEDS[task][0]))
+    frame = perform(env, solve(env, SEEDS[task]))
     env.close()
     Image.fromarray(frame).save(path, optimize=True)
 
 
-def animation(task: str, path: Path, *, size: int = 400) -> None:
-    """A movement in each scene of a task, one after the other, for ever."""
-    env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array_list", width=size, height=size)
-    films = [perform(env, solve(env, seed)) for seed in SEEDS[task]]
+def animation(path: Path, *, size: int = 400) -> None:
+    """The shipped agent's movements in the plane, one after the other, for ever."""
+    env = gym.make(IN_PLANE, render_mode="rgb_array_list", width=size, height=size)
+    films = [passage(env, IN_PLANE, row) for row in PASSAGES[IN_PLANE]]
     env.close()
     _animate(path, films, env.metadata["render_fps"])
 
@@ -112,13 +115,13 @@ def _animate(path: Path, films: list[list[Frame]], fps: float) -> None:
     )
 
 
-def passage(env: gym.Env[Any, Any], row: int, *, straight: bool = False) -> list[Frame]:
+def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = False) -> list[Frame]:
     """The frames of the shipped agent's movement in a test scene, or those of the straight one until it hits.
 
     Raises:
         RuntimeError: The agent's does not succeed, or the straight one does.
     """
-    scene, agent = load("test", IN_SPACE).scenes.take([row]), find_agent(None, IN_SPACE)
+    scene, agent = load("test", env_id).scenes.take([row]), find_agent(None, env_id)
     observation, _ = env.reset(options=scene.as_options())
     task: Any = env.unwrapped.task  # type: ignore[attr-defined]
     batch = {name: part[None] for name, part in observation.items()}
@@ -132,25 +135,34 @@ def passage(env: gym.Env[Any, Any], row: int, *, straight: bool = False) -> list
     return frames
 
 
+def side_by_side(frames: Sequence[Frame]) -> Frame:
+    """Frames in one line with white gaps between them."""
+    gap = np.full((len(frames[0]), GAP, 3), 255, np.uint8)
+    return np.concatenate([part for frame in frames for part in (gap, frame)][1:], axis=1)
+
+
 def passages(strip: Path, pair: Path, film: Path) -> None:
     """The shipped agent of an arm in space: moments of a movement, the straight one beside them, and a film."""
     sides = {strip: 300, pair: 480, film: 300}
     for path, side in sides.items():
         env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
         if path == film:
-            _animate(path, [passage(env, row) for row in PASSAGES], env.metadata["render_fps"])
+            _animate(
+                path, [passage(env, IN_SPACE, row) for row in PASSAGES[IN_SPACE]], env.metadata["render_fps"]
+            )
         else:
-            frames, hit = passage(env, PASSAGES[0]), passage(env, PASSAGES[0], straight=True)[-1]
+            row = PASSAGES[IN_SPACE][0]
+            frames, hit = passage(env, IN_SPACE, row), passage(env, IN_SPACE, row, straight=True)[-1]
             moments = MOMENTS if path == strip else MOMENTS[1:2]
             shown = [frames[round(moment * (len(frames) - 1))] for moment in moments]
-            Image.fromarray(np.concatenate((*shown, hit), axis=1)).save(path, optimize=True)
+            Image.fromarray(side_by_side((*shown, hit))).save(path, optimize=True)
         env.close()
 
 
 def flow(path: Path) -> None:
     """The flow from action to observation, in real numbers."""
     env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0", render_mode="rgb_array")
-    solved = solve(env, SEEDS["PlanarObstacles"][0])
+    solved = solve(env, SEEDS["PlanarObstacles"])
     observation, _ = env.reset(options=solved.scene.as_options())
     info = env.step(solved.action)[-1]
     draw_flow(path, env, solved.scene, solved.action, observation, info)
@@ -165,7 +177,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for task, name in FILES.items():
         picture(task, out / name)
-    animation("PlanarObstacles", out / "reaching.webp")
+    animation(out / "reaching.webp")
     passages(out / "panda_agent.png", out / "panda_obstacles.png", out / "panda.webp")
     flow(out / "flow.png")
     for path in sorted(out.iterdir()):

@@ -1,5 +1,8 @@
 """Laws of the families of hard scenes: each is what its name says."""
 
+import re
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from viapoint.envs.clearance import segment_distance_squared
 from viapoint.envs.scene_families import FAMILIES, ROWS, family_sampler
 from viapoint.envs.scenes import check_scenes
 
+PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
 NUMBER = {HAND: 40, WHOLE_ARM: 4}
 
@@ -141,3 +145,15 @@ def test_what_has_no_families_is_refused(tasks):
         family_sampler(tasks[HAND], "maze")
     with pytest.raises(ValueError, match="up to 5 obstacles"):
         family_sampler(task_of(HAND, n_obstacles=2), "gate")
+
+
+def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(monkeypatch):
+    monkeypatch.setitem(FAMILIES, "pair", None)  # taken out again afterwards
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    names = {}
+    exec(example, names)
+    scenes, start = names["scenes"], names["observation"]["hand"]
+    check_scenes(scenes, ADULT, whole_arm=False)
+    np.testing.assert_allclose(start, scenes.start[0], atol=1e-6)
+    assert (scenes.present.sum(axis=1) == 2).all()
+    names["env"].close()

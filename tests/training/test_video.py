@@ -194,11 +194,12 @@ def test_the_pictures_of_the_documentation(tmp_path, monkeypatch):
         assert image.width > 1200
 
 
-def test_the_pictures_of_the_agent_in_space_show_that_it_passes_and_the_straight_movement_does_not():
-    env = gym.make(pictures.IN_SPACE, render_mode="rgb_array_list", width=32, height=32)
+@pytest.mark.parametrize("env_id", pictures.PASSAGES)
+def test_the_pictures_of_an_agent_show_that_it_passes_and_the_straight_movement_does_not(env_id):
+    env = gym.make(env_id, render_mode="rgb_array_list", width=32, height=32)
     try:
-        row = pictures.PASSAGES[0]
-        passed, hit = pictures.passage(env, row), pictures.passage(env, row, straight=True)
+        row = pictures.PASSAGES[env_id][0]
+        passed, hit = (pictures.passage(env, env_id, row, straight=straight) for straight in (False, True))
     except GLUnavailableError as error:
         pytest.skip(str(error))
     finally:
