@@ -30,7 +30,8 @@ def _percent(rate: Summary | None) -> str:
 
 
 def _interval(rate: Summary) -> str:
-    return "-" if rate["rate"] is None else f"{100.0 * rate['low']:.1f}-{100.0 * rate['high']:.1f}"
+    ends = (f"{100.0 * rate[end]:.1f}".replace("100.0", "100") for end in ("low", "high"))
+    return "-" if rate["rate"] is None else "-".join(ends)
 
 
 def _number(name: str, scale: float, digits: int) -> Callable[[Summary], str]:
@@ -59,8 +60,8 @@ COLUMNS = (
     Column("jerk ratio", _number("jerk_ratio", 1.0, 2)),
     Column("SPL", _number("spl", 1.0, 3)),
     Column("duration [s]", _number("duration", 1.0, 2)),
-    Column("decision, median [ms]", _number("decision_time", 1e3, 2)),
-    Column("decision, 98 % [ms]", _number("decision_time_98", 1e3, 2)),
+    Column("decision [ms]", _number("decision_time", 1e3, 2)),
+    Column("98 % of them [ms]", _number("decision_time_98", 1e3, 2)),
 )
 
 NOTES = (
@@ -68,8 +69,8 @@ NOTES = (
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
     "that solve a scene; in hard sets also among scenes of each family. Clearance and goal error are medians "
     "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted "
-    "by straight distance over path length. Decision: wall time of single decisions; where the 98th percentile is "
-    "missing, the mean in a batch."
+    "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
+    "percentile; where that is missing, the mean in a batch."
 )
 
 
