@@ -43,7 +43,7 @@ FAILURES = """## Failures, drawn
 
 The shipped agent's in the `hard` scenes of PlanarObstacles-v0, policy alone, from the deepest of a kind to its mildest
 (`viapoint evaluate --pretrained viapoint/PlanarObstacles-v0 --methods agent --scenes hard --failures
-docs/images/failures`). Most are mouths of rings that are entered a few millimetres off; ranking mends them.
+docs/images/failures`). Most are mouths of rings that are entered a few millimetres off; ranking mends most of them.
 
 ![The plan enters an obstacle by 5 mm or less](images/failures/graze.png)
 
@@ -54,8 +54,8 @@ FREEDOM = """## When does more freedom pay?
 
 K via-points, passage times of least jerk (*optimal*) or chosen by the agent (*learned*). The scenes are the same;
 bands are those of one via-point with optimal timing. The planner searches anew with the same budget in the first
-{planned} test scenes: with K = 1 it solves every scene, as it certified them so, and the question there is what
-more freedom does to its jerk.
+{planned} test scenes. With K = 1 and optimal timing it solves them all, as a scene is in the set only if it did; the
+question is what more freedom does to its jerk.
 """
 
 TAGS = {
