@@ -28,3 +28,8 @@ def squared_length(vectors: Array) -> Array:
     """Sum of squares along the last axis: component by component, as sums of a few numbers each are slow."""
     square = vectors * vectors
     return functools.reduce(operator.add, (square[..., i] for i in range(vectors.shape[-1])))
+
+
+def last(array: Array, axes: int = 1) -> Array:
+    """The same with its first axes behind the others, each of their items by itself in memory, where it is quick."""
+    return namespace_of(array).moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs._arrays import Array, clamp, namespace_of
+from viapoint.envs._arrays import Array, clamp, last, namespace_of
 from viapoint.envs.arms.obstacles import add_obstacles
 
 
@@ -118,11 +118,11 @@ class PlanarArm:
     def links(self, joints: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
         xp = namespace_of(joints)
-        upper = joints[..., 0]
-        elbow = self.lengths[0] * xp.stack((xp.cos(upper), xp.sin(upper)), axis=-1)
-        shoulder = xp.zeros_like(elbow)
-        ends = (xp.stack((shoulder, elbow), axis=-2), xp.stack((elbow, self.hand(joints)), axis=-2))
-        return xp.stack(ends, axis=-3)
+        upper, hand = joints[..., 0], self.hand(joints)
+        zero = xp.zeros_like(upper)
+        elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
+        numbers = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
+        return last(xp.reshape(numbers, (2, 2, 2, *upper.shape)), 3)
 
     def posture(self, hand: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.posture`; out of reach, the elbow is as straight or bent as it goes."""
@@ -180,7 +180,7 @@ class PlanarArm:
         """Joint angles, unit vectors along upper arm and forearm, and the sine of the elbow angle."""
         xp = namespace_of(hand)
         (c1, s1), (cosine, sine) = self._directions(hand)
-        joints = xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine)), axis=-1)
+        joints = last(xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
         return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
 
     def _directions(self, hand: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
