@@ -1,9 +1,22 @@
-"""The examples of the README run as they stand."""
+"""The examples of the README run as they stand, and its numbers are those of the study."""
 
+import json
 import re
 from pathlib import Path
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+STUDY = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+ROWS = {
+    "agent, one forward pass (*policy alone*)": ("viatd3", "alone"),
+    "agent, its critic ranks 80 candidates (*ranked candidates*)": ("viatd3", "ranked"),
+    "SAC": ("sac", "alone"),
+    "PPO": ("ppo", "alone"),
+    "best of 80 random actions, each simulated": ("random80", None),
+    "motion planner from a library (OMPL's RRT-Connect, made smooth)": ("ompl", None),
+}
 
 
 def test_the_examples_of_the_readme_run(capsys):
@@ -14,3 +27,19 @@ def test_the_examples_of_the_readme_run(capsys):
     names["env"].close()
     names["envs"].close()
     assert names["position"].shape == (100, 2)
+
+
+def success(measured):
+    rate, low, high = (f"{100 * part:.1f}".replace("100.0", "100") for part in measured["success"])
+    return f"{rate} % ({low}-{high})"
+
+
+@pytest.mark.parametrize("label", ROWS)
+def test_the_table_of_the_study_is_that_of_its_file(label):
+    name, how = ROWS[label]
+    results = STUDY["environments"]["viapoint/PlanarObstacles-v0"]
+    (method,) = (each for each in results["methods"] + results["baselines"] if each["name"] == name)
+    test, hard = (method["sets"][each][how] if how else method["sets"][each] for each in ("test", "hard"))
+    learnt = [f"{method['training']['decisions']:,}", str(len(method["seeds"]))] if how else ["-", "-"]
+    cells = [label, *learnt, success(test), success(hard), f"{test['jerk'][0]:.2f}"]
+    assert f"| {' | '.join(cells)} |" in README
