@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -257,8 +258,10 @@ def _arrays(*values: Array) -> tuple[Array, ...]:
 def check_increasing_pair(name: str, pair: Any) -> None:
     """Refuse anything but two positive finite numbers in increasing order."""
     try:
-        low, high = (float(value) for value in pair)
+        low, high = pair
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be two numbers, got {pair!r}") from None
+        low = high = None
+    if not all(isinstance(value, Real) and not isinstance(value, bool) for value in (low, high)):
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
     if not (0.0 < low < high < float("inf")):
         raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")

@@ -37,9 +37,9 @@ def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> fl
 
 
 def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Refuse keyword arguments that there are not, with those that there are."""
+    """Refuse keyword arguments that there are not, with those that there are beside the number of environments."""
     if unknown:
-        allowed = [name for name in known if name not in ("unknown", "return")]
+        allowed = [name for name in known if name not in ("num_envs", "unknown", "return")]
         raise TypeError(
             f"unknown keyword argument {', '.join(map(repr, sorted(unknown)))}; allowed are {', '.join(allowed)}"
         )
@@ -66,16 +66,21 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
     return np.flatnonzero(mask)
 
 
-def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
-    """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
-    shape = (num_envs, len(names))
+def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """An action, or many, as an array; `shape` is the one that is wanted, and only said where these are no numbers."""
     try:
         given = np.asarray(actions)
     except (TypeError, ValueError):  # rows of different lengths, say
         raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}") from None
     if given.dtype.kind not in "fiu":
         raise ValueError(f"action must be real numbers of shape {shape}, got {given.dtype}: {actions!r}")
-    array = given.astype(np.float64, copy=False)
+    return given
+
+
+def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
+    """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
+    shape = (num_envs, len(names))
+    array = real_numbers(actions, shape).astype(np.float64, copy=False)
     if array.shape != shape:
         raise ValueError(f"action must have shape {shape} ({', '.join(names)}), got {array.shape}")
     if not np.isfinite(array).all():
@@ -89,6 +94,8 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     """A seed for each environment: `seed + i`, `seed[i]`, or None."""
     if seed is None:
         return [None] * num_envs
+    if isinstance(seed, np.ndarray) and not seed.ndim:
+        seed = seed.item()
     if not isinstance(seed, Sequence | np.ndarray):
         first = whole_number("seed", seed, 0)
         return [first + i for i in range(num_envs)]

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.utils import EzPickle
 
 from viapoint.envs.action import Plan
+from viapoint.envs.arguments import real_numbers
 from viapoint.envs.execution import Rollout
 from viapoint.envs.reach_vector import METADATA, Observation, ReachVectorEnv
 
@@ -64,6 +64,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
+        self.batch._np_random, self.batch._np_random_seed = self._np_random, self._np_random_seed
         observation, info = self.batch.reset(seed=seed, options=options)
         self._np_random, self._np_random_seed = self.batch._np_random, self.batch._np_random_seed
         if self.render_mode == "human":
@@ -76,10 +77,11 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         Args:
             action: Shape (m,), in [-1, 1]; components beyond are clipped.
         """
-        shape = np.shape(action)
-        if shape != self.action_space.shape:
-            raise ValueError(f"action must have shape {self.action_space.shape}, got {shape}")
-        observation, reward, info = self.batch.decide(np.asarray(action)[None])
+        shape: Any = self.action_space.shape
+        given = real_numbers(action, shape)
+        if given.shape != shape:
+            raise ValueError(f"action must have shape {shape}, got {given.shape}")
+        observation, reward, info = self.batch.decide(given[None])
         return _only(observation), float(reward[0]), True, False, {k: v[0].item() for k, v in info.items()}
 
     def render(self) -> Any:

@@ -60,6 +60,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
     """
 
+    weights_kind = OnlineRewardWeights
     scenes: ChangingScenes | None  # type: ignore[assignment]
     observation_layout: OnlineObservationLayout
 
@@ -91,8 +92,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
             "duration_range": duration_range, "render_mode": render_mode, "width": width, "height": height,
             "threads": threads,
         }  # fmt: skip
-        weights = OnlineRewardWeights.of(reward_weights)
-        super().__init__(num_envs, reward_weights=weights, **kwargs)
+        super().__init__(num_envs, reward_weights=reward_weights, **kwargs)
         EzPickle.__init__(
             self, num_envs, moving_obstacles=moving_obstacles, n_jumps=n_jumps, decide_at=decide_at, horizon=horizon,
             margin=margin, reward_weights=reward_weights, **kwargs,

@@ -84,6 +84,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
     """
 
+    weights_kind = StepRewardWeights
     observation_layout: StepObservationLayout
 
     def __init__(
@@ -107,7 +108,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
             "arm": arm, "whole_arm": whole_arm, "n_obstacles": n_obstacles, "duration_range": duration_range,
             "render_mode": render_mode, "width": width, "height": height, "threads": threads,
         }  # fmt: skip
-        weights = StepRewardWeights.of(reward_weights)
+        weights = self.weights_kind.of(reward_weights)
         if not isinstance(weights, StepRewardWeights):
             raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
         super().__init__(num_envs, reward_weights=weights, **kwargs)

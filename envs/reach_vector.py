@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -77,6 +77,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """
 
     metadata = METADATA
+    weights_kind: ClassVar[type[RewardWeights]] = RewardWeights
+    """What weighs the terms of the reward."""
 
     def __init__(
         self,
@@ -112,7 +114,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             action=ActionLayout(
                 dimension=arm.dimension, n_via=n_via, timing=timing, duration_range=duration_range
             ),
-            weights=RewardWeights.of(reward_weights),
+            weights=self.weights_kind.of(reward_weights),
             scenes=distribution_of(arm)(n_obstacles=fewest_and_most(n_obstacles)),
         )
         """What an agent may compute with before it has moved."""
@@ -179,11 +181,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
-        seeded = self._seeded(seed, rows)
+        seeded, first_seed = self._seeded(seed, rows)
         scenes = self._draw(seeded, rows, options)
-        self._generators, self._np_random = seeded, seeded[0]
-        if seed is not None:
-            self._np_random_seed = seeds_of(seed, self.num_envs)[0]
+        self._generators, self._np_random, self._np_random_seed = seeded, seeded[0], first_seed
         self._last = self._last if len(rows) < self.num_envs else None
         self._start(rows, scenes)
         return self._observe_start(), {}
@@ -281,16 +281,16 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _seeded(
         self, seed: int | Sequence[int | None] | None, rows: NDArray[np.int64]
-    ) -> list[np.random.Generator]:
-        """Generators for the next episodes: those in use, but new ones where a seed is given."""
-        seeds = seeds_of(seed, self.num_envs)
-        if not self._generators:
-            return [seeding.np_random(s)[0] for s in seeds]
-        generators = list(self._generators)
+    ) -> tuple[list[np.random.Generator], int | None]:
+        """Generators for the next episodes, new where a seed is given, and the seed of the first, `np_random`."""
+        seeds, first_seed = seeds_of(seed, self.num_envs), self._np_random_seed
+        generators: list[Any] = list(self._generators) or [None] * self.num_envs
+        generators[0] = self._np_random
         for i in rows:
-            if seeds[i] is not None:
-                generators[i] = seeding.np_random(seeds[i])[0]
-        return generators
+            if generators[i] is None or seeds[i] is not None:
+                generators[i], used = seeding.np_random(seeds[i])
+                first_seed = used if i == 0 else first_seed
+        return generators, first_seed
 
     def _draw(
         self, generators: list[np.random.Generator], rows: NDArray[np.int64], options: Mapping[str, Any]

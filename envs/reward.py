@@ -51,17 +51,19 @@ class RewardWeights:
 
     @classmethod
     def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:
-        """Weights from a record, from a mapping of some of them, or the defaults."""
-        if isinstance(weights, RewardWeights):
-            return weights
-        if weights is not None and not isinstance(weights, Mapping):
+        """Weights from a record, from a mapping of some of them, or the defaults.
+
+        Raises:
+            ValueError: It is something else, or has terms that there are not.
+        """
+        if weights is not None and not isinstance(weights, RewardWeights | Mapping):
             raise ValueError(f"reward_weights must be a mapping of names to numbers, got {weights!r}")
-        given = dict(weights or {})
+        given = dict(vars(weights) if isinstance(weights, RewardWeights) else weights or {})
         known = [field.name for field in dataclasses.fields(cls)]
-        unknown = sorted(set(given) - set(known))
+        unknown = sorted(repr(name) for name in given if name not in known)
         if unknown:
-            raise ValueError(f"reward_weights knows {', '.join(known)}, not {', '.join(map(repr, unknown))}")
-        return cls(**given)
+            raise ValueError(f"reward_weights knows {', '.join(known)}, not {', '.join(unknown)}")
+        return weights if isinstance(weights, RewardWeights) else cls(**given)
 
 
 class RewardTerms(NamedTuple):

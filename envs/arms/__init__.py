@@ -47,7 +47,10 @@ def arm_of(arm: Any) -> Arm:
 
 def _check_record(arm: Any) -> None:
     if not hasattr(arm, "reach_margin") or not isinstance(getattr(arm, "name", None), str):
-        raise TypeError(f"arm must be a record of viapoint.envs.arms, got {arm!r}")
+        raise TypeError(
+            f"arm must be a record of viapoint.envs.arms, got {arm!r:.80}; files and JSON know arms by "
+            f"their names: {OF_ONES_OWN}"
+        )
 
 
 __all__ = ["ADULT", "ARMS", "PANDA", "Arm", "arm_of", "register_arm"]

@@ -172,7 +172,12 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str)
     for (before, carrier), (after, body) in zip(
         zip(joints, bodies, strict=True), zip(joints[1:], bodies[1:], strict=True), strict=False
     ):
-        if carrier == body or carrier not in _ancestors(model, body):
+        if carrier == body:
+            raise ValueError(
+                f"joints {before!r} and {after!r} belong to one body; leave one out to hold it still, or give each a "
+                "body of its own in the file"
+            )
+        if carrier not in _ancestors(model, body):
             raise ValueError(f"joints must be in order from the base: {before!r} does not carry {after!r}")
     last = int(model.site(hand_site).bodyid[0])
     if model.body_weldid[last] != bodies[-1]:

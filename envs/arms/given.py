@@ -27,6 +27,8 @@ def names_of(joints: Any) -> tuple[str, ...]:
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
     if not names or not all(isinstance(each, str) for each in names):
         raise ValueError(f"joints must be names, in order from the base to the hand, got {joints!r}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"joints must be named once each, got {joints!r}")
     return names
 
 

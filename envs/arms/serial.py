@@ -197,8 +197,9 @@ class SerialArm:
     def _add_actuators(self, spec: mujoco.MjSpec) -> None:
         """The hand's servo along three axes, and one for each joint."""
         spec.worldbody.add_site(name=ORIGIN, **UNSEEN)
-        for axis, name in enumerate(("hand_x", "hand_y", "hand_z")):
-            gear = np.eye(6)[axis]
+        for gear, name in zip(np.eye(6), ("hand_x", "hand_y", "hand_z"), strict=False):
+            while name in self.joint_names:
+                name += "_"
             servo = _affine(spec, name, mujoco.mjtTrn.mjTRN_SITE, self.hand_stiffness, self.hand_damping)
             servo.target, servo.refsite, servo.gear = self.hand_site, ORIGIN, gear
         for name, stiffness, damping in zip(

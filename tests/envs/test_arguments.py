@@ -9,6 +9,7 @@ import viapoint.envs
 from viapoint.envs.arguments import reset_options
 from viapoint.envs.recording import RecordMovements
 from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.step_episodes import StepRewardWeights
 
 PLANAR = (
     "viapoint/PlanarObstacles-v0",
@@ -32,18 +33,18 @@ def test_actions_are_real_numbers(env_id, kind):
     single, batch = gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1)
     for env in (single, batch):
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, \d\), got .*: "):
+        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, ?\d?\), got .*: "):
             env.step(kind(np.ones(env.action_space.shape)))
         env.step(np.zeros(env.action_space.shape, dtype=np.int8))  # nothing was done by it
         env.close()
 
 
 def test_actions_of_different_lengths_are_refused_in_our_words(env_id):
-    env = gym.make_vec(env_id, num_envs=2, threads=1)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action must be real numbers of shape"):
-        env.step([[0.0], [0.0, 0.0]])
-    env.close()
+    for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1)):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, ?\d?\), got \[\["):
+            env.step([[0.0], [0.0, 0.0]])
+        env.close()
 
 
 @pytest.mark.parametrize("options", [5, "abc", [1, 2], 0, np.zeros(2)])
@@ -77,6 +78,36 @@ def test_via_points_are_bounded_before_anything_is_made():
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("pair", [("0.5", "1"), (True, 2), (0.5, None), 3, None, "ab", (1.0,), (1 + 0j, 2.0)])
+def test_a_range_of_durations_is_two_numbers(env_id, pair):
+    with pytest.raises(ValueError, match="duration_range must be two numbers, got"):
+        gym.make(env_id, duration_range=pair)
+
+
+@pytest.mark.parametrize("pair", [[0.5, 1], np.array([0.5, 1.0], np.float32), (np.int64(1), 2)])
+def test_any_two_numbers_are_a_range(env_id, pair):
+    assert gym.make(env_id, duration_range=pair).unwrapped.task.action.duration_range == tuple(
+        map(float, pair)
+    )
+
+
+def test_weights_of_terms_that_a_task_has_not_are_refused():
+    for env_id in (PLANAR[0], PLANAR[2]):
+        with pytest.raises(ValueError, match=r"reward_weights knows success, .*, not 'progress'$"):
+            gym.make(env_id, reward_weights=StepRewardWeights())
+    for env_id in PLANAR:
+        with pytest.raises(ValueError, match=r"reward_weights knows success, .*, not 'speed', 1$"):
+            gym.make(env_id, reward_weights={1: 2.0, "speed": 1.0})
+
+
+def test_what_the_number_of_environments_is_called_is_not_offered(env_id):
+    for make in (gym.make, lambda name, **given: gym.make_vec(name, num_envs=2, **given)):
+        with pytest.raises(
+            TypeError, match=r"unknown keyword argument 'speed'; allowed are arm, whole_arm, "
+        ):
+            make(env_id, speed=1.0)
 
 
 @pytest.mark.parametrize("mode", [None, "human", "rgb_array"])

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 import viapoint.envs
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
@@ -187,6 +188,7 @@ def test_posture_in_torch_is_the_same_and_differentiable(arm):
         ({"joints": 5}, "joints must be names, in order from the base to the hand, got 5"),
         ({"joints": "elbow"}, "joints must be names"),
         ({"name": 5}, "name must be a string"),
+        ({"joints": (*JOINTS[:5], JOINTS[0])}, "joints must be named once each, got .*'shoulder_pan'"),
     ],
 )
 def test_what_is_missing_is_named(changes, message):
@@ -234,6 +236,13 @@ def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
         ),
         (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo can make no model of .*arm.xml.*mass"),
         (lambda text: text[:-20], "arm.xml' is no MJCF file that MuJoCo can read"),
+        (
+            lambda text: text.replace('<joint name="wrist_1" class="wrist"/>', "").replace(
+                '<joint name="wrist_2"',
+                '<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"',
+            ),
+            "joints 'wrist_1' and 'wrist_2' belong to one body",
+        ),
     ],
 )
 def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
@@ -241,6 +250,36 @@ def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
     path.write_text(change(UR5E.read_text(encoding="utf-8")), encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
+
+
+def test_joints_may_have_any_names(tmp_path):
+    """Those of the parts that are added to the file, too."""
+    text, names = (
+        UR5E.read_text(encoding="utf-8"),
+        ("hand_x", "hand_x_", "hand", "origin", "obstacle_0", "a/b"),
+    )
+    for joint, name in zip(JOINTS, names, strict=True):
+        text = text.replace(f'joint name="{joint}"', f'joint name="{name}"')
+    path = tmp_path / "arm.xml"
+    path.write_text(text, encoding="utf-8")
+    arm = Arm.from_mjcf(path, hand_site="hand", joints=names, home=HOME, velocity_limit=np.pi)
+    mine, other = (
+        gym.make("viapoint/Obstacles-v0", arm=each).unwrapped for each in (arm, ur5e(velocity_limit=np.pi))
+    )
+    for env in (mine, other):
+        env.reset(seed=0)
+    assert mine.step(np.zeros(4))[-1] == other.step(np.zeros(4))[-1]
+    model = mine.model
+    assert [model.actuator(i).trntype[0] for i in range(model.nu)] == [mujoco.mjtTrn.mjTRN_SITE] * 3 + [
+        mujoco.mjtTrn.mjTRN_JOINT
+    ] * 6
+
+
+def test_a_record_that_json_took_apart_is_refused_in_few_words(arm):
+    spec = EnvSpec.from_json(gym.make("viapoint/Obstacles-v0", arm=arm).spec.to_json())
+    with pytest.raises(TypeError, match=r"arm must be a record of .*register_arm") as refused:
+        gym.make(spec)
+    assert len(str(refused.value).split(" was raised from")[0]) < 400
 
 
 @pytest.mark.parametrize("thing", [3, None, "panda", Arm])
