@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from viapoint.envs.palette import PALETTE
@@ -80,7 +81,8 @@ def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
         low = y < 35.0
         ax.annotate(
             f"$T_{name[1]}$", (x, y), xytext=(0, -4 if low else 4), textcoords="offset points", fontsize=6.5,
-            ha="center", va="top" if low else "bottom", color=GREY,
+            ha="center", va="top" if low else "bottom", color=GREY, zorder=4,
+            path_effects=[withStroke(linewidth=1.5, foreground="white")],
         )  # fmt: skip
     ax.set(aspect="equal", xlim=(-39.0, 15.0), ylim=(15.0, 66.0))
     ax.set(xlabel="$x$ [cm]", ylabel="$y$ [cm]", xticks=[-30, -15, 0], yticks=[20, 40, 60])

@@ -56,7 +56,7 @@ def _pair(movements: list[Trajectory], titles: tuple[str, str]) -> Figure:
         path(axes[0, column], done.hand[0], **ARM)
         dot(axes[0, column], np.asarray(movement(float(movement.knots[1]))))
         _profiles(axes[1:, column], movement, done)
-        axes[0, column].set_title(f"{'AB'[column]}   {title}", loc="left", pad=3.0)
+        axes[0, column].set_title(f"{'AB'[column]}   {title}", loc="left", pad=6.0)
         axes[4, column].set_xlabel("$t$ [s]")
     _same_scales(axes[1:], max(float(each.duration) for each in movements))
     axes[1, 1].legend(loc="upper right")
