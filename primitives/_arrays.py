@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
@@ -251,6 +252,17 @@ def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
     if xp is np:
         return values.astype(other.dtype, copy=False)
     return xp.asarray(values, dtype=other.dtype, device=other.device)
+
+
+def unit_factors(xp: Namespace, array: Array) -> Array:
+    """Powers of two (..., 1) that bring vectors (..., D) to a size of about 1: no square over- or underflows."""
+    size = np.abs(to_numpy(array)).max(axis=-1, keepdims=True)
+    largest = min(float(xp.finfo(array.dtype).max), sys.float_info.max)
+    limit = (
+        math.frexp(largest)[1] - 2
+    )  # powers of two up to this one, and their inverses, are of full precision
+    exponent = np.clip(np.frexp(size)[1], -limit, limit)
+    return like(xp, np.ldexp(1.0, -exponent), array)
 
 
 def constant(table: tuple[tuple[float, ...], ...], other: Array) -> Array:

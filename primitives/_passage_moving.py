@@ -3,16 +3,20 @@
 Without the via-point the movement would be x_free(t); with r = x1 - x_free the least cost of passing x1 at t
 is, in unit total time,
 
-    J(t) = J0 + 10 |r|^2 / (t^5 (1 - t)^q g(t)),    dJ/dt = 0  <=>
-    F(t) = |r|^2 (5 (1 - t) g - q t g + t (1 - t) g') - 2 t (1 - t) g r . r' = 0,
+    J(t) = J0 + 10 |r|^2 / (t^p (1 - t)^q g(t)),    dJ/dt = 0  <=>
+    F(t) = |r|^2 (p (1 - t) g - q t g + t (1 - t) g') - 2 t (1 - t) g r . r' = 0,   p = 5,
 
-where t^5 (1 - t)^q g is 20 times the Green's function of the boundary conditions at (t, t). There can be
+where t^p (1 - t)^q g is 20 times the Green's function of the boundary conditions at (t, t). There can be
 several minima, so no first root is trusted: the polynomial gives every one, and the least J decides (the
 earliest if equal).
+
+The coefficients of F lose the digits of a root close to an end. There the movement is looked at from either
+end, on every scale of time, and F is taken as the formula above, not as its coefficients.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +33,107 @@ _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {
 }
 """(goal velocity FREE, goal acceleration FREE) -> q and the coefficients of g."""
 
+_DOUBT = 1e-12
+"""Estimated relative error of the shorter fraction above which a movement is looked at from both ends."""
+
+_TOLERANCE = 1e-9
+"""Relative difference above which that result counts."""
+
+_NEAR = 1e-6
+"""Size of F at an end relative to its coefficients, below which a root close to it may be missed."""
+
+_SHORTEST = 1e-50
+"""Least fraction that a via-point apart from its neighbour may get: a higher power of it must not underflow."""
+
+_SCALES = 6
+"""Scales of time, from the whole movement down to the least root, on which roots are looked for."""
+
+_STEPS = 8
+"""Newton steps from the roots of the polynomial."""
+
+_CONVERGED_STEP = 1e-9
+"""Relative size of the last of them that tells a root; what is none must not win as an earlier equal."""
+
+_OVERLAP = 0.75
+"""Each end answers for the roots up to here; those found twice do no harm."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """The problem as seen from one end: time u runs from there.
+
+    Attributes:
+        miss: (N, D, 6) coefficients of r in u.
+        powers: p and q.
+        factor: coefficients of g in u.
+    """
+
+    miss: Floats
+    powers: tuple[int, int]
+    factor: Floats
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """Return the coefficients of p (1 - u) g - q u g + u (1 - u) g' and of 2 u (1 - u) g."""
+        p, q = self.powers
+        both = np.array([0.0, 1.0, -1.0])  # u (1 - u)
+        weight = np.convolve(np.array([float(p), float(-p - q)]), self.factor)
+        bent = np.convolve(both, differentiate(self.factor))
+        size = max(len(weight), len(bent))
+        weight = np.pad(weight, (0, size - len(weight))) + np.pad(bent, (0, size - len(bent)))
+        return weight, 2.0 * np.convolve(both, self.factor)
+
+    def stationary(self) -> Floats:
+        """Return the coefficients of F, (N, degree + 1)."""
+        weight, both = self.weights()
+        square = _over_dimensions(multiply(self.miss, self.miss))
+        change = _over_dimensions(multiply(self.miss, differentiate(self.miss)))
+        left, right = multiply(square, weight), multiply(change, both)
+        size = max(left.shape[-1], right.shape[-1])
+        total = np.zeros((len(self.miss), size))
+        total[:, : left.shape[-1]] += left
+        total[:, : right.shape[-1]] -= right
+        return total
+
+    def excess(self, u: Floats) -> Floats:
+        """Return J - J0 at the candidates (N, n), infinite at the ends."""
+        p, q = self.powers
+        square = np.zeros_like(u)
+        for d in range(self.miss.shape[1]):
+            value = evaluate(self.miss[:, None, d], u)
+            square = square + value * value
+        green = u
+        for _ in range(p - 1):
+            green = green * u
+        green = green * evaluate(self.factor, u)
+        for _ in range(q):
+            green = green * (1.0 - u)
+        inside = (u > 0) & (u < 1) & (green > 0)
+        return np.where(inside, 10.0 * square / np.where(inside, green, 1.0), np.inf)
+
+    def polished(self, u: Floats) -> tuple[Floats, Any]:
+        """Take Newton steps on F as a formula of r and r', from candidates (N, n); say which became roots."""
+        weight, both = self.weights()
+        first = differentiate(self.miss)
+        paths = [part[:, :, None] for part in (self.miss, first, differentiate(first))]
+        step = u
+        for _ in range(_STEPS):
+            r, dr, ddr = (evaluate(path, u[:, None]) for path in paths)
+            square, change = _over_dimensions(r * r), _over_dimensions(r * dr)
+            w, b = evaluate(weight, u), evaluate(both, u)
+            value = square * w - b * change
+            slope = square * evaluate(differentiate(weight), u) - b * _over_dimensions(dr * dr + r * ddr)
+            slope = slope + change * (2.0 * w - evaluate(differentiate(both), u))
+            step = value / np.where(slope == 0, 1.0, slope)
+            u = np.where(np.abs(step) < 0.1 * u, u - step, u)
+        return u, np.abs(step) < _CONVERGED_STEP * u
+
+    def seen_from_here(self) -> tuple[Floats, Floats]:
+        """Return the roots in the nearer part of the movement, (N, n) ascending, and the excess there."""
+        u, is_root = self.polished(_candidates_on_every_scale(self.stationary()))
+        excess = np.where((is_root | (u <= _SHORTEST)) & (u <= _OVERLAP), self.excess(u), np.inf)
+        order = np.argsort(u, axis=-1, kind="stable")
+        return np.take_along_axis(u, order, axis=-1), np.take_along_axis(excess, order, axis=-1)
+
 
 def fractions_moving(points: Floats, ends: list[Any]) -> Floats:
     """Fractions of the duration before and after the via-point.
@@ -39,51 +144,78 @@ def fractions_moving(points: Floats, ends: list[Any]) -> Floats:
             FREE.
 
     Returns:
-        (N, 2), each pair adds up to 1.
+        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy.
     """
-    free = connect(np, 3, points[:, [0, 2]], np.ones(1), [ends[:2], ends[2:]])
-    path = np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
-    miss = -path
-    miss[..., 0] = points[:, 1] - points[:, 0]
-    exponent, factor = _GREEN[ends[2] is FREE, ends[3] is FREE]
-    stationary = _stationary(miss, exponent, np.array(factor))
+    view, cost = _view(points, ends, from_goal=False)
+    stationary = view.stationary()
     u = root_candidates(stationary)
-    excess = _excess(miss, exponent, np.array(factor), u)
+    best = _earliest(u, view.excess(u), cost)
+    fractions = np.stack([best, 1.0 - best], axis=-1)
+    hard = np.flatnonzero(_inaccurate(stationary, best))
+    if hard.size:
+        chosen = [value[hard] if isinstance(value, np.ndarray) else value for value in ends]
+        found = _from_both_ends(points[hard], chosen, cost[hard])
+        wrong = (np.abs(found - fractions[hard]) > _TOLERANCE * found).any(axis=-1)
+        fractions[hard[wrong]] = found[wrong]
+    return fractions
+
+
+def _inaccurate(stationary: Floats, u: Floats) -> Any:
+    """Whether rounding of the coefficients of F may spoil the root u (N,), or hide one close to an end."""
+    slope = np.abs(evaluate(differentiate(stationary), u)) * np.minimum(u, 1.0 - u)
+    noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), u) + np.abs(evaluate(stationary, u))
+    at_ends = np.minimum(np.abs(stationary[:, 0]), np.abs(evaluate(stationary, np.ones_like(u))))
+    return ~(noise < _DOUBT * slope) | ~(at_ends > _NEAR * np.abs(stationary).sum(axis=-1))
+
+
+def _candidates_on_every_scale(polynomial: Floats) -> Floats:
+    """Return points of (0, 1], (N, n), among which are all real roots there, however small they are."""
+    powers = np.arange(polynomial.shape[-1])
+    size = np.abs(polynomial)
+    with np.errstate(all="ignore"):
+        # Half of this bounds all roots from below (Fujiwara), and the least is not much larger.
+        least = 1.0 / ((size[:, 1:] / size[:, :1]) ** (1.0 / powers[1:])).max(axis=-1)
+    least = np.clip(np.nan_to_num(8.0 * least), _SHORTEST, 1.0)
+    scales = least[:, None] ** np.linspace(0.0, 1.0, _SCALES)
+    u = scales[..., None] * root_candidates(polynomial[:, None] * scales[..., None] ** powers)
+    candidates: Floats = np.maximum(u.reshape(len(polynomial), -1), _SHORTEST)
+    return candidates
+
+
+def _from_both_ends(points: Floats, ends: list[Any], cost: Floats) -> Floats:
+    """Return the same fractions from the roots as seen from the nearer end."""
+    (before, early), (after, late) = (
+        _view(points, ends, from_goal=from_goal)[0].seen_from_here() for from_goal in (False, True)
+    )
+    after, late = after[:, ::-1], late[:, ::-1]  # in the order of time
+    fractions = np.concatenate(
+        [np.stack([before, 1.0 - before], axis=-1), np.stack([1.0 - after, after], axis=-1)], axis=1
+    )
+    return _earliest(fractions, np.concatenate([early, late], axis=1), cost)
+
+
+def _view(points: Floats, ends: list[Any], *, from_goal: bool) -> tuple[_View, Floats]:
+    """Return the problem as seen from one end, and (N,) the cost without the via-point."""
+    q, factor = _GREEN[ends[2] is FREE, ends[3] is FREE]
+    powers, g = (5, q), np.array(factor)
+    first, via, last = (points[:, k] for k in range(3))
+    states = [ends[:2], ends[2:]]
+    if from_goal:
+        powers, g = (q, 5), np.polynomial.Polynomial(g)(np.polynomial.Polynomial([1.0, -1.0])).coef
+        first, last = last, first
+        states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
+    free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)
+    miss = -np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
+    miss[..., 0] = via - first
+    return _View(miss, powers, g), free.cost()
+
+
+def _earliest(choices: Floats, excess: Floats, cost: Floats) -> Floats:
+    """Return the choice (N, n, ...) of least excess; equal ones differ by rounding, the first counts."""
     least = excess.min(axis=-1, keepdims=True)
-    # Equal minima differ by rounding of J0 + excess; the earliest counts.
-    first = np.argmax(excess <= least + 1e-12 * (least + free.cost()[:, None]), axis=-1)
-    best = u[np.arange(len(u)), first]
-    return np.stack([best, 1.0 - best], axis=-1)
-
-
-def _stationary(miss: Floats, exponent: int, factor: Floats) -> Floats:
-    """Return the coefficients of F, (N, degree + 1)."""
-    both = np.array([0.0, 1.0, -1.0])  # t (1 - t)
-    weight = np.convolve(np.array([5.0, -5.0 - exponent]), factor)
-    bent = np.convolve(both, differentiate(factor))
-    size = max(len(weight), len(bent))
-    weight = np.pad(weight, (0, size - len(weight))) + np.pad(bent, (0, size - len(bent)))
-    square = _over_dimensions(multiply(miss, miss))
-    change = _over_dimensions(multiply(miss, differentiate(miss)))
-    left, right = multiply(square, weight), multiply(change, 2.0 * np.convolve(both, factor))
-    size = max(left.shape[-1], right.shape[-1])
-    total = np.zeros((len(miss), size))
-    total[:, : left.shape[-1]] += left
-    total[:, : right.shape[-1]] -= right
-    return total
-
-
-def _excess(miss: Floats, exponent: int, factor: Floats, u: Floats) -> Floats:
-    """Return J - J0 at the candidates (N, n), infinite at the ends."""
-    square = np.zeros_like(u)
-    for d in range(miss.shape[1]):
-        value = evaluate(miss[:, None, d], u)
-        square = square + value * value
-    green = u * u * u * u * u * evaluate(factor, u)
-    for _ in range(exponent):
-        green = green * (1.0 - u)
-    inside = (u > 0) & (u < 1) & (green > 0)
-    return np.where(inside, 10.0 * square / np.where(inside, green, 1.0), np.inf)
+    first = np.argmax(excess <= least + 1e-12 * (least + cost[:, None]), axis=-1)
+    best: Floats = choices[np.arange(len(choices)), first]
+    return best
 
 
 def _over_dimensions(array: Floats) -> Floats:

@@ -11,7 +11,7 @@ from math import factorial
 from typing import Any
 
 from ._arrays import Array
-from .trajectory import Trajectory
+from .trajectory import Trajectory, require_trajectory
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
     For order m, dJ/dx^(i)(T) = (-1)^(m-1-i) x^(2m-1-i)(T) at the goal, the opposite at the start, and at a
     via-point the jump of (-1)^(m-1) x^(2m-1), left minus right.
     """
+    require_trajectory(trajectory)
     xp, m = trajectory.namespace, trajectory.order
     sign = (-1.0) ** (m - 1)
     highest = _segment_derivative(trajectory, 2 * m - 1, at_end=False) * sign

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ._arrays import Array, broadcast_batch, refuse_free, require
-from .trajectory import Trajectory
+from .trajectory import Trajectory, require_trajectory
 
 
 def minimum_duration(
@@ -33,6 +33,7 @@ def minimum_duration(
     Raises:
         ValueError: no limit is given, or a limit is not finite, not positive, or of a wrong shape.
     """
+    require_trajectory(trajectory)
     named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
     if all(limit is None for limit in named.values()):
         raise ValueError("give at least one limit: velocity, acceleration or jerk")

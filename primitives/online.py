@@ -19,7 +19,7 @@ from ._arrays import (
 )
 from ._connecting import check_boundary_shapes
 from .passage_times import passage_durations
-from .trajectory import Trajectory
+from .trajectory import Trajectory, require_trajectory
 from .via_points import through
 
 
@@ -64,6 +64,7 @@ def retarget(
         ValueError: time lies before the start or not before the old or the new arrival; freeze is negative
             or not finite; other bad arguments.
     """
+    require_trajectory(trajectory)
     named = {"goal_velocity": goal_velocity, "goal_acceleration": goal_acceleration}
     if trajectory.order != 3:
         raise ValueError(f"trajectory must have order 3 to be continued, got order {trajectory.order}")

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import Array, as_number, error_state, is_whole, like, to_numpy
+from ._arrays import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
 from ._polynomial import differentiate, multiply, root_candidates, unit_size
-from .trajectory import Trajectory
+from .trajectory import Trajectory, require_trajectory
 
 _SPECTRUM_SAMPLES = 1000
 """Instants at which the spectral arc length takes the speed, whatever the duration: far beyond a movement's
@@ -23,6 +23,12 @@ bandwidth."""
 
 _MOST_PADDING = 16
 """Beyond it the spectrum of a single movement takes gigabytes of memory."""
+
+_LEAST_TREND = 1e-12
+"""Change of the squared speed, relative to its greatest, that counts as one in double precision."""
+
+_ROUNDINGS = 64
+"""Of the trajectory's own precision: what it is in a lower one, where coefficients are rounded more."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,14 @@ class SpeedEvents:
 
 def speed(trajectory: Trajectory, time: Array) -> Array:
     """Return the tangential velocity |v| at `time` (T,) or (..., T): (..., T) [m/s]."""
-    return trajectory.namespace.linalg.vector_norm(trajectory(time, 1), axis=-1)
+    require_trajectory(trajectory)
+    return _length(trajectory.namespace, trajectory(time, 1))
+
+
+def _length(xp: Namespace, vectors: Array) -> Array:
+    """Return the Euclidean norm of the last axis, whatever the size."""
+    factors = unit_factors(xp, vectors)
+    return xp.linalg.vector_norm(vectors * factors, axis=-1) / factors[..., 0]
 
 
 def curvature(trajectory: Trajectory, time: Array) -> Array:
@@ -60,30 +73,37 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
     Raises:
         ValueError: the dimension is neither 2 nor 3; time is bad.
     """
+    require_trajectory(trajectory)
     if trajectory.dimension not in (2, 3):
         raise ValueError(f"trajectory must have dimension 2 or 3 for a curvature, got {trajectory.dimension}")
     xp = trajectory.namespace
     velocity, acceleration = trajectory.sample(time, (1, 2))
+    slower, flatter = unit_factors(xp, velocity), unit_factors(xp, acceleration)
+    velocity, acceleration = velocity * slower, acceleration * flatter
     if trajectory.dimension == 2:
         turn = velocity[..., 0] * acceleration[..., 1] - velocity[..., 1] * acceleration[..., 0]
     else:
         turn = xp.linalg.vector_norm(xp.linalg.cross(velocity, acceleration, axis=-1), axis=-1)
     length = xp.linalg.vector_norm(velocity, axis=-1)
     with error_state(xp):
-        return turn / (length * length * length)
+        bend = turn / (length * length * length)
+        return bend * slower[..., 0] * (slower[..., 0] / flatter[..., 0])
 
 
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
     """Return (...,) integral |jerk|^2 dt * duration^3 / peak speed^2; 204.8 for a straight reach."""
-    xp = trajectory.namespace
+    require_trajectory(trajectory)
+    xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
     duration, peak = trajectory.duration, trajectory.peak(1)
     with error_state(xp):
         return trajectory.energy(3) * duration * duration * duration / (peak * peak)
 
 
 def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return (...,) minus the natural logarithm of the dimensionless jerk: greater is smoother."""
-    return -trajectory.namespace.log(dimensionless_jerk(trajectory))
+    """Return (...,) minus the natural logarithm of dimensionless jerk: greater is smoother, infinite without jerk."""
+    ratio = dimensionless_jerk(trajectory)
+    with error_state(trajectory.namespace):
+        return -trajectory.namespace.log(ratio)
 
 
 def spectral_arc_length(
@@ -105,6 +125,7 @@ def spectral_arc_length(
     Raises:
         ValueError: cutoff or threshold is out of range, or padding is not a whole number from 0 to 16.
     """
+    require_trajectory(trajectory)
     if not as_number(cutoff) > 0:
         raise ValueError(f"cutoff must be a number above 0, got {cutoff!r}")
     if not 0 <= as_number(threshold) < 1:
@@ -115,6 +136,17 @@ def spectral_arc_length(
     if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
         return xp.astype(_arc_length(_in_single_precision(trajectory), cutoff, threshold, padding), dtype)
     return _arc_length(trajectory, cutoff, threshold, padding)
+
+
+def _unit_sized(trajectory: Trajectory) -> Trajectory:
+    """Return the movements at a size and a duration of about 1, by powers of two, which change no digit."""
+    xp, t = trajectory.namespace, trajectory
+    if 0 in t.batch_shape:
+        return t
+    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
+    pace = unit_factors(xp, t.end)
+    times = (array * pace for array in (t.durations, t.starts))
+    return Trajectory(t.coefficients * size, next(times), t.order, next(times), t.rates / pace, t.end * pace)
 
 
 def _in_single_precision(trajectory: Trajectory) -> Trajectory:
@@ -131,7 +163,7 @@ def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding
         return 0.0 * trajectory.duration
     length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
-    spectrum = xp.abs(xp.fft.rfft(xp.linalg.vector_norm(velocity, axis=-1), n=length, axis=-1))
+    spectrum = xp.abs(xp.fft.rfft(_length(xp, velocity), n=length, axis=-1))
     with error_state(xp):
         spectrum = spectrum / spectrum[..., :1]
     numbers = to_numpy(spectrum)
@@ -157,6 +189,7 @@ def speed_peaks(trajectory: Trajectory) -> SpeedEvents:
 
 
 def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
+    require_trajectory(trajectory)
     xp = trajectory.namespace
     times = _turning_times(trajectory)
     before, after = _speed_trend(trajectory, times)
@@ -193,7 +226,9 @@ def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
     wide = (
         np.diff(times, axis=-1) > 1e-9 * times[..., -1:]
     )  # between two copies of one root there is only noise
-    trend = np.where(wide & (np.abs(rate) > 1e-12 * size[..., None]), np.sign(rate), 0.0)
+    precision = float(trajectory.namespace.finfo(trajectory.coefficients.dtype).eps)
+    noise = max(_LEAST_TREND, _ROUNDINGS * precision) * size[..., None]
+    trend = np.where(wide & (np.abs(rate) > noise), np.sign(rate), 0.0)
     for i in range(1, trend.shape[-1]):
         trend[..., i] = np.where(trend[..., i] == 0, trend[..., i - 1], trend[..., i])
     edge = np.zeros((*trend.shape[:-1], 1))

@@ -271,9 +271,8 @@ class Trajectory:
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
         end = own(duration)[..., None]
         factor = end / self.end
-        empty = self.rates <= 0
         with error_state(xp):
-            rates = xp.where(empty, 0.0 * factor, self.rates / factor)
+            rates = xp.where(self.rates <= 0, 0.0 * factor, self.rates / factor)
         coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
         return Trajectory(coefficients, self.durations * factor, self.order, self.starts * factor, rates, end)
 
@@ -313,3 +312,9 @@ class Trajectory:
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
         return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end)
+
+
+def require_trajectory(value: object) -> None:
+    """Raise ValueError for anything else."""
+    if not isinstance(value, Trajectory):
+        raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")

@@ -175,3 +175,40 @@ def test_what_does_not_converge_is_flagged():
         durations = passage_durations(waypoints, 1.0)
     assert (durations > 0).all()
     np.testing.assert_allclose(durations.sum(axis=-1), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-5, 1e-7, 1e-10, 1e-40, 1e-160, 1e-300])
+@pytest.mark.parametrize("rest", ["nowhere", "at the start", "at the goal"])
+def test_a_movement_and_its_reversal_pass_at_the_same_instant(distance, rest):
+    """Also with moving ends and very near either end, where the instant is known from the nearer one."""
+    direction = RNG.normal(size=(30, 2))
+    via = distance * direction / np.linalg.norm(direction, axis=1)[:, None]
+    start, goal = np.zeros((30, 2)), np.broadcast_to([1.0, -2.0], (30, 2))
+    here = RNG.normal(size=(2, 30, 2)) * (rest != "at the start")
+    there = RNG.normal(size=(2, 30, 2)) * (rest != "at the goal")
+    names = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
+    forth = dict(zip(names, (*here, *there), strict=True))
+    back = dict(zip(names, (-there[0], there[1], -here[0], here[1]), strict=True))
+    waypoints = np.stack([start, via, goal], axis=1)
+    away = passage_durations(waypoints, 1.0, **forth)
+    assert (away > 0).all()
+    assert np.isfinite(through(waypoints, away, **forth).coefficients).all()
+    # The same seen from the goal: the origin lies there, so that the via-point is as near as it was.
+    toward = passage_durations(waypoints[:, ::-1], 1.0, **back)[:, ::-1]
+    np.testing.assert_allclose(toward, away, rtol=2e-9)
+
+
+@pytest.mark.parametrize("rest", ["at the start", "at the goal", "nowhere"])
+@pytest.mark.parametrize("where", [0, 1])
+def test_no_instant_is_better_for_a_via_point_near_an_end(where, rest):
+    count, grid = 8, np.concatenate([np.logspace(-5, -0.5, 150), 1 - np.logspace(-5, -0.5, 150)])
+    ends = np.array([[0.0, 0.0], [1.0, 0.0]])
+    for distance in (1e-2, 1e-5, 1e-8):
+        via = ends[where] + distance * RNG.normal(size=(count, 2))
+        waypoints = np.stack([np.tile(ends[0], (count, 1)), via, np.tile(ends[1], (count, 1))], axis=1)
+        state = {"start_velocity": RNG.normal(size=(count, 2)), "goal_velocity": RNG.normal(size=(count, 2))}
+        state.pop({"at the start": "start_velocity", "at the goal": "goal_velocity"}.get(rest, ""), None)
+        best = through(waypoints, passage_durations(waypoints, 1.0, **state), **state).cost()
+        moving = {name: value[:, None] for name, value in state.items()}
+        others = through(waypoints[:, None], np.stack([grid, 1 - grid], axis=-1), **moving).cost()
+        assert (best <= others.min(axis=1) * (1 + 1e-9)).all()

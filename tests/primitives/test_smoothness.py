@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from viapoint.primitives import (
     curvature,
@@ -131,3 +132,38 @@ def test_standing_still_has_no_measure():
     still = point_to_point([1.0, 1.0], [1.0, 1.0], 1.0)
     assert np.isnan(dimensionless_jerk(still))
     assert speed_valleys(still).time.shape == (0,)
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-110, 1e110, 1e200, 1e300])
+def test_measures_hold_for_any_size(size):
+    movement = via_movement(0.3, 0.5)
+    other = movement.transformed(scale=size)
+    time = np.linspace(0.1, 0.9, 9)
+    np.testing.assert_allclose(speed(other, time) / size, speed(movement, time), rtol=1e-13)
+    np.testing.assert_allclose(curvature(other, time) * size, curvature(movement, time), rtol=1e-12)
+    np.testing.assert_allclose(speed_valleys(other).speed / size, speed_valleys(movement).speed, rtol=1e-9)
+    for measure in MEASURES:
+        np.testing.assert_allclose(measure(other), measure(movement), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [np, torch])
+@pytest.mark.parametrize("duration", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_measures_of_single_precision_are_those_of_double_precision(kind, size, duration):
+    waypoints = size * np.concatenate([RNG.normal(size=(40, 3, 2)), [[[0, 0], [0.3, 0.5], [1, 0]]]])
+    parts = kind.asarray(waypoints, dtype=kind.float32), kind.asarray(duration, dtype=kind.float32)
+    single = through(parts[0], passage_durations(*parts))
+    double = through(waypoints, np.asarray(passage_durations(*parts), float))
+    for measure in MEASURES:
+        np.testing.assert_allclose(measure(single), measure(double), rtol=1e-3)
+    for events in (speed_valleys, speed_peaks):
+        found, expected = events(single).time, events(double).time
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found / duration, expected / duration, atol=2e-3)
+
+
+def test_a_movement_without_jerk_is_infinitely_smooth():
+    ends = {"start_velocity": [2.0, 0.0], "goal_velocity": [2.0, 0.0]}
+    steady = point_to_point([0.0, 0.0], [1.0, 0.0], 0.5, **ends)
+    assert dimensionless_jerk(steady) == 0
+    assert log_dimensionless_jerk(steady) == np.inf

@@ -8,7 +8,10 @@ import torch
 
 from viapoint.primitives import (
     FREE,
+    cost_gradient,
     curvature,
+    dimensionless_jerk,
+    log_dimensionless_jerk,
     minimum_duration,
     minimum_jerk_coefficients,
     passage_durations,
@@ -16,6 +19,8 @@ from viapoint.primitives import (
     retarget,
     spectral_arc_length,
     speed,
+    speed_peaks,
+    speed_valleys,
     through,
 )
 
@@ -174,3 +179,25 @@ def test_a_peak_is_right_or_its_overflow_is_named():
                 ValueError, match=f"derivative 2 of the trajectory overflows .*float.* {shortest} s"
             ):
                 ask(nu)
+
+
+@pytest.mark.parametrize("bad", [None, [0.0, 1.0], np.zeros((3, 2)), "reach", WAYPOINTS])
+@pytest.mark.parametrize(
+    "ask",
+    [
+        cost_gradient,
+        dimensionless_jerk,
+        log_dimensionless_jerk,
+        spectral_arc_length,
+        speed_peaks,
+        speed_valleys,
+        lambda bad: curvature(bad, [0.5]),
+        lambda bad: minimum_duration(bad, velocity=1.0),
+        lambda bad: retarget(bad, 0.2, [1.0, 1.0], 1.0),
+        lambda bad: speed(bad, [0.5]),
+    ],
+)
+def test_what_is_no_trajectory_is_named(ask, bad):
+    expected = f"^trajectory must be a viapoint.primitives.Trajectory, got {type(bad).__name__}$"
+    with pytest.raises(ValueError, match=expected):
+        ask(bad)
