@@ -19,6 +19,7 @@ from ._arrays import (
     own,
     refuse_free,
     to_numpy,
+    unit_factors,
 )
 from ._banded import States, solve_states
 from ._hermite import ORDERS, coefficient_table
@@ -87,7 +88,26 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     return Trajectory.from_segments(_coefficients(xp, order, waypoints, durations, states), durations, xp)
 
 
+_SHORT, _LONG = 1e-3, 1e3
+"""Durations [s] between which no power of them over- or underflows, in single precision either."""
+
+
+def _at_unit_pace(durations: Array, states: States) -> tuple[Array, States]:
+    """Return durations of about 1 and the states to match: by powers of two, which change no digit."""
+    pace = unit_factors(np, durations)
+    scaled: States = []
+    for state in states:
+        row, power = [], np.ones_like(pace)
+        for value in state:
+            power = power / pace
+            row.append(value if value is None or value is FREE else value * power)
+        scaled.append(row)
+    return durations * pace, scaled
+
+
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
+    if xp is np and durations.size and not (durations.min() >= _SHORT and durations.max() <= _LONG):
+        durations, states = _at_unit_pace(durations, states)
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     pieces = [steps[..., s, :] for s in range(segments)]

@@ -179,3 +179,20 @@ def test_equations_2_4_and_5_of_the_paper():
     expected = np.where(tau < t1, before, after)
     movement = through(np.array([[start], [via], [goal]]), [t1 * end, (1 - t1) * end])
     np.testing.assert_allclose(movement(tau * end)[:, 0], expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("exponent", [-20, -10, 10, 20])
+def test_the_pace_changes_no_digit_of_a_movement_in_unit_time(exponent, order, dtype):
+    """Durations of 1e-6 s to 1e6 s, in single precision too: scaled by a power of two, coefficients stay."""
+    pace = 2.0**exponent
+    waypoints, velocity = RNG.normal(size=(5, 4, 2)).astype(dtype), RNG.normal(size=(5, 2)).astype(dtype)
+    durations = RNG.uniform(0.5, 1.0, (5, 3)).astype(dtype)
+    plain = through(waypoints, durations, start_velocity=velocity, order=order)
+    scaled = through(waypoints, durations * dtype(pace), start_velocity=velocity / dtype(pace), order=order)
+    np.testing.assert_array_equal(scaled.coefficients, plain.coefficients)
+    shared = through(waypoints[0], durations[0] * dtype(pace), order=order)
+    np.testing.assert_array_equal(
+        shared.coefficients, through(waypoints[0], durations[0], order=order).coefficients
+    )
