@@ -9,7 +9,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.action import Plan
+
 Float = NDArray[np.float64]
+
+AWAY = 1e-3
+"""How far from the hand a plan may begin at most, [m]."""
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
@@ -88,6 +93,31 @@ def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
         value = array[env, component]
         raise ValueError(f"action must be finite, got {value} for {names[component]} of environment {env}")
     return np.clip(array, -1.0, 1.0)
+
+
+def checked_plan(plan: Plan, start: Float) -> Plan:
+    """Movements that begin where the hands are, shape (N, D), [m]."""
+    try:
+        waypoints, durations = (np.asarray(part, dtype=np.float64) for part in plan)
+    except (TypeError, ValueError):
+        raise ValueError(f"plan must be waypoints and durations, got {plan!r}") from None
+    number, dimension = start.shape
+    if waypoints.ndim != 3 or waypoints.shape[::2] != start.shape or waypoints.shape[1] < 2:
+        raise ValueError(
+            f"plan must have waypoints of shape ({number}, K + 2, {dimension}), got {waypoints.shape}"
+        )
+    if durations.shape != (number, waypoints.shape[1] - 1):
+        raise ValueError(
+            f"plan must have durations of shape {(number, waypoints.shape[1] - 1)}, got {durations.shape}"
+        )
+    away = np.sqrt(((waypoints[:, 0] - start) ** 2).sum(axis=-1))
+    if (away > AWAY).any():
+        env = int((away > AWAY).argmax())
+        raise ValueError(
+            f"plan {env} must begin where the hand is, at {start[env]} m, got {waypoints[env, 0]} m, "
+            f"{away[env]:.4f} m from there"
+        )
+    return Plan(waypoints, durations)
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:

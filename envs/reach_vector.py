@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from viapoint.envs.action import ActionLayout, Plan, Timing
 from viapoint.envs.arguments import (
     checked_actions,
+    checked_plan,
     fewest_and_most,
     masked_rows,
     refuse_unknown,
@@ -194,7 +195,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        self._check_running()
         rows, everyone = np.arange(self.num_envs), np.ones(self.num_envs, dtype=bool)
         prepared = self._prepare(self._decoded(actions))
         # The next scenes are drawn beside the physics, which waits for nothing but the first references.
@@ -219,17 +219,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        self._check_running()
-        return self.perform(self._decoded(actions))
+        return self._conclude(self._prepare(self._decoded(actions)))
 
     def perform(self, plan: Plan) -> Decision:
         """Carry out one plan in each environment, with any number of via-points, without a reset.
 
         Args:
-            plan: Of num_envs movements, from the starts to the goals.
+            plan: Of num_envs movements, from the starts to the goals; one that starts elsewhere is refused.
         """
-        self._check_running()
-        return self._conclude(self._prepare(plan))
+        return self._conclude(self._prepare(checked_plan(plan, self._check_running().start)))
 
     def render(self) -> Any:
         """The last movement of each environment as the render mode says; after a reset, the scenes."""
@@ -257,9 +255,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return self._renderer.movement(sim, scenes.take([sim]), plan.take([sim]), rollout)
 
     def _decoded(self, actions: Any) -> Plan:
-        assert self.scenes is not None
+        scenes = self._check_running()
         actions = checked_actions(actions, self.num_envs, self.action_layout.names)
-        return self.action_layout.decode(actions, self.scenes.start, self.scenes.goal)
+        return self.action_layout.decode(actions, scenes.start, scenes.goal)
 
     def _prepare(self, plan: Plan) -> Prepared:
         assert self.scenes is not None
@@ -275,9 +273,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self.render()
         return Decision(observation, terms.total(), {**outcome._asdict(), **terms.as_info()})
 
-    def _check_running(self) -> None:
+    def _check_running(self) -> Scenes:
         if self.scenes is None:
             raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
+        return self.scenes
 
     def _seeded(
         self, seed: int | Sequence[int | None] | None, rows: NDArray[np.int64]

@@ -6,6 +6,7 @@ import pytest
 from gymnasium.wrappers.vector import FlattenObservation, NormalizeObservation
 
 import viapoint.envs
+from viapoint.envs.action import Plan
 from viapoint.envs.arguments import reset_options
 from viapoint.envs.recording import RecordMovements
 from viapoint.envs.registration import ONLINE_TASKS
@@ -108,6 +109,32 @@ def test_what_the_number_of_environments_is_called_is_not_offered(env_id):
             TypeError, match=r"unknown keyword argument 'speed'; allowed are arm, whole_arm, "
         ):
             make(env_id, speed=1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            lambda way, time: (way + 0.1, time),
+            r"plan 0 must begin where the hand is, at .* m, got .* m, 0\.1414 m from there",
+        ),
+        (lambda way, time: (way[:1], time), r"waypoints of shape \(2, K \+ 2, 2\), got \(1, 2, 2\)"),
+        (lambda way, time: (way[:, :1], time), r"waypoints of shape .*, got \(2, 1, 2\)"),
+        (lambda way, time: (way, time[:, [0, 0]]), r"durations of shape \(2, 1\), got \(2, 2\)"),
+        (lambda way, time: (way, -time), "durations must not be negative"),
+        (lambda way, time: (way * np.nan, time), "finite"),
+        (lambda way, time: ("there", time), "plan must be waypoints and durations"),
+    ],
+)
+def test_a_plan_begins_where_the_hand_is(change, reason):
+    env = gym.make_vec(PLANAR[0], num_envs=2, threads=1).unwrapped
+    env.reset(seed=0)
+    scenes = env.scenes
+    waypoints, durations = np.stack((scenes.start, scenes.goal), axis=1), np.full((2, 1), 0.8)
+    with pytest.raises(ValueError, match=reason):
+        env.perform(Plan(*change(waypoints, durations)))
+    assert (env.perform(Plan(waypoints.tolist(), durations.tolist())).info["jerk_ratio"] < 1.0 + 1e-9).all()
+    env.close()
 
 
 @pytest.mark.parametrize("mode", [None, "human", "rgb_array"])
