@@ -130,8 +130,22 @@ HYPERPARAMETERS: dict[str, Allowed] = {
 }
 """By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaTD3."""
 
-PARTICULAR: dict[str, dict[str, Allowed]] = {"ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)}}
+PARTICULAR: dict[str, dict[str, Allowed]] = {
+    "ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)},
+    "viatd3": {"action_noise": Allowed("null, as its own is called noise", NONE.fits)},
+}
 """What is narrower for one algorithm."""
+
+VIA_POLICY: dict[str, Allowed] = {
+    "width": _whole(4),  # what looks at obstacles is a quarter as wide
+    "rounds": _whole(0),
+    "kept": _whole(1),
+    "candidates": _whole(0),
+    "heads": _or(_whole(1), NONE),
+    "trajectory_features": FLAG,
+    "optimizer_kwargs": _or(SETTINGS, NONE),
+}
+"""What `policy_kwargs` of ViaTD3 may hold, by name; the environment tells the task."""
 
 
 def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
@@ -140,7 +154,30 @@ def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
     Raises:
         ValueError: A value is not allowed.
     """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"hyperparameters must be values by name, got {values!r}")
     table = {**HYPERPARAMETERS, **PARTICULAR.get(algo, {})}
+    _check(f"of {algo}", table, values)
+    if algo == "viatd3":
+        policy = values.get("policy_kwargs") or {}
+        unknown = sorted(set(policy) - set(VIA_POLICY))
+        if unknown:
+            raise ValueError(
+                f"policy_kwargs of viatd3 have no {unknown[0]!r}; they have {', '.join(VIA_POLICY)}"
+            )
+        check_via_policy(policy)
+
+
+def check_via_policy(values: Mapping[str, Any]) -> None:
+    """Refuse `policy_kwargs` of ViaTD3 that make no sense; names that are not in the table are passed over.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+    _check("in policy_kwargs of viatd3", VIA_POLICY, values)
+
+
+def _check(where: str, table: Mapping[str, Allowed], values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         if name in table and not table[name].fits(value):
-            raise ValueError(f"hyperparameter {name} of {algo} must be {table[name].words}, got {value!r}")
+            raise ValueError(f"hyperparameter {name} {where} must be {table[name].words}, got {value!r}")

@@ -10,11 +10,14 @@ import numpy as np
 import torch
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from viapoint.envs.action import MOST_VIAS
+from viapoint.envs.scene_distribution import MOST
+
 LARGEST_MODEL_JSON = 1 << 20
 """Size of `model.json` at most, [bytes]."""
 LARGEST_WEIGHTS = 1 << 30
 """Size of `weights.safetensors` at most, [bytes]."""
-LARGEST_ARGUMENTS = {"n_via": 64, "n_obstacles": 64, "width": 8192, "height": 8192, "threads": 1024}
+LARGEST_ARGUMENTS = {"n_via": MOST_VIAS, "n_obstacles": MOST, "width": 8192, "height": 8192, "threads": 1024}
 """Arguments of an environment that memory and time grow with, and how large a file may make them."""
 
 SPARE_PARAMETERS = 100_000

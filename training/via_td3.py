@@ -9,6 +9,7 @@ decision counts as the critic judges it, and the actor learns on observations of
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -16,18 +17,30 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.arms import ARMS
+from viapoint.envs.step_episodes import StepRewardWeights
 from viapoint.envs.task import Task
 from viapoint.training.actor import ViaActor, arrays
 from viapoint.training.features import Look
+from viapoint.training.hyperparameters import check_hyperparameters, check_via_policy
+from viapoint.training.movements import on_the_way
 from viapoint.training.policies import Judgement, ViaCritic, ViaPolicy
 from viapoint.training.scene_pool import Pool, ScenePool, VisitedPool
 
 SHARPNESS = 8.0
 """How fast the probability of success falls with the learned part of the reward, about one half."""
+OWN = (
+    "explore_uniformly", "noise", "temperature", "promising", "others", "further", "fresh_scenes", "augment",
+    "objective", "smoothness",
+)  # fmt: skip
+"""Settings that TD3 does not have."""
+BOUND = ("arm", "whole_arm", "action", "weights")
+"""Parts of a task that an agent cannot do without: it computes with them. Scenes of another kind are only others."""
 
 
 class ViaTD3(TD3):
@@ -52,7 +65,10 @@ class ViaTD3(TD3):
             critic's learned part tells it, with the known effort.
         smoothness: Whether the objective counts the jerk of the movement.
         policy_kwargs: Of :class:`~viapoint.training.policies.ViaPolicy`; the task is asked of `env`.
-        **kwargs: Of :class:`stable_baselines3.TD3`.
+        **kwargs: Of :class:`stable_baselines3.TD3`; noise, delay and target networks of it are not used.
+
+    Raises:
+        ValueError: A setting makes no sense, or the environment is not one that can be foreseen.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaPolicy": ViaPolicy}
@@ -87,6 +103,8 @@ class ViaTD3(TD3):
         self.promising, self.others, self.further = promising, others, further
         self.fresh_scenes, self.augment = fresh_scenes, augment
         self.objective, self.smoothness = objective, smoothness
+        check_hyperparameters("viatd3", _plain({name: getattr(self, name) for name in OWN}))
+        check_via_policy(_plain(policy_kwargs or {}))
         kwargs = {"buffer_size": 50_000, "gamma": 0.0, "train_freq": 1, **kwargs}
         super().__init__(
             policy,
@@ -100,10 +118,48 @@ class ViaTD3(TD3):
             **kwargs,
         )
         if self.env is not None:
-            self.policy_kwargs.setdefault("task", self.env.get_attr("task", indices=0)[0].as_dict())
+            self.policy_kwargs.setdefault("task", task_of(self.env).as_dict())
         self.pool: Pool | None = None
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._take_on(self.env)
+        super()._setup_model()
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """As its base class.
+
+        Raises:
+            ValueError: The environment is not one for this agent.
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        self._take_on(wrapped)
+        super().set_env(wrapped, force_reset)
+
+    def _take_on(self, env: VecEnv) -> None:
+        """Refuse an environment that the agent was not made for; draw scenes from now on as it does."""
+        mine, theirs = (
+            task.as_dict() for task in (Task.from_dict(self.policy_kwargs["task"], ARMS), task_of(env))
+        )
+        others = [name for name in BOUND if mine[name] != theirs[name]]
+        if others:
+            raise ValueError(
+                f"the environment must have the {', '.join(others)} that the agent was made for: "
+                f"{ {name: mine[name] for name in others} }, got { {name: theirs[name] for name in others} }"
+            )
+        normalized = unwrap_vec_normalize(env)
+        if normalized is not None and normalized.norm_obs:
+            raise ValueError("ViaTD3 computes with metres: VecNormalize must be made with norm_obs=False")
+        if not self.gamma and on_the_way(getattr(env.observation_space, "spaces", ())):
+            raise ValueError(
+                f"gamma must be more than 0 where episodes are several decisions, got {self.gamma}"
+            )
+        if mine["scenes"] != theirs["scenes"]:
+            self.policy_kwargs = {**self.policy_kwargs, "task": theirs}
+            self.pool = None
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """Update critic and actor `gradient_steps` times."""
@@ -163,7 +219,8 @@ class ViaTD3(TD3):
     def _few(self, observation: Any) -> Tensor:
         """The first anchor in each scene, and as many others as an update looks at."""
         every = torch.as_tensor(self.actor.anchors.actions(arrays(observation)))
-        others = 1 + torch.randint(0, every.shape[1] - 1, (len(every), self.promising))
+        number = every.shape[1]
+        others = torch.randint(min(1, number - 1), number, (len(every), self.promising))
         some = torch.cat((torch.zeros_like(others[:, :1]), others), dim=1)
         return every[torch.arange(len(every)).unsqueeze(-1), some]
 
@@ -176,7 +233,9 @@ class ViaTD3(TD3):
         ahead = first.promise[:, : self.promising]
         chosen = ahead.topk(min(self.further, ahead.shape[1]), dim=-1).indices
         rows = torch.arange(batch_size).unsqueeze(-1)
-        again = self.actor.look_at(observation, first.actions[rows, chosen])
+        again = (
+            self.actor.look_at(observation, first.actions[rows, chosen]) if self.further else look.at(chosen)
+        )
         second = self.actor.improve(scene, again)
         self.critic.requires_grad_(False)
         judgement = self.critic.judge(observation, torch.cat((first.actions, second.actions), dim=1))
@@ -231,3 +290,26 @@ class ViaTD3(TD3):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "pool"]
+
+
+def task_of(env: VecEnv) -> Task:
+    """The task of an environment whose movements can be foreseen.
+
+    Raises:
+        ValueError: It is not one of this package, or an action is less than a movement.
+    """
+    try:
+        task = env.get_attr("task", indices=0)[0]
+    except AttributeError:
+        task = None
+    if not isinstance(task, Task) or isinstance(task.weights, StepRewardWeights):
+        raise ValueError(
+            "ViaTD3 needs an environment of this package in which an action is a whole movement, such as "
+            f"viapoint/PlanarObstacles-v0, got {env.observation_space} with {env.action_space}"
+        )
+    return task
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """With numbers of NumPy as those of Python."""
+    return {name: each.item() if isinstance(each, np.generic) else each for name, each in settings.items()}

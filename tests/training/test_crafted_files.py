@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save, save_file
 
+from viapoint.envs.action import MOST_VIAS
+from viapoint.envs.scene_distribution import MOST
 from viapoint.training.checkpoints import _digest, read_checkpoint, write_checkpoint
 from viapoint.training.files import BadFileError
 from viapoint.training.model_files import build, load_model, save_model
@@ -184,7 +186,12 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
             load_model(model)
     edit(model, hyperparameters={**record["hyperparameters"], "buffer_size": 10**15})
     load_model(model)  # to decide, it needs no buffer
-    for kwargs in ({"n_obstacles": 10**9}, {"n_obstacles": [1, 10**9]}, {"n_via": 10**9}, {"threads": 10**6}):
+    for kwargs in (
+        {"n_obstacles": 10**9},
+        {"n_obstacles": [1, MOST + 1]},
+        {"n_via": MOST_VIAS + 1},
+        {"threads": 10**6},
+    ):
         edit(model, **{**record, "env": {"id": ENV, "kwargs": kwargs}})
         with pytest.raises(BadFileError, match="may be at most"):
             load_model(model)

@@ -5,8 +5,14 @@ import math
 
 import pytest
 
-from viapoint.training.hyperparameters import HYPERPARAMETERS, PARTICULAR, check_hyperparameters
+from viapoint.training.hyperparameters import (
+    HYPERPARAMETERS,
+    PARTICULAR,
+    VIA_POLICY,
+    check_hyperparameters,
+)
 from viapoint.training.model_files import ALGORITHMS, _argument_names, _encode
+from viapoint.training.policies import ViaPolicy
 from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, SPACE_PRESETS, STEP_PRESETS
 
 
@@ -61,3 +67,38 @@ def test_what_makes_no_sense_is_refused_with_what_is_allowed(value):
 def test_ranges_and_types(algo, name, value):
     with pytest.raises(ValueError, match=f"hyperparameter {name} of {algo} must be .+, got"):
         check_hyperparameters(algo, {name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 0),
+        ("width", 3),
+        ("width", 128.0),
+        ("width", True),
+        ("rounds", -1),
+        ("kept", 0),
+        ("candidates", -1),
+        ("candidates", 2.5),
+        ("heads", 0),
+        ("trajectory_features", 1),
+        ("optimizer_kwargs", 3),
+    ],
+)
+def test_what_makes_no_sense_of_a_policy_of_via_points_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} in policy_kwargs of viatd3 must be .+, got"):
+        check_hyperparameters("viatd3", {"policy_kwargs": {name: value}})
+
+
+@pytest.mark.parametrize("name", ["net_arch", "task", "foo"])
+def test_names_that_a_policy_of_via_points_has_not_are_refused_with_those_it_has(name):
+    with pytest.raises(ValueError, match=f"no '{name}'; they have width, rounds, kept"):
+        check_hyperparameters("viatd3", {"policy_kwargs": {name: [3]}})
+    check_hyperparameters("sac", {"policy_kwargs": {name: [3]}})
+
+
+def test_the_table_of_a_policy_of_via_points_is_whole():
+    arguments = inspect.signature(ViaPolicy).parameters.values()
+    own = {each.name: each.default for each in arguments if each.default is not each.empty}
+    assert set(VIA_POLICY) == {*own, "optimizer_kwargs"}
+    check_hyperparameters("viatd3", {"policy_kwargs": own})

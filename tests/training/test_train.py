@@ -164,12 +164,13 @@ def test_what_cannot_be_trained_is_refused(tmp_path):
     for changes, words in (
         ({"hyperparameters": {"speed": 1}}, "no hyperparameter 'speed'"),
         (
-            {"hyperparameters": {"policy_kwargs": {"speed": 1}}},
+            {"algo": "sac", "hyperparameters": {"policy_kwargs": {"speed": 1}}},
             'cannot be made with policy_kwargs={"speed": 1}: ',
         ),
+        ({"hyperparameters": {"policy_kwargs": {"speed": 1}}}, "have no 'speed'; they have width"),
         (
             {"hyperparameters": {"policy_kwargs": {"heads": -1}}},
-            'cannot be made with policy_kwargs={"heads": -1}: ',
+            "heads in policy_kwargs of viatd3 must be a whole number, 1 or more, or null, got -1",
         ),
         (
             {"algo": "sac", "hyperparameters": {"policy_kwargs": {"net_arch": [-3]}}},
