@@ -45,11 +45,11 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> Interval:
         Sci. 16.
 
     Raises:
-        ValueError: Not 0 <= successes <= trials, or not 0 < confidence < 1.
+        ValueError: Not whole numbers with 0 <= successes <= trials, or not 0 < confidence < 1.
     """
     _check_confidence(confidence)
-    if not 0 <= successes <= trials:
-        raise ValueError(f"successes must lie between 0 and trials, got {successes} of {trials}")
+    if not (0 <= successes <= trials < math.inf and successes % 1 == trials % 1 == 0):
+        raise ValueError(f"successes must lie between 0 and trials and be whole, got {successes} of {trials}")
     if trials == 0:
         return Interval(math.nan, 0.0, 1.0)
     z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
@@ -72,11 +72,11 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
     Source: McNemar 1947, Psychometrika 12, 153-157, in its exact form.
 
     Args:
-        first: Successes, shape (N,).
+        first: Successes, true or false, or 0 and 1, shape (N,).
         second: Successes, shape (N,), in the same scenes.
 
     Raises:
-        ValueError: The shapes differ or there are no scenes.
+        ValueError: The shapes differ, there are no scenes, or something else is among the successes.
     """
     a, b = _paired(first, second)
     only_first, only_second = int((a & ~b).sum()), int((b & ~a).sum())
@@ -111,9 +111,10 @@ def paired_bootstrap(
         samples: Number of draws.
 
     Raises:
-        ValueError: The shapes differ or there are no scenes.
+        ValueError: The shapes differ, there are no scenes, or a score is no number.
     """
-    a, b = (np.asarray(each, dtype=np.float64) for each in (first, second))
+    _check_draws(confidence, samples)
+    a, b = _scores(first), _scores(second)
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise ValueError(f"both must have the same shape (N,), N > 0, got {a.shape} and {b.shape}")
     difference = a - b
@@ -128,9 +129,9 @@ def interquartile_mean(scores: ArrayLike) -> float:
     Learning at the Edge of the Statistical Precipice, arXiv 2108.13264, section 4.3.
 
     Raises:
-        ValueError: There are no scores.
+        ValueError: There are no scores, or one is no number.
     """
-    ordered = np.sort(np.asarray(scores, dtype=np.float64), axis=None)
+    ordered = np.sort(_scores(scores), axis=None)
     if not ordered.size:
         raise ValueError("scores must not be empty")
     cut = ordered.size // 4
@@ -157,9 +158,10 @@ def stratified_bootstrap(
         samples: Number of draws.
 
     Raises:
-        ValueError: The scores have another shape.
+        ValueError: The scores have another shape, or one is no number.
     """
-    table = np.asarray(scores, dtype=np.float64)
+    _check_draws(confidence, samples)
+    table = _scores(scores)
     if table.ndim != 2 or not table.size:
         raise ValueError(f"scores must have shape (seeds, tasks), got {table.shape}")
     seeds, tasks = table.shape
@@ -199,9 +201,10 @@ def across_seeds(
         samples: Number of draws.
 
     Raises:
-        ValueError: The scores or the strata have another shape.
+        ValueError: The scores or the strata have another shape, or a score is no number.
     """
-    table, groups = np.asarray(scores, dtype=np.float64), np.asarray(strata)
+    _check_draws(confidence, samples)
+    table, groups = _scores(scores), np.asarray(strata)
     if table.ndim != 2 or not table.size:
         raise ValueError(f"scores must have shape (seeds, scenes), got {table.shape}")
     if groups.shape != table.shape[1:]:
@@ -210,8 +213,9 @@ def across_seeds(
     if (table == table[0, 0]).all() and table[0, 0] in (0.0, 1.0):
         return wilson(int(table[0].sum()), scenes, confidence)
     times_drawn = np.zeros((scenes, samples))
-    for group in np.unique(groups):
-        rows = np.flatnonzero(groups == group)
+    group = np.unique(groups, return_inverse=True)[1]
+    for each in range(group.max() + 1):
+        rows = np.flatnonzero(group == each)
         times_drawn[rows] = generator.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), samples).T
     means = table @ times_drawn / scenes
     chosen = generator.integers(seeds, size=(seeds, samples))
@@ -231,8 +235,8 @@ def probability_of_improvement(
 
         P(X > Y) = mean over tasks of 1/(N M) sum_ij (1[x_i > y_j] + 1/2 1[x_i = y_j])
 
-    With a percentile interval, each task's runs drawn separately. Source: Agarwal et al. 2021, arXiv 2108.13264,
-    section 4.3; for one task it is Mann and Whitney's U / (N M).
+    With a percentile interval, each task's runs drawn separately. Source: Agarwal et al. 2021, arXiv 2108.13264, 4.3;
+    for one task it is Mann and Whitney's U / (N M).
 
     Args:
         first: Scores, shape (N, tasks).
@@ -242,9 +246,10 @@ def probability_of_improvement(
         samples: Number of draws.
 
     Raises:
-        ValueError: The scores have other shapes.
+        ValueError: The scores have other shapes, or one is no number.
     """
-    x, y = (np.asarray(each, dtype=np.float64) for each in (first, second))
+    _check_draws(confidence, samples)
+    x, y = _scores(first), _scores(second)
     if x.ndim != 2 or y.ndim != 2 or x.shape[1] != y.shape[1] or not x.size or not y.size:
         raise ValueError(f"both must have shape (seeds, tasks) with equal tasks, got {x.shape} and {y.shape}")
     tasks = np.arange(x.shape[1])
@@ -269,33 +274,45 @@ def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken:
 
     Args:
         success: S, shape (N,).
-        shortest: l, shape (N,), more than 0, [m].
+        shortest: l, shape (N,), more than 0 and finite, [m].
         taken: p, shape (N,), [m].
 
     Raises:
-        ValueError: A shortest length is not positive, or the shapes differ.
+        ValueError: A shortest length is not positive, the shapes differ, or something is no number.
     """
-    s, shortest, taken = (np.asarray(each, dtype=np.float64) for each in (success, shortest, taken))
+    s, shortest, taken = (_scores(each) for each in (success, shortest, taken))
     if not s.shape == shortest.shape == taken.shape or not s.size:
-        raise ValueError(
-            f"all must have the same shape (N,), N > 0, got {s.shape}, {shortest.shape}, {taken.shape}"
-        )
-    if not (shortest > 0.0).all():
-        raise ValueError(f"shortest must be more than 0, got {shortest.min()}")
+        shapes = [each.shape for each in (s, shortest, taken)]
+        raise ValueError(f"all must have the same shape (N,), N > 0, got {shapes}")
+    if not ((shortest > 0.0) & np.isfinite(shortest)).all():
+        raise ValueError(f"shortest must be more than 0 and finite, got {shortest.min()} to {shortest.max()}")
     return float((s * shortest / np.maximum(taken, shortest)).mean())
 
 
 def _paired(first: ArrayLike, second: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    a, b = (np.asarray(each, dtype=bool) for each in (first, second))
+    a, b = np.asarray(first), np.asarray(second)
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise ValueError(f"both must have the same shape (N,), N > 0, got {a.shape} and {b.shape}")
-    return a, b
+    if not np.isin((a, b), (0, 1)).all():
+        raise ValueError(f"successes must be 0 or 1, got {np.setdiff1d((a, b), (0, 1))[0]}")
+    return a.astype(bool), b.astype(bool)
+
+
+def _scores(values: ArrayLike) -> Float:
+    if np.isnan(scores := np.asarray(values, dtype=np.float64)).any():
+        raise ValueError(f"scores and lengths must be numbers, got nan in an array of shape {scores.shape}")
+    return scores
 
 
 def _percentile(estimate: float, draws: Float, confidence: float) -> Interval:
-    _check_confidence(confidence)
     low, high = np.quantile(draws, (0.5 - confidence / 2.0, 0.5 + confidence / 2.0))
     return Interval(estimate, float(low), float(high))
+
+
+def _check_draws(confidence: float, samples: int) -> None:
+    _check_confidence(confidence)
+    if samples % 1 or samples < 1:
+        raise ValueError(f"samples must be a whole number, 1 or more, got {samples!r}")
 
 
 def _check_confidence(confidence: float) -> None:

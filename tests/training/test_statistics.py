@@ -179,3 +179,43 @@ def test_spl_by_its_formula():
 def test_wrong_shapes_are_refused(call):
     with pytest.raises(ValueError, match="must"):
         call()
+
+
+def draws():
+    """Every statistic that draws, as a call on scores."""
+    generator = np.random.default_rng(0)
+    return (
+        lambda scores, **kwargs: statistics.paired_bootstrap(
+            scores, np.zeros_like(scores), generator, **kwargs
+        ),
+        lambda scores, **kwargs: statistics.stratified_bootstrap([scores], generator, **kwargs),
+        lambda scores, **kwargs: statistics.across_seeds(
+            [scores], np.zeros(len(scores)), generator, **kwargs
+        ),
+        lambda scores, **kwargs: statistics.probability_of_improvement(
+            [scores], [scores], generator, **kwargs
+        ),
+    )
+
+
+@pytest.mark.parametrize("call", draws())
+def test_no_number_makes_no_result(call):
+    with pytest.raises(ValueError, match="must be numbers, got nan"):
+        call([0.5, math.nan])
+    for samples in (0, -1, 1.5):
+        with pytest.raises(ValueError, match="samples must be a whole number, 1 or more"):
+            call([0.5, 1.0], samples=samples)
+    with pytest.raises(ValueError, match="confidence must lie between 0 and 1"):
+        call([0.5, 1.0], confidence=1.0)
+
+
+def test_successes_are_told_from_other_numbers():
+    with pytest.raises(ValueError, match=r"successes must be 0 or 1, got 0\.5"):
+        statistics.mcnemar([0.5, 1.0], [0.0, 1.0])
+    with pytest.raises(ValueError, match="successes must be 0 or 1, got nan"):
+        statistics.mcnemar([0.0, 1.0], [math.nan, 1.0])
+    assert statistics.mcnemar([0.0, 1.0], [0.0, 0.0]) == statistics.mcnemar([False, True], [False, False])
+    with pytest.raises(ValueError, match="got nan"):
+        statistics.interquartile_mean([math.nan])
+    with pytest.raises(ValueError, match="shortest must be more than 0 and finite"):
+        statistics.success_weighted_path_length([1.0], [math.inf], [1.0])
