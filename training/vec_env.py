@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
@@ -81,9 +82,9 @@ class ViaVecEnv(VecEnv):
     def reset(self) -> Observation:
         """Start new episodes everywhere."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        observation, _ = self.venv.reset(seed=seeds, options=self._batched_options)
+        options, self._batched_options = self._batched_options, None  # refused ones must not be met again
+        observation, _ = self.venv.reset(seed=seeds, options=options)
         self._reset_seeds()
-        self._batched_options = None
         self._returns[:], self._lengths[:] = 0.0, 0
         started: Observation = observation
         return started
@@ -187,8 +188,11 @@ class ViaVecEnv(VecEnv):
         return [answer] * len(self._rows(indices))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Never: a native vector environment has no wrappers for single copies."""
-        return [False] * len(self._rows(indices))
+        """Whether the copies do what a wrapper would: infos tell of episodes as SB3's `Monitor` has them do.
+
+        They have no other wrappers: the vector environment is a native one.
+        """
+        return [wrapper_class is Monitor] * len(self._rows(indices))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Rendered frames, one for each copy."""
@@ -197,7 +201,10 @@ class ViaVecEnv(VecEnv):
 
     def _rows(self, indices: Any) -> list[int]:
         chosen: Iterable[int] = self._get_indices(indices)
-        return list(chosen)
+        rows = list(chosen)
+        if any(not -self.num_envs <= row < self.num_envs for row in rows):
+            raise IndexError(f"indices must be of {self.num_envs} copies, got {indices!r}")
+        return rows
 
 
 def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:

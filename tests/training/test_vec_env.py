@@ -4,6 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from stable_baselines3 import SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
 from viapoint.training.vec_env import ViaVecEnv
 
@@ -200,3 +203,34 @@ def test_a_restored_state_goes_on_alike(env):
             np.testing.assert_array_equal(mine[0][name], part)
     assert other.physics_steps == env.physics_steps
     other.close()
+
+
+def test_refused_options_are_not_met_again_and_the_seed_still_counts(env):
+    expected = env.reset()
+    env.seed(3)
+    env.set_options({"goal": np.array([5.0, 5.0])})
+    with pytest.raises(ValueError, match="out of the arm's reach"):
+        env.reset()
+    for name, part in env.reset().items():
+        np.testing.assert_array_equal(part, expected[name])
+
+
+def test_copies_that_there_are_not_have_no_attributes(env):
+    assert env.get_attr("num_envs", [-1, 5]) == [6, 6]
+    for call in (
+        lambda: env.get_attr("num_envs", 6),
+        lambda: env.env_method("__str__", indices=[0, -7]),
+        lambda: env.env_is_wrapped(Monitor, indices=[9]),
+    ):
+        with pytest.raises(IndexError, match="indices must be of 6 copies"):
+            call()
+
+
+def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
+    """So SB3 takes returns and lengths from the infos, and does not ask for a wrapper."""
+    assert env.env_is_wrapped(Monitor) == [True] * 6
+    model = SAC("MultiInputPolicy", env, buffer_size=10)
+    rewards, lengths = evaluate_policy(model, env, n_eval_episodes=12, return_episode_rewards=True)
+    assert not [each for each in recwarn if "Monitor" in str(each.message)]
+    assert lengths == [1] * 12
+    assert len(set(rewards)) == 12
