@@ -130,8 +130,14 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
 
 
 def _unboxed(text: str) -> str:
-    """The words in tyro's boxes, without the frame, its title and its rules."""
+    """The words in tyro's boxes, without the frame, its title and its rules.
+
+    Where the output knows only ASCII, there is no frame, and a rule follows the title.
+    """
     lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
+    if "╭" not in text:
+        rule = next((i for i, line in enumerate(lines) if line and not line.strip("-")), -1)
+        lines = lines[rule + 1 :]
     return " ".join(line for line in lines if line.strip("-")) or text
 
 

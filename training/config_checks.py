@@ -37,6 +37,8 @@ def check_env(env: str) -> None:
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
     """Refuse arguments that are given elsewhere; the others are checked by the environment."""
+    if not isinstance(kwargs, Mapping):
+        raise ValueError(f"env_kwargs must be values by name, got {kwargs!r}")
     for name in kwargs:
         if name in ELSEWHERE:
             raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
@@ -70,12 +72,14 @@ def check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) 
 
 
 def check_methods(methods: tuple[str, ...]) -> None:
-    """Refuse none, and names that there are not."""
+    """Refuse none, names that there are not, and one that is there twice, as a table has one row for each."""
     if not methods:
         raise ValueError("methods must name at least one method")
     for name in methods:
         if name not in METHODS:
             raise ValueError(f"methods must be some of {', '.join(METHODS)}, got {name!r}")
+        if methods.count(name) > 1:
+            raise ValueError(f"methods must differ, {name} is there twice")
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:

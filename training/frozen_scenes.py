@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -122,13 +123,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         )
     if not path.is_file():
         raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            kind = ChangingScenes if "jumps" in archive else Scenes
-            names = (*kind._fields, *MEASURED, "env_id", "sha256", "family", "number")
-            content = {name: archive[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
-        raise ValueError(f"{path} is not a file of scenes: {error}") from None
+    kind, content = _read(path)
     frozen = FrozenScenes(
         name=str(name_or_path),
         env_id=str(content["env_id"]),
@@ -143,3 +138,41 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
     if frozen.env_id != env_id:
         raise ValueError(f"{path} holds scenes for {frozen.env_id}, not for {env_id}")
     return frozen
+
+
+def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """Which kind of scenes a file holds, and its arrays, whose shapes fit together.
+
+    Raises:
+        ValueError: It is no such file.
+    """
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise ValueError("it is no archive of arrays, or a part of one")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                kind: Any = ChangingScenes if "jumps" in archive else Scenes
+                names = (*kind._fields, *MEASURED, "env_id", "sha256", "family", "number")
+                content = {name: archive[name] for name in names}
+        _check_content(kind, content)
+    except Exception as error:  # an archive can be broken in any of its layers
+        raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
+    return kind, content
+
+
+def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
+    """Refuse arrays that are not of N scenes in the same D dimensions, N > 0."""
+    number, d = content["start"].shape if content["start"].ndim == 2 else (0, 0)
+    obstacles = content["obstacles"].shape[1:2]
+    wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("start", "goal"), (number, d))
+    wanted |= dict.fromkeys(("obstacles", "courses"), (number, *obstacles, 2 * d + 1))
+    wanted |= {"jumps": (number, *content.get("jumps", content["goal"]).shape[1:2], d + 1)}
+    wanted |= dict.fromkeys(("share", "family", "number"), (number,))
+    wanted |= {"solution": (number, *content["solution"].shape[1:2])}
+    for name in (*kind._fields, *MEASURED, "family", "number"):
+        shape, numbers = content[name].shape, content[name].dtype.kind in "fi"
+        if shape != wanted[name] or not number or numbers is (name == "family"):
+            raise ValueError(f"{name} of {number} scenes is {content[name].dtype} of shape {shape}")
+    if not (np.isnan(content["share"]) | ((content["share"] >= 0.0) & (content["share"] <= 1.0))).all():
+        raise ValueError("a solution share is not between 0 and 1")

@@ -1,5 +1,6 @@
 """The command, from the words to the files."""
 
+import io
 import json
 import shlex
 
@@ -76,6 +77,12 @@ def test_help_is_short_and_has_an_example(words, capsys):
         (f"evaluate --env {ENV} --methods straight --json /", "json must be a file"),
         (f"play --pretrained {REACH} --video film.gif", "video must end in .mp4, got film.gif"),
         ("paper --out /etc/passwd", "out /etc/passwd cannot be written"),
+        ("paper --agent nowhere", "nowhere: is no run folder"),
+        (
+            'train --hyperparameters policy_kwargs={"kept":0}',
+            "kept in policy_kwargs of viatd3 must be a whole",
+        ),
+        (f"evaluate --env {ENV} --methods straight random straight", "straight is there twice"),
         ("evaluate --pretrained viapoint/Nothing-v0", "no pretrained agent for 'viapoint/Nothing-v0'"),
         (f"evaluate --methods magic --env {ENV} --scenes test", "magic"),
         (f"evaluate --methods straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
@@ -86,6 +93,13 @@ def test_help_is_short_and_has_an_example(words, capsys):
 )
 def test_an_error_is_one_line_that_names_the_offender(words, named, capsys, shipped):
     assert named in failed(capsys, *words.split())
+
+
+def test_an_error_is_the_same_where_the_output_knows_ascii_only(capsys, monkeypatch):
+    framed = failed(capsys, "train", "--seed", "-1")
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
+    assert failed(capsys, "train", "--seed", "-1") == framed
+    assert framed.startswith("viapoint: Error parsing TrainConfig: seed must be")
 
 
 def test_unexpected_errors_say_their_kind_and_debug_shows_them(capsys, monkeypatch):

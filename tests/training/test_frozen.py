@@ -1,5 +1,6 @@
 """Frozen scenes are what their files say, planners certify them, and difficulty is measured right."""
 
+import contextlib
 import dataclasses
 import re
 from pathlib import Path
@@ -200,9 +201,52 @@ def test_what_is_no_set_is_refused(tmp_path):
         load("tests", ENV_ID)
     with pytest.raises(ValueError, match="for viapoint/PlanarObstacles-v0, not for viapoint/PlanarReach-v0"):
         load(shipped_path("test", ENV_ID), "viapoint/PlanarReach-v0")
-    (tmp_path / "text.npz").write_text("no archive")
-    with pytest.raises(ValueError, match="not a file of scenes"):
-        load(tmp_path / "text.npz", ENV_ID)
+
+
+def test_a_file_that_is_broken_in_any_way_is_refused_with_its_name(frozen, tmp_path):
+    path = tmp_path / "broken"
+    frozen.take(slice(0, 5)).save(tmp_path / "whole.npz")
+    whole = (tmp_path / "whole.npz").read_bytes()
+    flipped = [
+        whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :] for at in range(30, len(whole) - 30, 67)
+    ]
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    one = (tmp_path / "one.npy").read_bytes()
+    for content in (b"", b"no archive", b"PK", whole[: len(whole) // 2], one):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"broken is not a file of scenes: .*no archive of arrays"):
+            load(path, ENV_ID)
+    for content in flipped:
+        path.write_bytes(content)
+        with contextlib.suppress(ValueError):  # a bit may lie where nothing is read
+            load(path, ENV_ID)
+
+
+@pytest.mark.parametrize(
+    ("name", "forge"),
+    [
+        ("share", lambda share: share[:3]),
+        ("share", lambda share: share[0]),
+        ("share", lambda share: share * 9.0),
+        ("start", lambda start: start[:, :1]),
+        ("start", lambda start: start.astype(str)),
+        ("goal", lambda goal: goal.astype(complex)),
+        ("obstacles", lambda rows: rows[..., :4]),
+        ("obstacles", lambda rows: rows[:0]),
+        ("solution", lambda solution: solution[:2]),
+        ("family", lambda family: np.arange(len(family))),
+        ("number", lambda number: number[:1]),
+        ("number", lambda number: np.array([None] * len(number))),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused_whatever_their_hash(frozen, tmp_path, name, forge):
+    path = tmp_path / "forged.npz"
+    frozen.take(slice(0, 5)).save(path)
+    with np.load(path) as archive:
+        content = dict(archive)
+    np.savez(path, **{**content, name: forge(content[name])})
+    with pytest.raises(ValueError, match="is not a file of scenes"):
+        load(path, ENV_ID)
 
 
 @pytest.mark.parametrize("name", ["straight", "random", "random16"])
