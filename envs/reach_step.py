@@ -150,6 +150,16 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         waypoints = np.stack((self.scenes.start, self.scenes.goal), axis=-2)
         return Plan(waypoints, np.full((self.num_envs, 1), self.observation_layout.time_limit))
 
+    def perform(self, plan: Plan) -> Decision:
+        """Refuse plans: here the hand is steered in every control step.
+
+        Raises:
+            TypeError: Always; the twin whose actions are whole movements carries them out.
+        """
+        raise TypeError(
+            "plans are carried out by the twin of this environment whose actions are whole movements"
+        )
+
     def decide(self, actions: Any) -> Decision:
         """Move for one control step in each environment, without a reset.
 

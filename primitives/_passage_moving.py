@@ -33,10 +33,10 @@ _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {
 }
 """(goal velocity FREE, goal acceleration FREE) -> q and the coefficients of g."""
 
-_DOUBT = 1e-12
+_DOUBT = 1e-13
 """Estimated relative error of the shorter fraction above which a movement is looked at from both ends."""
 
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-13
 """Relative difference above which that result counts."""
 
 _NEAR = 1e-6

@@ -26,6 +26,8 @@ ELSEWHERE = {
     "wrappers": "the environments are trained on as they are",
 }
 """What is no argument of a training's environment, and what is instead."""
+GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
+"""Of what has a limit: seeds as NumPy's old generator takes them, environments as many as may fit into memory."""
 
 
 def check_env(env: str) -> None:
@@ -58,9 +60,12 @@ def check_has_scenes(env: str) -> None:
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
-    """Refuse anything but whole numbers from `least` on."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+    """Refuse anything but whole numbers from `least` to the greatest that makes sense."""
+    most = GREATEST.get(name)
+    known = isinstance(value, int) and not isinstance(value, bool)
+    if not known or value < least or (most is not None and value > most):
+        allowed = f"{least} or more" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
 
 
 def check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) -> None:

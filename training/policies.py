@@ -146,6 +146,11 @@ class ViaPolicy(TD3Policy):
             )
         self.__dict__.update(actor_target=self.actor, critic_target=self.critic)  # not modules of their own
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What :meth:`save` keeps besides the weights."""
+        ours = {"task": self.task.as_dict(), **self._both, **self._rounds, "candidates": self.candidates}
+        return {**super()._get_constructor_parameters(), **ours}
+
     def make_actor(self, features_extractor: Any = None) -> Any:
         """An actor for the task."""
         spaces_: Any = (self.observation_space, self.action_space)
@@ -158,12 +163,28 @@ class ViaPolicy(TD3Policy):
         return ViaCritic(*spaces_, task=self.task, **self._both).to(self.device)
 
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """As its base class; in machine code where there is some."""
+        """As its base class; in machine code where there is some.
+
+        Raises:
+            ValueError: The observation is not a dict with the parts of the observation space.
+        """
         compiled = self._compiled.get(self.candidates)
-        action = compiled(observation) if compiled is not None and isinstance(observation, dict) else None
-        if action is None:
-            return super().predict(observation, state, *args, **kwargs)
-        return action, state
+        if not isinstance(observation, tuple):  # of which the base class says more
+            self._check_parts(observation)
+            action = None if compiled is None else compiled(observation)
+            if action is not None:
+                return action, state
+        return super().predict(observation, state, *args, **kwargs)
+
+    def _check_parts(self, observation: Any) -> None:
+        space: Any = self.observation_space
+        wanted = ", ".join(space.spaces)
+        if not isinstance(observation, dict):
+            raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
+        if observation.keys() != space.spaces.keys():
+            raise ValueError(
+                f"observation must have the parts {wanted}; got {', '.join(map(str, observation))}"
+            )
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         return self.decide(observation, self.candidates)

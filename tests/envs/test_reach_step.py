@@ -247,6 +247,14 @@ def test_pictures_show_the_movement_so_far():
     env.close()
 
 
+def test_plans_are_for_the_twin():
+    envs = gym.make_vec(STEP, num_envs=2).unwrapped
+    envs.reset(seed=0)
+    with pytest.raises(TypeError, match="carried out by the twin"):
+        envs.perform(envs.last_plan)
+    envs.close()
+
+
 def test_weights_are_checked():
     with pytest.raises(ValueError, match=r"knows .*progress, not 'speed'"):
         gym.make(STEP, reward_weights={"speed": 1.0})

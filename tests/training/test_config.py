@@ -78,6 +78,8 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"hyperparameters": 5}, "hyperparameters must be values by name, got 5"),
         (EvaluateConfig, {"methods": ("agent", "agent"), "pretrained": "x"}, "agent is there twice"),
         (TrainConfig, {"n_envs": True}, "n_envs"),
+        (TrainConfig, {"n_envs": 10**9}, "n_envs must be a whole number, from 1 to 65536"),
+        (TrainConfig, {"seed": 2**32}, "seed must be a whole number, from 0 to 4294967295"),
         (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
         (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viatd3 decides on whole movements"),
         (
