@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch._inductor import aoti_compile_and_package, aoti_load_package
 
 from viapoint.training import graphs, sight
-from viapoint.training.lowering import lowered, settings
+from viapoint.training.lowering import SETTINGS, lowered
 from viapoint.training.sight import Observation
 
 if TYPE_CHECKING:
@@ -108,8 +108,7 @@ def _translated(decision: _Decision) -> Any:
         decision(*example)  # constants must be there before a graph is drawn: within one they are no numbers
         graph = lowered(torch.export.export(decision, example))
         file = str(Path(folder.name) / "decision.pt2")
-        chosen = settings(postures=decision.policy.task.whole_arm)
-        path = aoti_compile_and_package(graph, package_path=file, inductor_configs=chosen)
+        path = aoti_compile_and_package(graph, package_path=file, inductor_configs=SETTINGS)
         return aoti_load_package(path).loader.boxed_run
 
 

@@ -19,14 +19,11 @@ TERMS = 24
 """Most of them in one number of a product or a running sum that is written out term by term."""
 OUTPUTS = 512
 """Most numbers of a layer's output that are summed up one by one."""
-
-
-def settings(*, postures: bool) -> dict[str, Any]:
-    """Of the compiler: parts of an array are computed where they are needed instead of put together in memory.
-
-    Where postures are looked at they are put together: every end of a link takes all of its posture's angles.
-    """
-    return {"cpp.threads": 1, "force_pointwise_cat": not postures}
+SETTINGS = {
+    "cpp.threads": 1,
+    "force_pointwise_cat": True,  # parts are computed where they are needed instead of put together in memory
+}
+"""Of the compiler."""
 
 
 def lowered(program: ExportedProgram) -> ExportedProgram:

@@ -261,5 +261,6 @@ def _clearance(hand: Array, others: _Others, task: Task) -> Array:
     arm, (rows, present, drift) = task.arm, others
     if not task.whole_arm:
         return clearance_profile(hand, arm.hand_radius, rows, present, drift=drift)
-    links = arm.links(arm.posture(hand))
+    quick = getattr(arm, "links_at", None)
+    links = arm.links(arm.posture(hand)) if quick is None else quick(hand)
     return clearance_profile(hand, arm.hand_radius, rows, present, links, arm.link_radii, drift)

@@ -55,6 +55,13 @@ def test_kinematics_agree_with_mujoco(arm):
             np.testing.assert_allclose(traced[1:], arm.links(joints).reshape(-1, 3), atol=1e-12)
 
 
+@pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
+def test_links_are_known_without_angles(library):
+    """Beyond the reach, too, where the arm points at the place."""
+    hand = library(np.random.default_rng(0).uniform(-0.9, 0.9, (50, 8, 2)))
+    np.testing.assert_allclose(ADULT.links_at(hand), ADULT.links(ADULT.posture(hand)), atol=1e-14)
+
+
 def test_links_hang_together_and_have_their_lengths():
     arm = ADULT
     links = arm.links(postures(arm))
