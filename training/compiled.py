@@ -6,8 +6,6 @@ So the whole decision is drawn as a graph for one scene, and torch's compiler ma
 
 from __future__ import annotations
 
-import tempfile
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch._inductor import aoti_compile_and_package, aoti_load_package
 
-from viapoint.training import graphs, sight
-from viapoint.training.lowering import SETTINGS, lowered
+from viapoint.training import sight
+from viapoint.training.machine_code import digest, machine_code
 from viapoint.training.sight import Observation
 
 if TYPE_CHECKING:
@@ -35,12 +32,14 @@ class CompiledDecision:
     Args:
         policy: Whose.
         candidates: How many movements its critic ranks; 0 takes the actor's own choice.
+        keep: Folder where machine code is looked for, and kept.
 
     Raises:
         CannotCompileError: There is no compiler, or the decision searches depending on what it finds.
+        ValueError: What is kept cannot be loaded.
     """
 
-    def __init__(self, policy: ViaPolicy, candidates: int) -> None:
+    def __init__(self, policy: ViaPolicy, candidates: int, keep: Path | None = None) -> None:
         space: Any = policy.observation_space
         if "obstacles" in space.spaces and sight.among_links(policy.task):
             raise CannotCompileError(
@@ -51,12 +50,14 @@ class CompiledDecision:
             raise CannotCompileError(
                 f"decisions are compiled for the cpu only, the agent is on {policy.device}"
             )
-        require_compiler()
         decision = _Decision(policy, candidates)
+        kept = None if keep is None else keep / f"{decision.digest()}.pt2"
+        if kept is None or not kept.is_file():
+            require_compiler()
         self._shapes = {name: box.shape for name, box in decision.boxes.items()}
         self._weights = [*policy.parameters()]
         self._versions = self._now()
-        self._run = _translated(decision)
+        self._run = machine_code(decision, decision.example(), kept)
 
     def __call__(self, observation: Observation) -> NDArray[np.float32] | None:
         """The action as `predict` returns it, or None where it must be decided otherwise.
@@ -93,23 +94,18 @@ class _Decision(nn.Module):
         action = self.policy.decide(dict(zip(self.boxes, parts, strict=True)), self.candidates)
         return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
 
+    def digest(self) -> str:
+        """What it depends on as one word."""
+        task, settings = self.policy.task.as_dict(), self.policy.settings
+        return digest(
+            repr((task, settings, self.boxes, self.low, self.high, self.candidates)), self.policy.state_dict()
+        )
+
     def example(self) -> tuple[Tensor, ...]:
         """Some observation of one scene."""
         generator = np.random.default_rng(0)
         drawn = (generator.uniform(box.low, box.high) for box in self.boxes.values())
         return tuple(torch.tensor(part[None], dtype=torch.float32) for part in drawn)
-
-
-def _translated(decision: _Decision) -> Any:
-    """Machine code on one thread, as a function from a list of the same arguments to a list of the action."""
-    example, folder = decision.example(), tempfile.TemporaryDirectory(prefix="viapoint-")
-    with torch.no_grad(), graphs.drawn(), warnings.catch_warnings(), folder:
-        warnings.simplefilter("ignore")  # of torch's own parts about each other
-        decision(*example)  # constants must be there before a graph is drawn: within one they are no numbers
-        graph = lowered(torch.export.export(decision, example))
-        file = str(Path(folder.name) / "decision.pt2")
-        path = aoti_compile_and_package(graph, package_path=file, inductor_configs=SETTINGS)
-        return aoti_load_package(path).loader.boxed_run
 
 
 def require_compiler() -> None:

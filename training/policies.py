@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -148,14 +149,18 @@ class ViaPolicy(TD3Policy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         """What :meth:`save` keeps besides the weights."""
-        ours = {"task": self.task.as_dict(), **self._both, **self._rounds, "candidates": self.candidates}
+        ours = {"task": self.task.as_dict(), **self.settings, "candidates": self.candidates}
         return {**super()._get_constructor_parameters(), **ours}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Of both networks."""
+        return {**self._both, **self._rounds}
 
     def make_actor(self, features_extractor: Any = None) -> Any:
         """An actor for the task."""
         spaces_: Any = (self.observation_space, self.action_space)
-        settings = {**self._both, **self._rounds}
-        return ViaActor(*spaces_, task=self.task, **settings).to(self.device)
+        return ViaActor(*spaces_, task=self.task, **self.settings).to(self.device)
 
     def make_critic(self, features_extractor: Any = None) -> Any:
         """A critic for the task."""
@@ -193,22 +198,25 @@ class ViaPolicy(TD3Policy):
         """The actor's own choice, or of so many candidates the critic's, shape (B, m)."""
         return self.ranked(observation, candidates) if candidates else cast(Tensor, self.actor(observation))
 
-    def compile_decisions(self, candidates: int = 0) -> None:
-        """Let machine code decide in single scenes from now on: the same decisions, several times faster.
+    def compile_decisions(self, candidates: int = 0, keep: str | Path | None = None) -> None:
+        """Let machine code decide in single scenes from now on: the same decisions, ten times faster.
 
-        That takes a minute or two and a C++ compiler, once in each process. It is for as many candidates as are said
-        here; decisions with other numbers of them, in many scenes at once, and with weights that were changed
-        afterwards are made as before. Nothing of it is saved.
+        That takes a minute or two and a C++ compiler, once in each process, or once at all where it is kept. It is
+        for as many candidates as are said here; decisions with other numbers of them, in many scenes at once, and
+        with weights that were changed afterwards are made as before. It is not saved with the model.
 
         Args:
             candidates: As :attr:`candidates` will be.
+            keep: Folder in which the next process finds the machine code, if its agent, program and processor are the
+                same. It is loaded as a program is: only from a folder that nobody else writes to.
 
         Raises:
             CannotCompileError: There is no compiler, or the task does not allow it.
+            ValueError: What is kept cannot be loaded.
         """
         from viapoint.training.compiled import CompiledDecision
 
-        self._compiled[candidates] = CompiledDecision(self, candidates)
+        self._compiled[candidates] = CompiledDecision(self, candidates, None if keep is None else Path(keep))
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies are without machine code."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training import cli, graphs
+from viapoint.training import cli, compiled, graphs
 from viapoint.training.commands import find_agent
 from viapoint.training.compiled import CannotCompileError, require_compiler
 from viapoint.training.features import foresee
@@ -79,14 +79,14 @@ def test_via_points_on_the_ends_are_no_trouble_in_a_graph():
 
 
 @needs_compiler
-def test_machine_code_decides_the_same_in_single_scenes_until_a_weight_changes():
+def test_machine_code_decides_the_same_in_single_scenes_until_a_weight_changes(tmp_path, monkeypatch):
     trained, observation = agent_and_scenes(PLANAR)
     torch.manual_seed(0)
     spaces, task = (trained.observation_space, trained.action_space), trained.policy.task
     policy = ViaPolicy(*spaces, lambda _: 1e-3, task=task.as_dict(), width=16, rounds=1, heads=4)
     torch.nn.init.normal_(policy.actor.step.weight, std=0.1)
     before = one_by_one(policy, observation)
-    policy.compile_decisions()
+    policy.compile_decisions(keep=tmp_path / "code")
     calls, made = [], policy._compiled[0]
     policy._compiled[0] = Counted(made, calls)
     np.testing.assert_allclose(one_by_one(policy, observation), before, atol=1e-5)
@@ -98,14 +98,29 @@ def test_machine_code_decides_the_same_in_single_scenes_until_a_weight_changes()
         policy.predict((alone, {}))
     np.testing.assert_allclose(one_by_one(copy.deepcopy(policy), observation), before, atol=1e-5)
     assert len(calls) == NUMBER + 1, "many scenes at once, and copies, are not its business"
+    again = copy.deepcopy(policy)
+    with monkeypatch.context() as without:
+        without.setattr(compiled, "require_compiler", no_compiler)
+        again.compile_decisions(keep=tmp_path / "code")
+        np.testing.assert_array_equal(again.predict(alone)[0], policy.predict(alone)[0])
+        with pytest.raises(CannotCompileError):
+            again.compile_decisions(candidates=3, keep=tmp_path / "code")
+    (kept,) = (tmp_path / "code").iterdir()
+    kept.write_bytes(kept.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="is no machine code that can be loaded; delete it"):
+        copy.deepcopy(policy).compile_decisions(keep=tmp_path / "code")
     with torch.no_grad():
         policy.actor.step.bias += 0.3
     assert np.abs(one_by_one(policy, observation) - before).max() > 0.05
-    assert len(calls) == NUMBER + 1
+    assert len(calls) == NUMBER + 2
     asked = torch.zeros((NUMBER, 1, task.action.size), requires_grad=True)
     scene = {name: torch.as_tensor(part) for name, part in observation.items()}
     foresee(scene, asked, task).vector().sum().backward()
     assert torch.isfinite(asked.grad).all(), "what a graph was drawn of still has gradients"
+
+
+def no_compiler():
+    raise CannotCompileError
 
 
 class Counted:
