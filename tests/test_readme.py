@@ -13,6 +13,8 @@ ROWS = {
     "agent, one forward pass (*policy alone*)": ("viatd3", "alone"),
     "agent, its critic ranks 80 candidates (*ranked candidates*)": ("viatd3", "ranked"),
     "SAC": ("sac", "alone"),
+    "TQC": ("tqc", "alone"),
+    "TD3": ("td3", "alone"),
     "PPO": ("ppo", "alone"),
     "best of 80 random actions, each simulated": ("random80", None),
     "motion planner from a library (OMPL's RRT-Connect, made smooth)": ("ompl", None),

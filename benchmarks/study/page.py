@@ -144,6 +144,11 @@ def _comparison(numbers: Numbers, name: str) -> str:
     middle, least, most = (100.0 * each for each in found["difference"])
     p = found["p_value"]
     shown = "p < 0.0001" if p < 1e-4 else f"p <= {p:.2g}"
+    if not (least or most):
+        return (
+            "The agent with ranked candidates, which simulates none, solves as many scenes as the best of 80 random "
+            "actions that were simulated."
+        )
     return (
         "Against the best of 80 random actions that were simulated, the agent with ranked candidates, which "
         f"simulates none, solves {middle:+.1f} points more scenes (median seed; {least:+.1f} to {most:+.1f}); exact "
