@@ -113,4 +113,4 @@ def places(trajectory: primitives.Trajectory, times: Tensor) -> Tensor:
     """As a trajectory gives them, for times within it; each component by itself in memory."""
     coefficients, starts, rates = trajectory.coefficients, trajectory.starts, trajectory.rates
     found: Tensor = evaluate(coefficients, starts, rates, times, (0,), None, xp)[0]
-    return found.mT.contiguous().mT
+    return torch.stack(found.unbind(-1)).movedim(0, -1)
