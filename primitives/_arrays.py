@@ -258,9 +258,8 @@ def unit_factors(xp: Namespace, array: Array) -> Array:
     """Powers of two (..., 1) that bring vectors (..., D) to a size of about 1: no square over- or underflows."""
     size = np.abs(to_numpy(array)).max(axis=-1, keepdims=True)
     largest = min(float(xp.finfo(array.dtype).max), sys.float_info.max)
-    limit = (
-        math.frexp(largest)[1] - 2
-    )  # powers of two up to this one, and their inverses, are of full precision
+    # Powers of two up to this one, and their inverses, are of full precision.
+    limit = math.frexp(largest)[1] - 2
     exponent = np.clip(np.frexp(size)[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
 

@@ -7,7 +7,7 @@ from collections.abc import Container
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs._arrays import clamp, namespace_of
+from viapoint.envs._arrays import clamp, last, namespace_of
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.task import Task
 from viapoint.training.features import Look, look_along, look_at
@@ -83,7 +83,7 @@ class Anchors:
             start[:, i, None, None] + sum(paths[j] * axes[:, j, i, None, None] for j in range(len(paths)))
             for i in range(len(paths))
         ]
-        return xp.moveaxis(xp.stack(parts, axis=0), 0, -1)
+        return last(xp.stack(parts))
 
     def actions(self, observation: Observation) -> Array:
         """In each of B scenes, shape (B, A, m), inside (-1, 1)."""

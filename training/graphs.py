@@ -11,13 +11,14 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import cast
 
 import array_api_compat.torch as xp
 import torch
 from torch import Tensor
 
 from viapoint import primitives
-from viapoint.envs._arrays import clamp
+from viapoint.envs._arrays import clamp, last
 from viapoint.envs.action import ActionLayout, Plan
 from viapoint.primitives._banded import States
 from viapoint.primitives._connecting import _coefficients
@@ -113,4 +114,4 @@ def places(trajectory: primitives.Trajectory, times: Tensor) -> Tensor:
     """As a trajectory gives them, for times within it; each component by itself in memory."""
     coefficients, starts, rates = trajectory.coefficients, trajectory.starts, trajectory.rates
     found: Tensor = evaluate(coefficients, starts, rates, times, (0,), None, xp)[0]
-    return torch.stack(found.unbind(-1)).movedim(0, -1)
+    return cast(Tensor, last(torch.stack(found.unbind(-1))))

@@ -119,10 +119,8 @@ class PlanarArm:
         """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
         xp = namespace_of(joints)
         upper, hand = joints[..., 0], self.hand(joints)
-        zero = xp.zeros_like(upper)
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
-        numbers = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
-        return last(xp.reshape(numbers, (2, 2, 2, *upper.shape)), 3)
+        return _ends(elbow, (hand[..., 0], hand[..., 1]))
 
     def links_at(self, hand: Array) -> Array:
         """What :meth:`links` gives for the :meth:`posture` at `hand`, but for rounding: quicker, as without angles."""
@@ -135,8 +133,7 @@ class PlanarArm:
             elbow[0] + ratio * (elbow[0] * cosine - elbow[1] * sine),
             elbow[1] + ratio * (elbow[1] * cosine + elbow[0] * sine),
         )
-        zero = xp.zeros_like(c1)
-        return last(xp.reshape(xp.stack((zero, zero, *elbow, *elbow, *reached)), (2, 2, 2, *zero.shape)), 3)
+        return _ends(elbow, reached)
 
     def posture(self, hand: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.posture`; out of reach, the elbow is as straight or bent as it goes."""
@@ -240,6 +237,13 @@ class PlanarArm:
         )
         elbow = coupling * accelerations[0] + c * accelerations[1] + coriolis * rates[0] ** 2
         return shoulder, elbow
+
+
+def _ends(elbow: tuple[Array, Array], hand: tuple[Array, Array]) -> Array:
+    """End points of the links' axes, shape (..., 2, 2, 2), the shoulder at the origin."""
+    xp = namespace_of(elbow[0])
+    zero = xp.zeros_like(elbow[0])
+    return last(xp.reshape(xp.stack((zero, zero, *elbow, *elbow, *hand)), (2, 2, 2, *zero.shape)), 3)
 
 
 def _pair(values: Any) -> tuple[float, float]:
