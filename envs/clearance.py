@@ -7,6 +7,9 @@ batched over leading dimensions and accept NumPy arrays and torch tensors.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
 from viapoint.envs._arrays import Array, clamp, namespace_of
 
 FAR = 1.0
@@ -74,13 +77,42 @@ def clearance_profile(
     Returns:
         Shape (..., n, T), [m].
     """
-    xp = namespace_of(hand)
     radii, shown = obstacles[..., :, None, -1], present[..., :, None]
     least = _clearance(point_distance_squared(hand, obstacles, drift), radii + hand_radius, shown)
-    for i, radius in enumerate(link_radii if links is not None else ()):
-        squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles, drift)
-        least = xp.minimum(least, _clearance(squared, radii + radius, shown))
-    return least
+    if links is None:
+        return least
+    pairs = [(links[..., i, 0, :], links[..., i, 1, :]) for i in range(len(link_radii))]
+    return namespace_of(hand).minimum(least, links_profile(pairs, link_radii, obstacles, present, drift))
+
+
+def links_profile(
+    links: Sequence[tuple[Array, Array]],
+    radii: tuple[float, ...],
+    obstacles: Array,
+    present: Array,
+    drift: Array = None,
+) -> Array:
+    """Clearance of the links alone, as :func:`clearance_profile` has it.
+
+    Args:
+        links: Both ends of the L links' axes, shape (..., T, D) each, [m].
+        radii: Of the links, [m].
+        obstacles: Shape (..., n, 2 D + 1), [m].
+        present: Whether a row is an obstacle, shape (..., n), bool.
+        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
+
+    Returns:
+        Shape (..., n, T), [m].
+    """
+    each = (
+        _clearance(
+            segment_distance_squared(first, second, obstacles, drift),
+            obstacles[..., :, None, -1] + radius,
+            present[..., :, None],
+        )
+        for (first, second), radius in zip(links, radii, strict=True)
+    )
+    return functools.reduce(namespace_of(obstacles).minimum, each)
 
 
 def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:

@@ -1,7 +1,7 @@
 """What a compiler is told of a graph beforehand: small sums are written out instead of asked of a library.
 
-A call of a library of linear algebra takes microseconds whatever it multiplies, and its arguments and results must be
-in memory. Written out, a small product is made together with what comes before and after it.
+A call of a library takes microseconds whatever it computes, and its arguments and results must be in memory. Written
+out, a small product is made together with what comes before and after it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ TERMS = 24
 """Most of them in one number of a product or a running sum that is written out term by term."""
 OUTPUTS = 512
 """Most numbers of a layer's output that are summed up one by one."""
+RANKED = 256
+"""Most numbers of which the greatest are found by comparing each with each."""
 SETTINGS = {
     "cpp.threads": 1,
     "force_pointwise_cat": True,  # parts are computed where they are needed instead of put together in memory
@@ -55,8 +57,23 @@ def _cumsum(values: Tensor, dim: int, dtype: torch.dtype | None = None) -> Any:
     return torch.stack(list(itertools.accumulate(values.unbind(dim), operator.add)), dim)
 
 
+def _topk(values: Tensor, k: int, dim: int = -1, largest: bool = True, *_: bool) -> Any:
+    """The rank of each number is how many are before it; none of them is sorted for that."""
+    number = values.shape[dim]
+    if number > RANKED or not largest or dim not in (-1, values.ndim - 1):
+        return NotImplemented
+    places = torch.arange(number, dtype=values.dtype)
+    mine, other = values[..., :, None], values[..., None, :]
+    before = (other > mine) | ((other == mine) & (places < places[:, None]))
+    rank = before.to(values.dtype).sum(-1)
+    chosen = rank[..., None, :] == torch.arange(k, dtype=values.dtype)[:, None]
+    indices = torch.where(chosen, places, 0.0).sum(-1).long()
+    return values.gather(-1, indices), indices
+
+
 _WRITTEN_OUT: dict[Any, Any] = {
     torch.ops.aten.linear.default: _linear,
     torch.ops.aten.matmul.default: _matmul,
     torch.ops.aten.cumsum.default: _cumsum,
+    torch.ops.aten.topk.default: _topk,
 }

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs._arrays import clamp, namespace_of
-from viapoint.envs.clearance import FAR, clearance_profile
+from viapoint.envs.clearance import FAR, clearance_profile, links_profile
 from viapoint.envs.observation import ObstacleRows
 from viapoint.envs.task import Task
 from viapoint.training.approaches import Approaches, Obstacles, approaches
@@ -262,5 +262,11 @@ def _clearance(hand: Array, others: _Others, task: Task) -> Array:
     if not task.whole_arm:
         return clearance_profile(hand, arm.hand_radius, rows, present, drift=drift)
     quick = getattr(arm, "links_at", None)
-    links = arm.links(arm.posture(hand)) if quick is None else quick(hand)
-    return clearance_profile(hand, arm.hand_radius, rows, present, links, arm.link_radii, drift)
+    if quick is None:
+        links = arm.links(arm.posture(hand))
+        return clearance_profile(hand, arm.hand_radius, rows, present, links, arm.link_radii, drift)
+    nearest = links_profile(quick(hand), arm.link_radii, rows, present, drift)
+    if arm.hand_radius <= arm.link_radii[-1]:  # it is inside the end of the last link
+        return nearest
+    alone = clearance_profile(hand, arm.hand_radius, rows, present, drift=drift)
+    return namespace_of(hand).minimum(nearest, alone)

@@ -122,18 +122,16 @@ class PlanarArm:
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
         return _ends(elbow, (hand[..., 0], hand[..., 1]))
 
-    def links_at(self, hand: Array) -> Array:
-        """What :meth:`links` gives for the :meth:`posture` at `hand`, but for rounding: quicker, as without angles."""
+    def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
+        """Both ends of each link in the :meth:`posture` at `hand`, shape (..., 2), [m]: quick, as without angles.
+
+        But for rounding they are those of :meth:`links`; out of reach, the forearm is drawn out to the hand.
+        """
         xp = namespace_of(hand)
-        (c1, s1), (cosine, sine) = self._directions(hand)
+        (c1, s1), _ = self._directions(hand)
         upper = self.lengths[0] / xp.sqrt(c1 * c1 + s1 * s1)
-        ratio = self.lengths[1] / self.lengths[0]
-        elbow = (c1 * upper, s1 * upper)
-        reached = (
-            elbow[0] + ratio * (elbow[0] * cosine - elbow[1] * sine),
-            elbow[1] + ratio * (elbow[1] * cosine + elbow[0] * sine),
-        )
-        return _ends(elbow, reached)
+        elbow = last(xp.stack((c1 * upper, s1 * upper)))
+        return (xp.zeros_like(elbow), elbow), (elbow, hand)
 
     def posture(self, hand: Array) -> Array:
         """See :meth:`viapoint.envs.arms.arm.Arm.posture`; out of reach, the elbow is as straight or bent as it goes."""

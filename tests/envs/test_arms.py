@@ -57,9 +57,17 @@ def test_kinematics_agree_with_mujoco(arm):
 
 @pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
 def test_links_are_known_without_angles(library):
-    """Beyond the reach, too, where the arm points at the place."""
-    hand = library(np.random.default_rng(0).uniform(-0.9, 0.9, (50, 8, 2)))
-    np.testing.assert_allclose(ADULT.links_at(hand), ADULT.links(ADULT.posture(hand)), atol=1e-14)
+    """Beyond the reach, too, where the forearm is drawn out to the hand instead of pointing at it."""
+    hand = np.random.default_rng(0).uniform(-0.9, 0.9, (50, 8, 2))
+    (shoulder, elbow), (joint, end) = (np.stack(link) for link in ADULT.links_at(library(hand)))
+    exact, distance = ADULT.links(ADULT.posture(hand)), np.linalg.norm(hand, axis=-1)
+    np.testing.assert_array_equal(shoulder, 0.0)
+    np.testing.assert_array_equal(elbow, joint)
+    np.testing.assert_allclose(elbow, exact[..., 0, 1, :], atol=1e-14)
+    np.testing.assert_array_equal(end, hand)
+    reached = (distance > ADULT.reach[0]) & (distance < ADULT.reach[1])
+    np.testing.assert_allclose(end[reached], exact[reached][:, 1, 1], atol=1e-14)
+    assert 0.2 < reached.mean() < 0.8
 
 
 def test_links_hang_together_and_have_their_lengths():

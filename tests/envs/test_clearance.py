@@ -10,6 +10,7 @@ from viapoint.envs.clearance import (
     arm_clearance,
     clearance_profile,
     hand_clearance,
+    links_profile,
     segment_distance_squared,
 )
 from viapoint.envs.simulator import Simulator
@@ -76,6 +77,21 @@ def test_the_profile_has_the_clearance_as_its_least_value():
         arm_clearance(links, ADULT.link_radii, obstacles, present),
     )
     np.testing.assert_allclose(profile.min(axis=-1), least, atol=1e-12)
+
+
+def test_a_hand_no_thicker_than_the_forearm_is_inside_its_end():
+    rng = np.random.default_rng(6)
+    low, high = np.array(ADULT.joint_range).T
+    joints = rng.uniform(low, high, (10, 40, 2))
+    obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
+    hand, links, radii = ADULT.hand(joints), ADULT.links(joints), ADULT.link_radii
+    pairs = [(links[..., i, 0, :], links[..., i, 1, :]) for i in (0, 1)]
+    alone = links_profile(pairs, radii, obstacles, present)
+    for radius in (ADULT.hand_radius, radii[-1]):
+        profile = clearance_profile(hand, radius, obstacles, present, links, radii)
+        np.testing.assert_allclose(alone, profile, atol=1e-12)
+    thicker = clearance_profile(hand, radii[-1] + 0.01, obstacles, present, links, radii)
+    assert (thicker < alone - 0.009).any()
 
 
 def test_absent_obstacles_are_far_and_order_is_irrelevant():

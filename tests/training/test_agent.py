@@ -1,12 +1,15 @@
 """Laws of the agent: what it foresees is so, its networks see a set, and it learns."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 import torch
 
-from viapoint.envs.arms import ARMS
+from viapoint.envs.arms import ADULT, ARMS
+from viapoint.envs.arms.planar import PlanarArm
+from viapoint.envs.reach_vector import ReachVectorEnv
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.task import Task
 from viapoint.training import sight
@@ -102,6 +105,23 @@ def test_the_obstacles_push_where_clearance_grows(trial):
     close = (seen.clearance < NEAR / 2) & (seen.clearance > 5e-3)
     assert close.any()
     assert (moved.clearance >= seen.clearance - 2e-4)[close].mean() > 0.9
+
+
+class WithAngles(PlanarArm):
+    links_at = None
+
+
+@pytest.mark.parametrize("hand_radius", [ADULT.hand_radius, 0.05])
+def test_links_without_angles_look_the_same_and_the_hand_counts_with_them(hand_radius):
+    numbers = vars(dataclasses.replace(ADULT, hand_radius=hand_radius))
+    quick, slow = (
+        ReachVectorEnv(arm=kind(**numbers), whole_arm=True).task for kind in (PlanarArm, WithAngles)
+    )
+    scenes = quick.sampler()([np.random.default_rng(seed) for seed in range(64)])
+    observation = quick.observation.observe(np.asarray(quick.arm.posture(scenes.start)), scenes.start, scenes)
+    straight = scenes.start[:, None] + (scenes.goal - scenes.start)[:, None] * INSTANTS[:, None]
+    seen = [see(observation, straight[:, None], task).clearance for task in (quick, slow)]
+    np.testing.assert_allclose(*seen, atol=1e-9)
 
 
 @pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
