@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes import Scenes
@@ -61,9 +63,9 @@ class Constant:
         generator = np.random.default_rng(seed)
         scenes = trial.task.sampler()([generator] * number)
         actions = generator.uniform(-1.0, 1.0, (candidates, trial.task.action.size))
-        every = scenes.take(np.tile(np.arange(number), candidates))
-        success = trial(every, np.repeat(actions, number, axis=0)).success.reshape(candidates, number)
-        self._action = actions[success.mean(axis=-1).argmax()]
+        tried = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
+        solved = [trial(scenes, np.tile(action, (number, 1))).success.sum() for action in tried]
+        self._action = actions[np.argmax(solved)]
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """See :class:`Method`."""

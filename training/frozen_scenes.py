@@ -26,6 +26,8 @@ DRAWN = ""
 """Family of the scenes that are drawn from the training distribution."""
 MEASURED = ("share", "solution")
 """What is known of each scene."""
+LARGEST = 1 << 30
+"""Bytes that a file's arrays may take in memory: a million scenes and more; a small archive can claim any number."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
@@ -150,6 +152,10 @@ def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
         with path.open("rb") as file:
             if not zipfile.is_zipfile(file):
                 raise ValueError("it is no archive of arrays, or a part of one")
+            with zipfile.ZipFile(file) as packed:
+                size = sum(part.file_size for part in packed.infolist())
+            if size > LARGEST:
+                raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
                 kind: Any = ChangingScenes if "jumps" in archive else Scenes

@@ -10,6 +10,7 @@ import pytest
 
 from viapoint.envs.scene_families import FAMILIES
 from viapoint.envs.scenes import check_scenes
+from viapoint.training import frozen_scenes
 from viapoint.training.baselines import METHODS, make_method
 from viapoint.training.difficulty import planned_share, solution_share
 from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, load, shipped_path
@@ -194,6 +195,16 @@ def test_a_file_comes_back_as_it_was_and_damage_is_noticed(frozen, tmp_path):
         np.savez(path, **{**content, name: other})
         with pytest.raises(ValueError, match="damaged"):
             load(path, ENV_ID)
+
+
+def test_a_small_archive_that_claims_a_huge_array_is_refused(frozen, tmp_path, monkeypatch):
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, start=np.zeros((1_000_000, 2)))
+    monkeypatch.setattr(frozen_scenes, "LARGEST", 1_000_000)
+    with pytest.raises(
+        ValueError, match=r"bomb.npz is not a file of scenes: its arrays would take 16000128 bytes"
+    ):
+        load(path, ENV_ID)
 
 
 def test_what_is_no_set_is_refused(tmp_path):
