@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs._arrays import Array, namespace_of
+from viapoint.envs._arrays import Array, cosine_and_sine, namespace_of
 
 Vector = Array
 """Three components, an array of shape (3, ...) or three arrays."""
@@ -64,7 +64,7 @@ class Chain:
         xp = namespace_of(joints)
         frames: list[Frame] = []
         angles = xp.stack([joints[..., index] for index in range(len(self.hinges))], axis=0)
-        cosines, sines = xp.cos(angles), xp.sin(angles)
+        cosines, sines = cosine_and_sine(angles)
         units = xp.reshape(xp.asarray(np.eye(3), dtype=joints.dtype), (3, 3, *[1] * (joints.ndim - 1)))
         before = Frame(units[0], units[1], units[2], xp.zeros_like(units[0]))
         for hinge, cosine, sine in zip(self.hinges, cosines, sines, strict=True):

@@ -10,9 +10,11 @@ Emika Panda, ICCMA 2021.)
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from viapoint.envs._arrays import Array, clamp, namespace_of
+from viapoint.envs._arrays import Array, clamp, cosine_and_sine, namespace_of
 from viapoint.envs.arms.mjcf import serial_arm
 
 SHOULDER, UPPER, FORE, ELBOW, WRIST = 0.333, 0.316, 0.384, 0.0825, 0.088
@@ -23,7 +25,10 @@ SHARE = 0.3
 """Of the turn towards the hand, taken by joint 3."""
 STEPS = 5
 """That find the angle between forearm and wrist as seen from above: each is ten to a hundred times as exact."""
-
+UPPER_SIDE, FORE_SIDE = float(np.hypot(UPPER, ELBOW)), float(np.hypot(FORE, ELBOW))
+"""From the shoulder to joint 4, and from there to the wrist, [m]."""
+OPENED = float(np.arctan2(UPPER, ELBOW) + np.arctan2(FORE, ELBOW) - 2.0 * np.pi)
+"""Angle of joint 4 less that between these two, [rad]."""
 
 CLOSEST, FARTHEST = 0.31, 0.69
 """Least and greatest distance of shoulder and wrist, [m]: joint 4 stays inside its range, the arm is never straight."""
@@ -45,21 +50,21 @@ class PandaPosture:
         height = hand[..., 2] + (DROP - SHOULDER)
         square, azimuth = x * x + y * y, xp.atan2(y, x)
         roll = SHARE * azimuth
-        c3, s3 = xp.cos(roll), xp.sin(roll)
-        bend, side, ahead = xp.ones_like(x), xp.zeros_like(x), xp.zeros_like(x)
+        c3, s3 = cosine_and_sine(roll)
+        bend, side = xp.ones_like(x), xp.zeros_like(x)
         for _ in range(STEPS):
-            reach = xp.sqrt(clamp(square - (WRIST * side) ** 2, 1e-4, np.inf)) - WRIST * bend
-            q4, c4, s4 = _elbow(reach * reach + height * height)
+            reach = xp.sqrt(xp.maximum(square - (WRIST * side) ** 2, 1e-4)) - WRIST * bend
+            between, c4, s4 = _elbow(reach * reach + height * height)
             fold = ELBOW - ELBOW * c4 - FORE * s4
             rise = UPPER - ELBOW * s4 + FORE * c4
             lean, left = fold * c3, fold * s3
-            q2, ahead = _shoulder(lean, rise, height)
-            c2, s2 = xp.cos(q2), xp.sin(q2)
+            c2, s2, ahead = _shoulder(lean, rise, height)
             # The forearm's direction as seen from above, in the frame of joint 1, and the wrist's.
-            fore = -s4 * c3 * c2 + c4 * s2, -s4 * s3
+            fore = c4 * s2 - s4 * c3 * c2, -s4 * s3
             scale = 1.0 / xp.sqrt((fore[0] ** 2 + fore[1] ** 2) * (ahead**2 + left**2))
             bend = (fore[0] * ahead + fore[1] * left) * scale
             side = (fore[1] * ahead - fore[0] * left) * scale
+        q2, q4 = xp.atan2(s2, c2), xp.acos(between) + OPENED
         wrist = azimuth - xp.atan2(WRIST * side, reach + WRIST * bend)
         q1 = wrist - xp.atan2(left, ahead)
         level = xp.sqrt(fore[0] ** 2 + fore[1] ** 2)
@@ -85,21 +90,24 @@ class PandaPosture:
 
 
 def _elbow(square: Array) -> tuple[Array, Array, Array]:
-    """Angle of joint 4 for a squared distance of shoulder and wrist, its cosine and sine."""
+    """Cosine of the angle between the sides that meet in joint 4, and cosine and sine of that joint's own."""
     xp = namespace_of(square)
-    upper, fore = float(np.hypot(UPPER, ELBOW)), float(np.hypot(FORE, ELBOW))
-    cosine = (upper**2 + fore**2 - square) * (0.5 / (upper * fore))
-    offset = float(np.arctan2(UPPER, ELBOW) + np.arctan2(FORE, ELBOW) - 2.0 * np.pi)
-    angle = xp.acos(clamp(cosine, -0.9999, 0.9999)) + offset
-    return angle, xp.cos(angle), xp.sin(angle)
+    cosine = (UPPER_SIDE**2 + FORE_SIDE**2 - square) * (0.5 / (UPPER_SIDE * FORE_SIDE))
+    cosine = clamp(cosine, -0.9999, 0.9999)
+    sine = xp.sqrt(1.0 - cosine * cosine)
+    c, s = math.cos(OPENED), math.sin(OPENED)
+    return cosine, c * cosine - s * sine, s * cosine + c * sine
 
 
-def _shoulder(lean: Array, rise: Array, height: Array) -> tuple[Array, Array]:
-    """Angle of joint 2 that brings the wrist to a height, and how far ahead it is then."""
+def _shoulder(lean: Array, rise: Array, height: Array) -> tuple[Array, Array, Array]:
+    """Cosine and sine of joint 2's angle that brings the wrist to a height, and how far ahead it is then."""
     xp = namespace_of(lean)
-    length = xp.sqrt(lean * lean + rise * rise)
-    cosine = clamp(height / length, -0.9999, 0.9999)
-    return xp.acos(cosine) - xp.atan2(lean, rise), length * xp.sqrt(1.0 - cosine * cosine)
+    square = lean * lean + rise * rise
+    length = xp.sqrt(square)
+    up = length * clamp(height / length, -0.9999, 0.9999)
+    ahead = xp.sqrt(square - up * up)
+    share = 1.0 / square
+    return (up * rise + ahead * lean) * share, (ahead * rise - up * lean) * share, ahead
 
 
 def _dot(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
