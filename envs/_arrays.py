@@ -19,7 +19,9 @@ def namespace_of(array: Array) -> Any:
 
 
 def clamp(values: Array, low: float, high: float) -> Array:
-    """Values no less than `low` and no more than `high`; on small arrays much faster than `clip`."""
+    """Values no less than `low` and no more than `high`; the method is several times as fast as the function."""
+    if type(values) is np.ndarray:
+        return values.clip(low, high)
     xp = namespace_of(values)
     return xp.minimum(xp.maximum(values, low), high)
 

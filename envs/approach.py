@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.clearance import FAR, segment_distance_squared
-from viapoint.envs.nearness import Single, ball_bounds
+from viapoint.envs.nearness import Single, ball_bounds, raised
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -71,8 +71,8 @@ def nearest_approach(
     first, second = seen[:, :, links[:, 0]], seen[:, :, links[:, 1]]
     around = np.float32(0.5) * _norm(second - first) + strayed + np.array(radii, np.float32)
     centres = np.moveaxis(np.float32(0.5) * (first + second), -1, 1).reshape(len(least), 3, -1)
-    bounds = ball_bounds(centres, around.reshape(len(least), -1), obstacles)
-    bounds -= np.where(present, obstacles[..., -1], -np.inf).astype(np.float32)[..., None]
+    shown = np.where(present[..., None], obstacles, 0.0)
+    bounds = ball_bounds(raised(centres), around.reshape(len(least), -1), shown)
     size = np.array(radii)
 
     def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:

@@ -164,12 +164,11 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array, drif
     gap = gap if drift is None else [g - drift[..., i] for i, g in enumerate(gap)]
     a, e, b = _dot(link, link), _dot(axis, axis), _dot(link, axis)
     c, f = _dot(link, gap), _dot(axis, gap)
-    e = xp.where(e > _TINY, e, xp.full_like(e, _TINY))
+    e = xp.maximum(e, _TINY)
     determinant = a * e - b * b
-    crossing = (b * f - c * e) / xp.where(
-        determinant > _TINY * a * e, determinant, xp.full_like(determinant, 1.0)
-    )
-    on_link = clamp(xp.where(determinant > _TINY * a * e, crossing, xp.zeros_like(crossing)), 0.0, 1.0)
+    crosses = determinant > _TINY * a * e
+    crossing = (b * f - c * e) / xp.where(crosses, determinant, 1.0)
+    on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
     on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
     on_link = clamp((b * on_axis - c) / a, 0.0, 1.0)
     rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs._arrays import squared_length
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import segment_distance_squared
-from viapoint.envs.nearness import Single, ball_bounds
+from viapoint.envs.nearness import Single, ball_bounds, raised
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -29,9 +29,21 @@ class Bodies(NamedTuple):
     """Some links of an arm at T times of N movements."""
 
     ends: Single
-    """Of their axes, shape (N, T, B, 2, 3), [m]."""
-    radii: tuple[float, ...]
-    """Of the B links, [m]."""
+    """Of their axes, with components apart in memory, shape (2, 3, N, B, T), [m]."""
+    balls: Single
+    """Centres of balls around the B links, :func:`~viapoint.envs.nearness.raised`, shape (N, 5, B, T)."""
+    around: Single
+    """Radii of the balls, shape (B,), [m]."""
+    radii: Single
+    """Of the links, shape (B,), [m]."""
+
+    @classmethod
+    def of(cls, ends: Single, radii: tuple[float, ...]) -> Bodies:
+        """Links whose axes end there, shape (2, 3, N, B, T), [m], and their radii, [m]."""
+        links, size = np.ascontiguousarray(ends), np.array(radii, np.float32)
+        balls = raised(np.moveaxis(np.float32(0.5) * (links[0] + links[1]), 0, 1))
+        half = 0.5 * np.sqrt(np.add.reduce(np.square(links[1] - links[0])).max(axis=(0, 2), initial=0.0))
+        return cls(links, balls, half + size + np.float32(ROUNDING), size)
 
     def clearance(
         self,
@@ -57,49 +69,47 @@ class Bodies(NamedTuple):
         Returns:
             Shape (N, n / together), [m]; no more than `most`.
         """
-        least, radii = np.full((len(rows), rows.shape[1] // together), most), rows[..., -1]
-        if not len(self.radii) or not (radii > 0.0).any():
-            return least
-        margins = np.broadcast_to(margin, self.ends.shape[1:2]).repeat(len(self.radii))
-        bound = ball_bounds(*self._balls(margins), rows)
-        bound -= np.where(radii > 0.0, radii, -np.inf).astype(np.float32)[..., None]
-        places = bound.shape[-1]
-        bound = bound.reshape(*least.shape, together * places)
+        shape, places = (len(rows), rows.shape[1] // together), math.prod(self.balls.shape[2:])
+        least = np.full(math.prod(shape), most)
+        if not places or not (rows[..., -1] > 0.0).any():
+            return least.reshape(shape)
+        margins = np.zeros(self.balls.shape[2:]) + margin
+        around = (self.around[:, None] + margins).astype(np.float32).reshape(-1)
+        bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows).reshape(len(least), -1)
         nearest = bound.argmin(axis=-1)
-        scene, one = np.nonzero(np.take_along_axis(bound, nearest[..., None], axis=-1)[..., 0] < most)
 
-        def look(scene: Index, one: Index, ball: Index) -> None:
-            row, ball = together * one + ball // places, ball % places
-            clearance = self._between(rows[scene, row], scene, ball) - margins[ball]
-            np.minimum.at(least, (scene, one), clearance)
+        def look(one: Index, ball: Index) -> None:
+            row, ball = np.divmod(one * bound.shape[-1] + ball, places)
+            clearance = self._between(rows, row, ball) - margins.reshape(-1)[ball]
+            np.minimum.at(least, one, clearance)
 
-        look(scene, one, nearest[scene, one])
-        open_ = least[scene, one] >= floor
-        scene, one = scene[open_], one[open_]
-        nearer = bound[scene, one] < least[scene, one, None].astype(np.float32)
-        nearer[np.arange(len(one)), nearest[scene, one]] = False
+        one = np.flatnonzero(bound[np.arange(len(least)), nearest] < most)
+        look(one, nearest[one])
+        one = one[least[one] >= floor]
+        nearer = bound.take(one, axis=0) < least[one, None].astype(np.float32)
+        nearer[np.arange(len(one)), nearest[one]] = False
         which, ball = np.nonzero(nearer)
-        look(scene[which], one[which], ball)
-        return least
+        if len(which):
+            look(one[which], ball)
+        return least.reshape(shape)
 
     def every_other(self) -> Bodies:
         """The same at every other time."""
-        return Bodies(self.ends[:, ::2], self.radii)
+        return self._replace(ends=self.ends[..., ::2], balls=self.balls[..., ::2])
 
-    def _balls(self, margins: Float) -> tuple[Single, Single]:
-        """Around the links at all times: centres, shape (N, 3, T B), and radii with a margin, shape (T B,), [m]."""
-        first, second = self.ends[..., 0, :], self.ends[..., 1, :]
-        link, centre = second - first, np.moveaxis(np.float32(0.5) * (first + second), -1, 1)
-        half = 0.5 * np.sqrt(squared_length(link).max(axis=(0, 1)))
-        around = np.tile(half + np.array(self.radii) + ROUNDING, self.ends.shape[1]) + margins
-        return centre.reshape(len(centre), 3, -1), around.astype(np.float32)
+    def take(self, movements: Index) -> Bodies:
+        """Some of the movements."""
+        return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
 
-    def _between(self, obstacles: Float, scene: Index, ball: Index) -> Float:
-        """Clearance of obstacles, shape (M, 7), each from one link at one time, shape (M,), [m]."""
-        body = ball % len(self.radii)
-        ends = self.ends[scene, ball // len(self.radii), body][:, :, None]
-        squared = segment_distance_squared(ends[:, 0], ends[:, 1], obstacles[:, None].astype(np.float32))
-        distance = np.sqrt(squared[:, 0, 0]) - np.array(self.radii, np.float32)[body]
+    def _between(self, rows: Float, row: Index, ball: Index) -> Float:
+        """Clearance of obstacles, the index of each among all rows, each from one link at one time, shape (M,), [m]."""
+        links, times = self.balls.shape[2:]
+        ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
+        obstacles = rows.reshape(-1, 7).take(row, axis=0)
+        # Components apart in memory, which are mostly read one after the other.
+        first, second = ends[:3].T[:, None], ends[3:].T[:, None]
+        squared = segment_distance_squared(first, second, obstacles.astype(np.float32, order="F")[:, None])
+        distance = np.sqrt(squared[:, 0, 0]) - self.radii[ball // times]
         return np.asarray(distance.astype(np.float64) - obstacles[:, -1])
 
 
@@ -113,15 +123,15 @@ class Swept(NamedTuple):
     def of(cls, arm: Arm, hand: Float, *, whole_arm: bool) -> Swept:
         """Of an arm, or its hand alone, whose hand takes paths of shape (N, T, 3), [m]."""
         if whole_arm:
-            links = np.asarray(arm.links(arm.posture(hand))).astype(np.float32)
-            radii = arm.link_radii
+            links, radii = np.asarray(arm.links(arm.posture(hand))), arm.link_radii
         else:
-            links = np.stack((hand, hand + np.array([0.0, 0.0, LENGTH])), axis=-2)[:, :, None].astype(
-                np.float32
-            )
+            links = np.stack((hand, hand + np.array([0.0, 0.0, LENGTH])), axis=-2)[:, :, None]
             radii = (arm.hand_radius,)
+        ends = links.astype(np.float32).transpose(3, 4, 0, 2, 1)
         first = max(len(radii) - OUTER, 0)
-        return cls(Bodies(links[:, :, first:], radii[first:]), Bodies(links[:, :, :first], radii[:first]))
+        return cls(
+            *(Bodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
+        )
 
     def top(self, phase: NDArray[np.int64], place: Float) -> Float:
         """Height of what of the links near the hand stands above it, at K times of each movement.
@@ -133,11 +143,12 @@ class Swept(NamedTuple):
         Returns:
             Shape (N, K), [m].
         """
-        ends = self.outer.ends[np.arange(len(phase))[:, None], phase]
-        apart = np.sqrt(squared_length(ends[..., :2] - place[:, :, None, None, :2]))
-        high = ends[..., 2] + np.array(self.outer.radii, np.float32)[:, None]
-        return np.asarray(np.where(apart < ABOVE, high, place[:, :, None, None, 2]).max(axis=(-2, -1)))
+        there = self.outer.ends[:, :, np.arange(len(phase))[:, None], :, phase]
+        x, y, z = (place[:, :, i, None, None] for i in range(3))
+        apart = np.sqrt(np.square(there[..., 0, :] - x) + np.square(there[..., 1, :] - y))
+        high = there[..., 2, :] + self.outer.radii
+        return np.asarray(np.where(apart < ABOVE, high, z).max(axis=(-2, -1)))
 
-    def take(self, rows: NDArray[np.int64]) -> Swept:
-        """The movements at `rows`."""
-        return Swept(*(Bodies(bodies.ends[rows], bodies.radii) for bodies in self))
+    def take(self, movements: Index) -> Swept:
+        """Some of the movements."""
+        return Swept(*(bodies.take(movements) for bodies in self))

@@ -154,8 +154,9 @@ class SpaceSampler:
         chosen = built[np.arange(number), fits.argmax(axis=-1)]
         chosen[wanted == 0.0] = 0.0
         good = fits.any(axis=-1) | (wanted == 0.0)
-        good &= self._free(swept.inner, chosen[:, None])[:, 0]
-        some, others = np.flatnonzero(good), np.zeros((number, self._rows, 7))
+        some = np.flatnonzero(good)
+        some = some[self._free(swept.inner.take(some), chosen[some, None])[:, 0]]
+        good, others = np.isin(np.arange(number), some), np.zeros((number, self._rows, 7))
         missing = np.maximum(wanted - (chosen[..., -1] > 0.0).sum(axis=-1), 0.0)
         enough, others[some] = self._others(
             _each(u[2], OTHERS)[some],
@@ -281,7 +282,7 @@ class SpaceSampler:
             missed = depth[:, 0] >= -IN_THE_WAY
             fits[left[missed], first[missed]] = False
             more = missed & fits[left].any(axis=-1)
-            left, bodies = left[more], Bodies(bodies.ends[more], bodies.radii)
+            left, bodies = left[more], bodies.take(more)
 
 
 def _within_bounds(rows: Float) -> Bool:

@@ -6,7 +6,7 @@ import pytest
 from viapoint.envs import space_sampling
 from viapoint.envs.arms import PANDA
 from viapoint.envs.clearance import point_distance_squared, segment_distance_squared
-from viapoint.envs.nearness import ball_bounds
+from viapoint.envs.nearness import ball_bounds, raised
 from viapoint.envs.space_bodies import Swept
 from viapoint.envs.space_distribution import SpaceDistribution
 from viapoint.envs.space_sampling import SpaceSampler
@@ -48,7 +48,7 @@ def everything(bodies, rows):
     """Clearance of all rows from all links at all times, shape (N, ROWS, TIMES)."""
     single = rows.astype(np.float32)
     each = [
-        np.sqrt(segment_distance_squared(bodies.ends[:, :, b, 0], bodies.ends[:, :, b, 1], single))
+        np.sqrt(segment_distance_squared(*np.moveaxis(bodies.ends[:, :, :, b], 1, -1), single))
         - np.float32(radius)
         for b, radius in enumerate(bodies.radii)
     ]
@@ -59,16 +59,18 @@ def test_balls_are_bounded_from_below_and_closely(generator):
     rows, centres = obstacles(generator), generator.uniform(-1.0, 1.0, (N, 3, 50)).astype(np.float32)
     radii = generator.uniform(0.0, 0.2, 50).astype(np.float32)
     distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows)) - radii
-    slack = distance - ball_bounds(centres, radii, rows)
-    assert slack.min() > -1e-6
-    assert slack[distance > 0.1].max() < 1e-4
+    clearance = np.where(rows[..., -1:] > 0.0, distance - rows[..., -1:], np.inf)
+    bounds = ball_bounds(raised(centres), radii, rows)
+    assert (bounds <= clearance + 1e-6).all()
+    assert (bounds >= clearance - 1e-4)[distance > 0.1].all()
 
 
 def test_balls_far_from_the_origin_are_bounded_from_below(generator):
     rows, centres = obstacles(generator), generator.uniform(49.0, 51.0, (N, 3, 50)).astype(np.float32)
     rows[..., :3] += 50.0
     distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows))
-    assert (ball_bounds(centres, np.zeros(50, np.float32), rows) <= distance + 1e-6).all()
+    bounds = ball_bounds(raised(centres), np.zeros(50, np.float32), rows)
+    assert (bounds <= distance - rows[..., -1:] + 1e-6)[rows[..., -1] > 0.0].all()
 
 
 @pytest.mark.parametrize("most", [-0.01, 1e-6, 0.05, np.inf])
