@@ -19,6 +19,7 @@ from viapoint.envs.scenes import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.space_bodies import Bodies, Swept
 from viapoint.envs.space_distribution import BOARDS, FAMILIES, SpaceDistribution
 from viapoint.envs.space_draws import ENDS, PHASES, WITNESSES, draw_ends, draw_path
+from viapoint.envs.space_numbers import GROUPS, Numbers
 from viapoint.envs.space_obstacles import NUMBERS, PARTS, Course, single, structure
 
 Float = NDArray[np.float64]
@@ -27,13 +28,10 @@ Index = NDArray[np.int64]
 
 STRUCTURES, OTHERS = 4, 14
 """How many structures and other obstacles are drawn at once."""
-ATTEMPTS = (1, 2, 4, *[8] * 400)
-"""How many attempts are made at once, one time after the other: few are left after the first,
-but one in a hundred makes a tunnel."""
-TOGETHER = 512
+TOGETHER = 640
 """Attempts that are looked at together: only the first good one of a scene counts, so not all at once."""
-FAITHFUL = 8
-"""How many times attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
+FAITHFUL = sum(GROUPS[:8])
+"""How many attempts keep to the family that was drawn first, so that those that seldom fit are not rarer."""
 FAMILY = 6 * ENDS + 3 * WITNESSES + 1
 """Which of the uniform numbers of an attempt stands for the family."""
 GIVE_WAY = 1.3
@@ -69,25 +67,26 @@ class SpaceSampler:
         number = len(generators)
         scenes = Scenes(np.zeros((number, 3)), np.zeros((number, 3)), np.zeros((number, self._rows, 7)))
         pending, family = np.arange(number), np.array([each.random() for each in generators])
-        for group, attempts in enumerate(ATTEMPTS):
-            if not len(pending):
-                break
-            u = np.stack([generators[int(i)].random((attempts, self._size)) for i in pending])
-            if group < FAITHFUL:
-                u[..., FAMILY] = family[pending, None]
-            pending = self._draw(u, pending, ends, scenes)
+        numbers = Numbers(generators, self._size)
+        while len(pending) and numbers.made < sum(GROUPS):
+            faithful = max(FAITHFUL - numbers.made, 0)
+            u = numbers.draw(pending)
+            u[:, :faithful, FAMILY] = family[pending, None]
+            first = self._draw(u, pending, ends, scenes)
+            numbers.put_back(pending, first)
+            pending = pending[first < 0]
         if len(pending):
             between = (
                 "" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
             )
             raise RuntimeError(
-                f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(ATTEMPTS)} "
+                f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(GROUPS)} "
                 f"attempts{between}"
             )
         return scenes
 
     def _draw(self, u: Float, pending: Index, ends: tuple[Float, Float] | None, scenes: Scenes) -> Index:
-        """Put the scene of the first good attempt of each; those without one come back.
+        """Put the scene of the first good attempt of each; which that was, shape (P,), -1 for none.
 
         Args:
             u: Uniform numbers, shape (P, attempts, .).
@@ -95,7 +94,7 @@ class SpaceSampler:
             ends: See :meth:`__call__`.
             scenes: To put them.
         """
-        left, begin = np.arange(len(pending)), 0
+        left, begin, good = np.arange(len(pending)), 0, np.full(len(pending), -1)
         while begin < u.shape[1] and len(left):
             several = max(TOGETHER // len(left), 1)
             some = u[left, begin : begin + several]
@@ -105,8 +104,9 @@ class SpaceSampler:
             found, attempt = self._attempt(some.reshape(-1, self._size), given)
             solved, first = np.unique(each[found], return_index=True)
             scenes.put(pending[solved], attempt.take(first))
-            left, begin = np.setdiff1d(left, solved), begin + several
-        return pending[left]
+            good[solved] = begin + np.flatnonzero(found)[first] % some.shape[1]
+            left, begin = np.flatnonzero(good < 0), begin + several
+        return good
 
     @property
     def _size(self) -> int:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from viapoint.envs import space_sampling
+from viapoint.envs import space_numbers, space_sampling
 from viapoint.envs.arms import PANDA
 from viapoint.envs.clearance import point_distance_squared, segment_distance_squared
 from viapoint.envs.nearness import ball_bounds, raised
@@ -98,3 +98,17 @@ def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkey
         found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
     for other in found[1:]:
         assert all((mine == theirs).all() for mine, theirs in zip(found[0], other, strict=True))
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(monkeypatch, shared):
+    sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
+    for ahead in (0, 30, 1_000):
+        monkeypatch.setattr(space_numbers, "AHEAD", ahead)
+        generators = [np.random.default_rng(0 if shared else seed) for seed in range(8)]
+        generators = generators[:1] * 8 if shared else generators
+        for _ in range(2):
+            scenes = sampler(generators)
+        found.append((*scenes, [each.random() for each in generators]))
+    for other in found[1:]:
+        assert all(np.array_equal(mine, theirs) for mine, theirs in zip(found[0], other, strict=True))
