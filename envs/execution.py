@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
 from viapoint.envs.beside import Beside
-from viapoint.envs.outcome import Outcome, blank, least_clearance, measure, norm, refused
+from viapoint.envs.outcome import Outcome, blank, ended, least_clearance, measure, norm
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record, Simulator
 
@@ -93,6 +93,8 @@ class Executor:
         self._beside = beside
         self._groups: list[References] = []
         self._records: list[Record | None] = []
+        self.final_joints = np.zeros((0, len(self.arm.joint_range)))
+        """Where the arms ended, shape (N, J), [rad]."""
 
     def __call__(self, plan: Plan, scenes: Scenes) -> Outcome:
         """Carry out one plan in each simulation, which must have been placed at its start."""
@@ -123,18 +125,11 @@ class Executor:
         for group, outcome in zip(self._groups, outcomes, strict=True) if len(referred) > 1 else ():
             for mine, theirs in zip(together, outcome, strict=True):
                 mine[group.sims] = theirs
+        self.final_joints = self._final_joints(scenes)
+        together = ended(together, self.final_joints, scenes, self.arm, whole_arm=self.whole_arm)
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
         jerk_ratio = np.maximum(together.jerk_cost / straight, 1.0)
         return together._replace(duration=duration, jerk_ratio=jerk_ratio, stretch=stretch)
-
-    def final_joints(self, scenes: Scenes) -> Float:
-        """Where the arms ended, shape (N, J), [rad]."""
-        joints = np.asarray(self.arm.posture(scenes.start))
-        for group, record in zip(self._groups, self._records, strict=True):
-            if record is not None:
-                run = group.reachable
-                joints[group.sims[run]] = record.joints[np.arange(run.sum()), group.steps[run] - 1]
-        return joints
 
     def rollout(self, sim: int, scenes: Scenes) -> Rollout:
         """The last movement of one simulation, step by step; `scenes` are those it took place in."""
@@ -189,6 +184,14 @@ class Executor:
             clearance=least_clearance(self.arm, seen, scenes.take(rows), whole_arm=self.whole_arm),
         )
 
+    def _final_joints(self, scenes: Scenes) -> Float:
+        joints = np.asarray(self.arm.posture(scenes.start))
+        for group, record in zip(self._groups, self._records, strict=True):
+            if record is not None:
+                run = group.reachable
+                joints[group.sims[run]] = record.joints[np.arange(run.sum()), group.steps[run] - 1]
+        return joints
+
     def _simulate(self, group: References) -> Record | None:
         run = group.reachable
         if run.all():
@@ -196,28 +199,20 @@ class Executor:
         return self.simulator.rollout(group.sims[run], group.controls[run]) if run.any() else None
 
     def _measure(self, index: int, scenes: Scenes) -> Outcome:
-        """The outcome of one group, but for duration and jerk ratio."""
+        """The outcome of one group, but for duration, jerk ratio and what :func:`ended` adds."""
         group, record = self._groups[index], self._records[index]
-        scene, run = scenes.take(group.rows), group.reachable
-        if run.all():
-            outcome = self._measured(group, record, scene)
-        else:
-            outcome = refused(scene, self.arm, whole_arm=self.whole_arm)
-            done = self._measured(group, record, scene.take(run)) if record is not None else blank(0)
+        run: slice | NDArray[np.bool_] = slice(None) if group.reachable.all() else group.reachable
+        outcome = blank(len(group.sims))
+        if record is not None:
+            done = measure(
+                record,
+                group.steps[run],
+                group.planned[run],
+                scenes.take(group.rows).take(run),
+                self.arm,
+                whole_arm=self.whole_arm,
+                timestep=self.simulator.timestep,
+            )
             for mine, theirs in zip(outcome, done, strict=True):
                 mine[run] = theirs
         return outcome._replace(jerk_cost=group.jerk_cost, planned_clearance=group.clearance)
-
-    def _measured(self, group: References, record: Record | None, scene: Scenes) -> Outcome:
-        """The outcome of those that ran."""
-        assert record is not None
-        run = slice(None) if group.reachable.all() else group.reachable
-        return measure(
-            record,
-            group.steps[run],
-            group.planned[run],
-            scene,
-            self.arm,
-            whole_arm=self.whole_arm,
-            timestep=self.simulator.timestep,
-        )

@@ -131,20 +131,35 @@ def _measured_clearance(
     *,
     whole_arm: bool,
 ) -> Float:
-    """Least clearance over all steps: of what the physics has recorded before each, and at the end."""
+    """Least clearance over all steps; of what the physics has recorded, before each of them."""
     if record.traced is None or not whole_arm:
         return least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints)
-    final = least_clearance(arm, hand[last][:, None], scenes, whole_arm=True, joints=joints[last][:, None])
-    before = nearest_approach(record.traced, arm.link_radii, scenes.obstacles, scenes.present, last[1])
-    return np.minimum(before, final)
+    return nearest_approach(record.traced, arm.link_radii, scenes.obstacles, scenes.present, last[1])
 
 
-def refused(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
-    """The outcome of plans out of the arm's reach: it stays at rest at the start."""
-    return blank(len(scenes.start))._replace(
-        min_clearance=least_clearance(arm, scenes.start[:, None], scenes, whole_arm=whole_arm),
-        goal_error=norm(scenes.goal - scenes.start),
+def ended(outcome: Outcome, joints: Float, scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Outcome:
+    """The outcome of N movements with what belongs to where the arms ended, looked at for all of them together.
+
+    Where their places are recorded before each step, the clearance after the last one is missing. And arms whose plans
+    were out of reach have stayed at rest at the start.
+
+    Args:
+        outcome: Of which this is missing.
+        joints: Where the arms ended, shape (N, J), [rad].
+        scenes: Where they moved.
+        arm: That moved.
+        whole_arm: Whether its links count.
+    """
+    some = np.flatnonzero(~outcome.reachable | (whole_arm and len(arm.traced) > 0))
+    least, scene = outcome.min_clearance.copy(), scenes.take(some)
+    # Where links are traced, the hand is the end of one of them.
+    least[some] = np.minimum(
+        np.where(outcome.reachable, least, FAR)[some],
+        least_clearance(arm, scene.start[:, None], scene, whole_arm=whole_arm, joints=joints[some, None]),
     )
+    away = norm(scenes.goal - scenes.start)
+    goal_error = np.where(outcome.reachable, outcome.goal_error, away)
+    return outcome._replace(min_clearance=least, goal_error=goal_error)
 
 
 def blank(number: int) -> Outcome:

@@ -266,7 +266,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def _conclude(self, prepared: Prepared) -> Decision:
         outcome, scenes = self._executor.carry_out(prepared), prepared.scenes
         terms = reward_terms(outcome, self.action_layout.centre_duration, self.task.weights)
-        joints = self._executor.final_joints(scenes)
+        joints = self._executor.final_joints
         observation = self.observation_layout.observe(joints, np.asarray(self.arm.hand(joints)), scenes)
         self._last, self.scenes = (scenes, prepared.plan, outcome), None
         if self.render_mode == "human":

@@ -282,7 +282,7 @@ class SpaceSampler:
             missed = depth[:, 0] >= -IN_THE_WAY
             fits[left[missed], first[missed]] = False
             more = missed & fits[left].any(axis=-1)
-            left, bodies = left[more], bodies.take(more)
+            left, bodies = left[more], bodies.take(np.flatnonzero(more))
 
 
 def _within_bounds(rows: Float) -> Bool:
