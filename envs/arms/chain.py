@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import operator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,30 @@ class Hinge:
     inertia: tuple[Constants, Constants, Constants]
     """About the centre of mass, [kg m^2]."""
 
+    @functools.cached_property
+    def lever(self) -> Constants:
+        """First moments of the mass about the frame's origin, [kg m]."""
+        x, y, z = self.centre
+        return self.mass * x, self.mass * y, self.mass * z
+
+    @functools.cached_property
+    def spread(self) -> tuple[Constants, ...]:
+        """Second moments of the mass about the frame's origin, the integral of r r^T, [kg m^2]."""
+        inertia, centre = np.array(self.inertia), np.array(self.centre)
+        about_centre = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        return tuple(map(tuple, (about_centre + self.mass * np.outer(centre, centre)).tolist()))
+
+    def inwards(self, vector: Vector, cosine: Array, sine: Array) -> Vector:
+        """A vector of the frame before in this one."""
+        x, y, z = (_combined(vector, axis) for axis in self.turn)
+        return [cosine * x + sine * y, cosine * y - sine * x, z]
+
+    def outwards(self, vector: Vector, cosine: Array, sine: Array) -> Vector:
+        """A vector of this frame in the one before."""
+        x, y, z = vector
+        turned = cosine * x - sine * y, sine * x + cosine * y, z
+        return [_combined(turned, weights) for weights in zip(*self.turn, strict=True)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
@@ -91,7 +115,8 @@ class Chain:
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
         """What moves the chain, and what only holds it against gravity, shape (..., J) each, [N m].
 
-        The recursive Newton-Euler equations (Luh, Walker and Paul 1980) without gravity; then gravity alone.
+        The recursive Newton-Euler equations (Luh, Walker and Paul 1980) in the joints' frames, without gravity; then
+        gravity alone.
 
         Args:
             joints: Angles, shape (..., J), [rad].
@@ -99,64 +124,70 @@ class Chain:
             accelerations: Their second derivatives, likewise, [rad/s^2].
         """
         xp = namespace_of(joints)
-        frames = self.frames(joints)
-        centres = [frame.place(hinge.centre) for frame, hinge in zip(frames, self.hinges, strict=True)]
-        forces, moments = self._inertial(frames, centres, rates, accelerations)
+        each = range(len(self.hinges))
+        turns = list(zip(*cosine_and_sine(xp.stack([joints[..., i] for i in each], axis=0)), strict=True))
+        forces, moments, ups = self._inertial(turns, rates, accelerations)
         moving, holding = [], []
-        nothing: Vector = [0.0, 0.0, 0.0]
-        force, moment, weight, lever = nothing, nothing, 0.0, nothing
-        for index in reversed(range(len(self.hinges))):
-            frame, centre, hinge = frames[index], centres[index], self.hinges[index]
-            # Moments are taken about the origin of the world, where those of further links simply add up.
-            force = _sum(force, forces[index])
-            moment = _sum(moment, _sum(moments[index], _cross(centre, forces[index])))
-            weight, lever = weight + hinge.mass, _sum(lever, [hinge.mass * part for part in centre])
-            moving.append(_dot(frame.z, _less(moment, _cross(frame.origin, force))))
-            hanging = [part - weight * at for part, at in zip(lever, frame.origin, strict=True)]
-            holding.append(GRAVITY * (frame.z[1] * -hanging[0] + frame.z[0] * hanging[1]))
-        zero = 0.0 * joints[..., 0]
-        whole = [xp.stack([part + zero for part in parts[::-1]], axis=-1) for parts in (moving, holding)]
-        return whole[0], whole[1]
+        force, moment, lever, weight = forces[-1], moments[-1], list(self.hinges[-1].lever), 0.0
+        for index in reversed(each):
+            hinge, up = self.hinges[index], ups[index]
+            moving.append(moment[2])
+            holding.append(GRAVITY * (lever[0] * up[1] - lever[1] * up[0]))
+            if index:
+                before = self.hinges[index - 1]
+                weight += hinge.mass
+                force, moment, lever = (
+                    hinge.outwards(part, *turns[index]) for part in (force, moment, lever)
+                )
+                moment = _sum(_sum(moment, _cross(hinge.offset, force)), moments[index - 1])
+                force = _sum(force, forces[index - 1])
+                lever = [
+                    a + weight * b + c for a, b, c in zip(lever, hinge.offset, before.lever, strict=True)
+                ]
+        return xp.stack(moving[::-1], axis=-1), xp.stack(holding[::-1], axis=-1)
 
     def _inertial(
-        self, frames: list[Frame], centres: list[Vector], rates: Array, accelerations: Array
-    ) -> tuple[list[Vector], list[Vector]]:
-        """Force and moment about the centre of mass that each link's motion takes."""
-        spin: Vector = [0.0, 0.0, 0.0]
-        turn, pull, origin = spin, spin, spin
-        forces, moments = [], []
-        for index, (frame, hinge) in enumerate(zip(frames, self.hinges, strict=True)):
-            arm = _less(frame.origin, origin)
-            pull = _sum(pull, _swept(spin, turn, arm))
-            rate = [rates[..., index] * part for part in frame.z]
-            gain = [accelerations[..., index] * part for part in frame.z]
-            turn = _sum(_sum(turn, gain), _cross(spin, rate))
-            spin, origin = _sum(spin, rate), frame.origin
-            swept = _swept(spin, turn, _less(centres[index], origin))
-            forces.append([hinge.mass * (a + b) for a, b in zip(pull, swept, strict=True)])
-            momentum = _resisting(frame, hinge, spin)
-            moments.append(_sum(_resisting(frame, hinge, turn), _cross(spin, momentum)))
-        return forces, moments
+        self, turns: list[tuple[Array, Array]], rates: Array, accelerations: Array
+    ) -> tuple[list[Vector], list[Vector], list[Vector]]:
+        """Force on each link and moment about its joint that its motion takes, and the vertical, in its joint's frame.
+
+        A point r of a link is accelerated by a + A r, with A = [w]x [w]x + [dw/dt]x. So force and moment are m a + A s
+        and s x a + the skew part of A S, with the first and second moments s and S of its mass.
+        """
+        spin, turn, pull, up = [0.0] * 3, [0.0] * 3, [0.0] * 3, [0.0, 0.0, 1.0]
+        swept: list[Vector] = [[0.0] * 3] * 3
+        forces, moments, ups = [], [], []
+        for index, hinge in enumerate(self.hinges):
+            pull = [a + _combined(row, hinge.offset) for a, row in zip(pull, swept, strict=True)]
+            spin, turn, pull, up = (hinge.inwards(part, *turns[index]) for part in (spin, turn, pull, up))
+            rate = rates[..., index]
+            turn = [turn[0] + rate * spin[1], turn[1] - rate * spin[0], turn[2] + accelerations[..., index]]
+            spin = [spin[0], spin[1], spin[2] + rate]
+            swept = _swept(spin, turn)
+            forces.append(
+                [hinge.mass * a + _combined(row, hinge.lever) for a, row in zip(pull, swept, strict=True)]
+            )
+            (a, b, c), (x, y, z) = swept, hinge.spread
+            pairs = ((c, y, b, z), (a, z, c, x), (b, x, a, y))
+            skew = [_combined(p, u) - _combined(q, v) for p, u, q, v in pairs]
+            moments.append(_sum(_cross(hinge.lever, pull), skew))
+            ups.append(up)
+        return forces, moments, ups
 
 
 GRAVITY = 9.81
 """[m/s^2], downwards along z."""
 
 
-def _resisting(frame: Frame, hinge: Hinge, vector: Vector) -> Vector:
-    """A link's inertia times a vector of the world."""
-    local = [_dot(axis, vector) for axis in (frame.x, frame.y, frame.z)]
-    times = [_added([i * v for i, v in zip(row, local, strict=True)]) for row in hinge.inertia]
-    return [_added([axis[k] * part for axis, part in zip(frame[:3], times, strict=True)]) for k in range(3)]
+def _swept(spin: Vector, turn: Vector) -> list[Vector]:
+    """Rows of the matrix that makes a point's acceleration of its place, in a body that turns about the origin."""
+    (x, y, z), (u, v, w) = spin, turn
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return [[-yy - zz, xy - w, xz + v], [xy + w, -xx - zz, yz - u], [xz - v, yz + u, -xx - yy]]
 
 
-def _swept(spin: Vector, turn: Vector, arm: Vector) -> Vector:
-    """Acceleration of a point of a turning body, `arm` away from one at rest."""
-    return _sum(_cross(turn, arm), _cross(spin, _cross(spin, arm)))
-
-
-def _combined(axes: tuple[Vector, Vector, Vector], weights: Constants) -> Vector:
-    """Axes times constant weights, where these are not zero."""
+def _combined(axes: Any, weights: Constants) -> Any:
+    """Sum of axes, or components, times constant weights, where these are not zero."""
     used = [(axis, weight) for axis, weight in zip(axes, weights, strict=True) if weight != 0.0]
     return _added([axis if weight == 1.0 else weight * axis for axis, weight in used] or [0.0 * axes[0]])
 
@@ -165,17 +196,10 @@ def _sum(first: Vector, second: Vector) -> Vector:
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
-def _less(first: Vector, second: Vector) -> Vector:
-    return [a - b for a, b in zip(first, second, strict=True)]
-
-
-def _dot(first: Vector, second: Vector) -> Array:
-    return _added([a * b for a, b in zip(first, second, strict=True)])
-
-
 def _added(parts: list[Array]) -> Array:
     return functools.reduce(operator.add, parts)
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+def _cross(place: Constants, vector: Vector) -> Vector:
+    x, y, z = place
+    return [_combined(vector, weights) for weights in ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))]
