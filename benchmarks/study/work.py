@@ -245,15 +245,15 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
             method = lambda way=way, model=model, count=count: agent_method(way, model, count)  # noqa: E731
             found.append((f"{variant.name} {way}", f"{source} {count}", method))
             if study.compiled and variant == WHOLE:
-                code = lambda way=way, folder=folder, count=count: _compiled(way, folder, count)  # noqa: E731
+                code = lambda way=way, folder=folder, count=count: _compiled(way, folder, count, study)  # noqa: E731
                 found.append((f"{variant.name} {way} compiled", f"{source} {count}", code))
     return found
 
 
-def _compiled(way: str, folder: Path, count: int) -> Method:
-    """An agent whose single decisions are machine code."""
+def _compiled(way: str, folder: Path, count: int, study: Study) -> Method:
+    """An agent whose single decisions are machine code, which is kept beside the runs."""
     model: Any = load_model(folder)
-    model.policy.compile_decisions(count)
+    model.policy.compile_decisions(count, keep=study.out / "machine_code")
     return agent_method(way, model, count)
 
 
