@@ -145,8 +145,8 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     if hasattr(model.policy, "ranked"):
         methods.append(agent_method(RANKED, model, study.candidates))
     kwargs = dict(cell.variant.env_kwargs)
+    results = _results(methods, frozen, cell.env, kwargs)
     with one_thread():
-        results = evaluate(methods, frozen, cell.env, env_kwargs=kwargs, time_decisions=False).results
         failures = {
             each.name: sort_out(each, frozen, model, cell.env, **kwargs).counts()
             for each in results
@@ -196,12 +196,22 @@ def planned(env: str, variant: Variant, study: Study) -> str:
 def _measure_baseline(
     method: Method, frozen: FrozenScenes, env: str, path: Path, kwargs: dict[str, Any]
 ) -> dict[str, Any]:
-    with one_thread():
-        result = evaluate([method], frozen, env, env_kwargs=kwargs, time_decisions=False).results[0]
+    (result,) = _results([method], frozen, env, kwargs)
     record = {"scenes": frozen.sha256, "methods": {method.name: compact(result)}}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, record)
     return record
+
+
+def _results(
+    methods: Sequence[Method], frozen: FrozenScenes, env: str, kwargs: dict[str, Any], timed: bool = False
+) -> tuple[MethodResult, ...]:
+    """What came of each method in all scenes; where it was interrupted, nothing is kept."""
+    with one_thread():
+        results = evaluate(methods, frozen, env, env_kwargs=kwargs, time_decisions=timed).results
+    if any(each.interrupted for each in results):
+        raise KeyboardInterrupt
+    return results
 
 
 def time_decisions(study: Study) -> str:
@@ -214,8 +224,7 @@ def time_decisions(study: Study) -> str:
             if times.get(name, {}).get("source") == source:
                 continue
             try:
-                with one_thread():
-                    result = evaluate([method()], frozen, env, env_kwargs={"threads": 1}).results[0]
+                (result,) = _results([method()], frozen, env, {"threads": 1}, timed=True)
             except CannotCompileError as error:
                 print(f"{short(env)}: {error}", flush=True)
                 continue

@@ -111,6 +111,16 @@ def test_what_is_lost_is_measured_again(done, monkeypatch):
     assert lost.read_bytes() == before
 
 
+def test_what_is_interrupted_is_not_kept(monkeypatch, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(work.Certified, "decide", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        work.baseline(ENV, "stored", study_of(tmp_path))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 def test_a_partial_study_says_which_seeds_are_in(done):
     record = gather.gather(study_of(done, seeds=(0, 1, 2)))
     text = page.page(record)
@@ -140,7 +150,8 @@ def test_decisions_are_timed_once(done):
 
 
 def test_what_cannot_be_compiled_is_passed_over(done, monkeypatch, capsys):
-    def refused(*_):
+    def refused(*_, keep):
+        assert keep.parent == done / "runs"
         raise CannotCompileError("no compiler here")
 
     monkeypatch.setattr(ViaPolicy, "compile_decisions", refused)
