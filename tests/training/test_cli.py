@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shlex
 
 import pytest
@@ -99,7 +100,7 @@ def test_an_error_is_the_same_where_the_output_knows_ascii_only(capsys, monkeypa
     framed = failed(capsys, "train", "--seed", "-1")
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
     assert failed(capsys, "train", "--seed", "-1") == framed
-    assert framed.startswith("viapoint: Error parsing TrainConfig: seed must be")
+    assert re.match(r"viapoint: (Error parsing TrainConfig: )?seed must be", framed)  # older tyro says less
 
 
 def test_unexpected_errors_say_their_kind_and_debug_shows_them(capsys, monkeypatch):
