@@ -218,7 +218,8 @@ def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: floa
         before = time.perf_counter()
         method.decide(observation, one)
         times.append(time.perf_counter() - before)
-        if times[-1] > (SLOW_DECISION if row else 20.0 * SLOW_DECISION):  # the first may warm up
+        usual = float(np.median(times[1:])) if row else times[0] / 20.0  # the first may warm up
+        if usual > SLOW_DECISION:
             return np.array([in_batch])
         if time.perf_counter() - began > TIMING_BUDGET:
             break
