@@ -120,7 +120,9 @@ class PlanarArm:
         xp = namespace_of(joints)
         upper, hand = joints[..., 0], self.hand(joints)
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
-        return _ends(elbow, (hand[..., 0], hand[..., 1]))
+        zero = xp.zeros_like(upper)
+        ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
+        return last(xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
         """Both ends of each link in the :meth:`posture` at `hand`, shape (..., 2), [m]: quick, as without angles.
@@ -235,13 +237,6 @@ class PlanarArm:
         )
         elbow = coupling * accelerations[0] + c * accelerations[1] + coriolis * rates[0] ** 2
         return shoulder, elbow
-
-
-def _ends(elbow: tuple[Array, Array], hand: tuple[Array, Array]) -> Array:
-    """End points of the links' axes, shape (..., 2, 2, 2), the shoulder at the origin."""
-    xp = namespace_of(elbow[0])
-    zero = xp.zeros_like(elbow[0])
-    return last(xp.reshape(xp.stack((zero, zero, *elbow, *elbow, *hand)), (2, 2, 2, *zero.shape)), 3)
 
 
 def _pair(values: Any) -> tuple[float, float]:
