@@ -26,9 +26,10 @@ from typing import Any
 import tyro
 from study import gather, page, work
 from study.figures import draw
+from study.merge import merged
 from study.plan import Study
 
-from viapoint.training.files import write_bytes, write_json
+from viapoint.training.files import read_json, write_bytes, write_json
 
 Answer = tuple[bool, str]
 """Whether a job went well, and what it told."""
@@ -41,9 +42,11 @@ def main(words: Sequence[str] | None = None) -> int:
     if "time" in study.only:
         print(work.time_decisions(study), flush=True)
     if "page" in study.only:
-        record = gather.gather(study)
+        record, known = gather.gather(study), study.docs / "results.json"
+        if known.is_file() and not study.alone:
+            record = merged(record, read_json(known))
         study.docs.joinpath("images").mkdir(parents=True, exist_ok=True)
-        write_json(study.docs / "results.json", record)
+        write_json(known, record)
         write_bytes(study.docs / "results.md", page.page(record).encode())
         for path in draw(record, study.docs / "images"):
             print(path)

@@ -51,7 +51,7 @@ def _environment(env: str, study: Study) -> Numbers:
         "decision_time": times,
         "curves": {variant.name: _curves(env, variant, study) for variant in variants},
         "failures": {name: _failures(env, name, study) for name in sets_of(env)},
-        "improvement": _improvement(found),
+        "improvement": improvement(found),
         "compared": {name: _compared(env, name, study) for name in sets_of(env)},
     }
 
@@ -236,7 +236,7 @@ def _failures(env: str, name: str, study: Study) -> Numbers:
     }
 
 
-def _improvement(methods: Sequence[Numbers]) -> Numbers:
+def improvement(methods: Sequence[Numbers]) -> Numbers:
     """Probability that a run of the whole agent, policy alone, beats one of another algorithm on the test scenes."""
     each = {m["name"]: m["sets"]["test"][ALONE]["each"] for m in methods if "test" in m["sets"]}
     mine = each.pop(WHOLE.name, None)
@@ -247,7 +247,8 @@ def _improvement(methods: Sequence[Numbers]) -> Numbers:
         generator = np.random.default_rng(0)
         interval = probability_of_improvement(np.c_[mine], np.c_[others], generator, samples=2000)
         result[name] = {"interval": list(interval), "pairs": len(mine) * len(others)}
-    return result
+    rounded: Numbers = _rounded(result)
+    return rounded
 
 
 def _compared(env: str, name: str, study: Study) -> Numbers:

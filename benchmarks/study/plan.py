@@ -125,6 +125,8 @@ class Study:
     """Actions that the critic ranks in the second row of an agent."""
     compiled: bool = False
     """Time the decisions of viatd3 as machine code, too: a minute or two for each, and a C++ compiler."""
+    alone: bool = False
+    """Leave out what the page holds and these files do not, such as what was measured on another machine."""
     n_timesteps: int | None = None
     """Decisions of each training; as the preset says if not given. For trials."""
     n_scenes: int | None = None

@@ -8,8 +8,9 @@ This page is made by one command from files that the trainings left; no number i
 
 It trains every method with every seed, measures each agent on the frozen `test` and `hard` scenes, measures the
 baselines on the same scenes, and writes this page, its figures and [results.json](results.json), which holds every
-number shown here. Called again it goes on where it stopped. Models are chosen on `validation` scenes alone; `test`
-and `hard` are looked at once training is over.
+number shown here. Called again it goes on where it stopped, and what was measured on another machine, on the same
+scenes, keeps its place on the page. Models are chosen on `validation` scenes alone; `test` and `hard` are looked at
+once training is over.
 
 {seeds}
 
