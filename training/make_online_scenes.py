@@ -1,11 +1,11 @@
 """Makes the frozen scenes of the tasks whose plans are revised on the way.
 
-    python -m viapoint.training.make_online_scenes [--env ID ...] [--sets validation test] [--write]
+    python -m viapoint.training.make_online_scenes [--env ID ...] [--sets test ...] [--write | --out DIR]
 
-Scenes are drawn from the training distribution, from other seeds for each set; those are kept that the planner, which
-knows all courses, solves in simulation. Where obstacles move, the solution share is the fraction of 512 uniformly
-random plans that would touch nothing and stay in reach if they were kept to the end: computed, not simulated. Without
---write the files are made anew and their hashes compared.
+They are compared with those shipped. Scenes are drawn from the training distribution, from other seeds for each set;
+those are kept that the planner, which knows all courses, solves in simulation. Where obstacles move, the solution share
+is the fraction of 512 uniformly random plans that would touch nothing and stay in reach if they were kept to the end:
+computed, not simulated.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from tqdm import tqdm
 
 from viapoint.envs.courses import ChangingScenes, clearance_over_time
 from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.training.frozen_scenes import FrozenScenes, load, shipped_path
+from viapoint.training.frozen_scenes import FrozenScenes
 from viapoint.training.movements import movements
 from viapoint.training.online_methods import OnlinePlanner
 from viapoint.training.online_trial import OnlineTrial
+from viapoint.training.remade_scenes import add_arguments, settle
 from viapoint.training.sight import INSTANTS
 
 SIZES = {"validation": 200, "test": 500}
@@ -82,26 +83,16 @@ def shares(trial: OnlineTrial, scenes: ChangingScenes) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Make sets, and write them or compare them with the files."""
+    """Make the sets named on the command line, or all, and say whether they are as shipped."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--env", nargs="+", default=list(ONLINE_TASKS), choices=list(ONLINE_TASKS))
     parser.add_argument("--sets", nargs="+", default=list(SIZES), choices=list(SIZES))
-    parser.add_argument("--write", action="store_true", help="write the files instead of comparing")
+    add_arguments(parser)
     arguments = parser.parse_args()
-    same = True
-    for env_id in arguments.env:
-        for name in arguments.sets:
-            frozen = make(env_id, name, SIZES[name])
-            if arguments.write:
-                frozen.save(shipped_path(name, env_id))
-            there = load(name, env_id)
-            same &= there.sha256 == frozen.sha256
-            print(
-                f"{env_id} {name}: {'the same' if there.sha256 == frozen.sha256 else 'DIFFERENT'}, {frozen.sha256}"
-            )
-    raise SystemExit(0 if same else 1)
+    made = (make(env_id, name, SIZES[name]) for env_id in arguments.env for name in arguments.sets)
+    raise SystemExit(0 if settle(made, arguments) else 1)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Makes the frozen scenes again: `python -m viapoint.training.make_scenes`.
+"""Makes the frozen scenes again and compares them with those shipped.
+
+    python -m viapoint.training.make_scenes [--env ID ...] [--sets test ...] [--write | --out DIR]
 
 `validation` and `test` are drawn from the training distribution with seeds that training never uses, a quarter of each
 set in each band of the solution share. `hard` holds scenes of some families, as many of each, all with a share below
@@ -14,8 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ from viapoint.envs.scenes import Scenes
 from viapoint.envs.space_distribution import NARROW, SpaceDistribution
 from viapoint.envs.space_sampling import SpaceSampler
 from viapoint.envs.task import Task
-from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands, load, shipped_path
+from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands
+from viapoint.training.remade_scenes import add_arguments, settle, shipped
 from viapoint.training.scene_search import Kinds, Source, measured, redrawn, search
 from viapoint.training.trial import Trial
 
@@ -170,36 +172,29 @@ def _source(
 
 
 def main() -> None:
-    """Make the sets named on the command line, or all, and say whether they are as they were."""
+    """Make the sets named on the command line, or all, and say whether they are as shipped."""
     parser = argparse.ArgumentParser(
         description="Make the frozen scenes again and compare their hashes with those shipped."
     )
-    parser.add_argument("--env", nargs="*", default=list(SETS), choices=list(SETS), help="environment ids")
-    parser.add_argument("--sets", nargs="*", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
+    parser.add_argument("--env", nargs="+", default=list(SETS), choices=list(SETS), help="environment ids")
+    parser.add_argument("--sets", nargs="+", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
     parser.add_argument(
         "--search", action="store_true", help="choose scenes anew, as for a set not there yet"
     )
-    parser.add_argument("--out", type=Path, default=None, help="folder to write to instead of the package's")
     parser.add_argument("--threads", type=int, default=0, help="of the simulation, 0 for one per core")
+    add_arguments(parser)
     arguments = parser.parse_args()
-    for env_id in arguments.env:
-        for name in (name for name in SETS[env_id] if name in arguments.sets):
-            shipped = shipped_path(name, env_id)
-            before = load(name, env_id) if shipped.is_file() else None
-            if before is None or arguments.search:
-                frozen = make(env_id, name, threads=arguments.threads)
-            else:
-                frozen = remake(before, threads=arguments.threads)
-            path = shipped if arguments.out is None else arguments.out / shipped.name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            frozen.save(path)
-            counts = ", ".join(f"{label}: {(frozen.band == i).sum()}" for i, label in enumerate(BANDS))
-            same = before is not None and before.sha256 == frozen.sha256
-            verdict = "unchanged" if same else "new" if before is None else f"was {before.sha256}"
-            print(
-                f"{path.name}: {len(frozen.share)} scenes ({counts}) sha256 {frozen.sha256} ({verdict})",
-                flush=True,
-            )
+
+    def each() -> Iterator[FrozenScenes]:
+        for env_id in arguments.env:
+            for name in (name for name in SETS[env_id] if name in arguments.sets):
+                before = None if arguments.search else shipped(name, env_id)
+                if before is None:
+                    yield make(env_id, name, threads=arguments.threads)
+                else:
+                    yield remake(before, threads=arguments.threads)
+
+    raise SystemExit(0 if settle(each(), arguments) else 1)
 
 
 if __name__ == "__main__":

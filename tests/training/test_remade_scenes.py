@@ -1,0 +1,54 @@
+"""Scenes that were made again: compared with those shipped, written only where one says so."""
+
+import argparse
+import dataclasses
+import sys
+
+import pytest
+
+from viapoint.training import make_online_scenes, make_scenes, remade_scenes
+from viapoint.training.frozen_scenes import load, shipped_path
+
+ENV = "viapoint/PlanarReach-v0"
+ONLINE = "viapoint/PlanarTargetJump-v0"
+
+
+def parsed(*words):
+    parser = argparse.ArgumentParser()
+    remade_scenes.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def changed(frozen):
+    return dataclasses.replace(frozen, scenes=frozen.scenes._replace(goal=0.99 * frozen.scenes.goal))
+
+
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize(("module", "env_id"), [(make_scenes, ENV), (make_online_scenes, ONLINE)])
+def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(
+    module, env_id, same, monkeypatch, capsys
+):
+    path, frozen = shipped_path("test", env_id), load("test", env_id)
+    before, made = path.read_bytes(), frozen if same else changed(frozen)
+    for maker in ("make", "remake"):
+        monkeypatch.setattr(module, maker, lambda *_, **__: made, raising=False)
+    monkeypatch.setattr(sys, "argv", ["make", "--env", env_id, "--sets", "test"])
+    with pytest.raises(SystemExit) as left:
+        module.main()
+    assert left.value.code == (0 if same else 1)
+    assert ("DIFFERENT" in capsys.readouterr().out) is not same
+    assert path.read_bytes() == before
+
+
+def test_scenes_go_where_one_says(tmp_path, monkeypatch):
+    frozen = load("test", ENV)
+    assert remade_scenes.settle([frozen], parsed("--out", str(tmp_path / "new")))
+    assert load(tmp_path / "new" / "planar_reach_test.npz", ENV).sha256 == frozen.sha256
+    monkeypatch.setattr(remade_scenes, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
+    assert not remade_scenes.settle([changed(frozen)], parsed("--write"))
+    assert load(tmp_path / "test.npz", ENV).sha256 == changed(frozen).sha256
+
+
+def test_there_is_one_place_to_write_to():
+    with pytest.raises(SystemExit):
+        parsed("--write", "--out", "elsewhere")
