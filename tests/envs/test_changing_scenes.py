@@ -1,0 +1,115 @@
+"""Scenes in which targets jump and obstacles move: drawn, given, refused, and hidden until it happens."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, make, play
+
+from viapoint.envs.registration import ONLINE_TASKS
+
+
+def test_what_lies_in_the_future_is_hidden():
+    (one, first), (other, second) = make(jumps=[[0.5, *OTHER]]), make(jumps=[[0.4, *START + 0.1]])
+    for _ in range(2):
+        for name, part in first.items():
+            np.testing.assert_array_equal(part, second[name])
+        (first, *_), (second, *_) = one.step(np.zeros(3)), other.step(np.zeros(3))
+    assert not np.array_equal(first["goal"], second["goal"])
+
+
+@pytest.mark.parametrize("env_id", ONLINE_TASKS)
+def test_the_scenes_of_an_episode_are_options_that_make_it_again(env_id):
+    drawn, given = gym.make_vec(env_id, num_envs=5), gym.make_vec(env_id, num_envs=5)
+    first, _ = drawn.reset(seed=3)
+    again, _ = given.reset(options=drawn.unwrapped.scenes.as_options())
+    for k in range(4):
+        for name, part in first.items():
+            np.testing.assert_array_equal(part, again[name])
+        actions = np.random.default_rng(k).uniform(-0.3, 0.3, drawn.action_space.shape)
+        (first, reward, over, *_), (again, same, *_) = drawn.step(actions), given.step(actions)
+        np.testing.assert_array_equal(reward, same)
+        if over.any():
+            return
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"jumps": [[0.0, *OTHER]]}, "jump 0 at 0 s lies in the past"),
+        ({"jumps": [[-0.1, *OTHER]]}, "lies in the past"),
+        ({"jumps": [[0.5, *OTHER], [0.4, *GOAL]]}, "jump 1 .*not after the one before"),
+        ({"jumps": [[99.0, *OTHER]]}, "not before the time limit"),
+        ({"jumps": [[0.2, 3.0, 0.0]]}, "target of jump 0 .* out of the arm's reach"),
+        ({"jumps": [[0.2, 3.0]]}, "shape"),
+        ({"jumps": [[0.2, np.nan, 0.3]]}, "finite"),
+        ({"jumps": [["soon", 0.0, 0.3]]}, "real numbers"),
+        ({"courses": [[0.1, 0.0, 0.0, 0.1, 0.0]]}, "course 0 belongs to no obstacle"),
+        (
+            {"obstacles": [[*START, 0.0, 0.0, 0.03]], "courses": [[0.1, 0.0, 0.0, 0.1, 0.0]]},
+            "obstacle 0 .* touches the arm at the start",
+        ),
+        (
+            {"obstacles": [[-0.1, 0.6, 0.0, 0.0, 0.03]], "courses": [[0.1, 0.0, 0.0, 0.2, 0.0]]},
+            "change of course 0 at 0 s lies in the past",
+        ),
+        (
+            {"obstacles": [[-0.1, 0.6, 0.0, 0.0, 0.03]], "courses": [[3.0, 0.0, 0.0, 3.0, 0.0]]},
+            "faster than",
+        ),
+        (
+            {"obstacles": [[*OTHER, 0.0, 0.0, 0.03]], "jumps": [[0.2, *OTHER]]},
+            "touches the arm at the target of jump 0",
+        ),
+    ],
+)
+def test_impossible_changes_are_refused_with_the_reason_and_nothing_has_changed(changes, reason):
+    env = gym.make(MOVING).unwrapped
+    before, _ = env.reset(seed=1)
+    with pytest.raises(ValueError, match=reason):
+        env.reset(options={"start": START, "goal": GOAL, **NO_ROWS, **changes})
+    after, _ = env.reset()
+    env.reset(seed=1)
+    again, _ = env.reset()
+    np.testing.assert_array_equal(after["goal"], again["goal"])
+    assert not np.array_equal(before["goal"], after["goal"])
+
+
+def test_jumps_and_courses_are_drawn_as_asked():
+    env = gym.make_vec(JUMP, num_envs=100, n_jumps=(0, 3), n_obstacles=2).unwrapped
+    env.reset(seed=0)
+    times, arm = env.scenes.jump_times, env.arm
+    assert set(np.isfinite(times).sum(axis=-1)) == {0, 1, 2, 3}
+    assert (np.diff(np.where(np.isfinite(times), times, 99.0 + np.arange(4)), axis=-1) > 0.0).all()
+    assert (arm.reach_margin(env.scenes.jumps[np.isfinite(times)][:, 1:]) > 0.0).all()
+    moving = gym.make_vec(MOVING, num_envs=200).unwrapped
+    moving.reset(seed=0)
+    scenes = moving.scenes
+    speed = np.linalg.norm(scenes.courses[..., :2], axis=-1)[scenes.present]
+    assert (speed > 0.0).mean() > 0.9
+    assert 0.3 < scenes.turns[scenes.present].mean() < 0.7
+
+
+def test_any_jumps_and_courses_are_played_or_refused_with_a_reason():
+    generator, found = np.random.default_rng(0), {True: 0, False: 0}
+    env = gym.make(MOVING).unwrapped
+    edges = [0.0, -0.0, 1e-300, 1e-9, 1e-3, 0.3, 2.4, 2.5, 1e9, -1.0]
+    for seed in range(150):
+        env.reset(seed=seed)
+        options = {name: part[0] for name, part in env.batch.scenes.as_options().items()}
+        number = int((options["obstacles"][:, -1] > 0.0).sum())
+        options["obstacles"], courses = options["obstacles"][:number], options["courses"][:number]
+        nasty = generator.random(courses.shape) < 0.05
+        courses = np.where(nasty, generator.choice(edges, courses.shape), courses)
+        jumps = np.column_stack(
+            (np.sort(generator.choice(edges[2:8], 2)), options["goal"] + generator.uniform(-0.1, 0.1, (2, 2)))
+        )
+        reason = ""
+        try:
+            env.reset(options={**options, "jumps": jumps[: seed % 3], "courses": courses})
+        except ValueError as error:
+            reason = str(error)
+        assert not reason or reason.startswith("scene 0: ")
+        found[not reason] += 1
+        for info in () if reason else play(env, actions=0.5, seed=seed):
+            assert np.isfinite(list(info.values())).all()
+    assert min(found.values()) > 20
