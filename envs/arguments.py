@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, cast
@@ -22,6 +23,14 @@ def whole_number(name: str, value: Any, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
     return int(value)
+
+
+def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments as they are now, whatever becomes of a caller's lists and mappings."""
+    return {
+        name: copy.copy(value) if isinstance(value, Mapping | list) else value
+        for name, value in arguments.items()
+    }
 
 
 def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:

@@ -35,7 +35,7 @@ def given_changes(
     refuse_unknown_options(options, (*GIVEN, *CHANGES))
     jumps, courses = None, None
     if "jumps" in options:
-        jumps = _padded("jumps", options["jumps"], (number, MOST_JUMPS, dimension + 1))
+        jumps = _packed(_padded("jumps", options["jumps"], (number, MOST_JUMPS, dimension + 1)))
     if "courses" in options:
         if "obstacles" not in options:
             raise ValueError("options['courses'] are those of options['obstacles'], which must be given, too")
@@ -53,6 +53,12 @@ def check_owners(courses: Float, present: NDArray[np.bool_]) -> None:
         raise ValueError(
             f"scene {scene}: course {row} belongs to no obstacle; there are {present[scene].sum()}"
         )
+
+
+def _packed(rows: Float) -> Float:
+    """Rows of zeros, which are none, behind the others."""
+    order = np.argsort((rows == 0.0).all(axis=-1), axis=-1, kind="stable")
+    return np.take_along_axis(rows, order[..., None], axis=1)
 
 
 def _padded(name: str, value: Any, shape: tuple[int, int, int]) -> Float:

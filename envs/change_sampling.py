@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,12 @@ from viapoint.envs.scenes import FARTHEST_CENTRE, Scenes, rest_clearance
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
 CANDIDATES, ATTEMPTS = 8, 40
 """Jumps and courses that are drawn at once, and how often jumps are drawn until some fit."""
+REDRAWN = 100
+"""How often other scenes are drawn instead of those in which no jump fits: one in a few hundred of some tasks."""
 LOOKS = 10
 """At how many times it is looked whether start and goal are free."""
 
@@ -88,6 +91,8 @@ class ChangeSampler:
         scenes: Scenes,
         jumps: Float | None = None,
         courses: Float | None = None,
+        *,
+        again: Callable[[Index], Scenes] | None = None,
     ) -> ChangingScenes:
         """What will become of N scenes.
 
@@ -96,10 +101,34 @@ class ChangeSampler:
             scenes: N scenes; obstacles whose courses are drawn will be there when a movement may meet them.
             jumps: Given ones, shape (N, MOST_JUMPS, D + 1).
             courses: Given ones, shape (N, n, 2 D + 1).
+            again: Draws other scenes instead of some, where no jump fits in; without it they are refused.
 
         Raises:
             RuntimeError: No jump that fits was found in many attempts.
         """
+        changing, left = self._changing(generators, scenes, jumps, courses)
+        for _ in range(REDRAWN if again else 0):
+            if not left.size:
+                break
+            assert again is not None
+            others, still = self._changing([generators[int(i)] for i in left], again(left), jumps, courses)
+            changing.put(left, others)
+            left = left[still]
+        if left.size:
+            start, goal = changing.start[left[0]], changing.goal[left[0]]
+            raise RuntimeError(
+                f"no jump of the target was found in {ATTEMPTS} attempts from start {start}, goal {goal}"
+            )
+        return changing
+
+    def _changing(
+        self,
+        generators: Sequence[np.random.Generator],
+        scenes: Scenes,
+        jumps: Float | None,
+        courses: Float | None,
+    ) -> tuple[ChangingScenes, Index]:
+        """What will become of N scenes, and those in which no jump fits."""
         number, dimension = scenes.start.shape
         still = np.zeros((number, scenes.obstacles.shape[1], 2 * dimension + 1))
         none = np.zeros((number, MOST_JUMPS, dimension + 1))
@@ -108,28 +137,25 @@ class ChangeSampler:
             obstacles, moving = self._courses(generators, scenes)
         changing = ChangingScenes(scenes.start, scenes.goal, obstacles, none, moving)
         if jumps is not None:
-            return changing._replace(jumps=jumps)
-        if self.distribution.n_jumps[1]:
-            self._jump(generators, changing)
-        return changing
+            return changing._replace(jumps=jumps), np.arange(0)
+        if not self.distribution.n_jumps[1]:
+            return changing, np.arange(0)
+        return changing, self._jump(generators, changing)
 
-    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> None:
-        """Draw jumps into scenes, all of an episode at once, until all fit."""
+    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> Index:
+        """Draw jumps into scenes, all of an episode at once, until all fit; which are left."""
         fewest, most = self.distribution.n_jumps
         pending = np.arange(len(scenes.start))
         size = 1 + most * (1 + 3 * CANDIDATES)
         for _ in range(ATTEMPTS):
+            if not len(pending):
+                break
             u = Uniforms(np.stack([generators[int(i)].random(size) for i in pending]))
             number = fewest + np.floor((most - fewest + 1) * u.take(1)[:, 0])
             good, jumps = self._attempt(u, number, scenes.take(pending))
             scenes.jumps[pending[good]] = jumps[good]
             pending = pending[~good]
-            if not len(pending):
-                return
-        start, goal = scenes.start[pending[0]], scenes.goal[pending[0]]
-        raise RuntimeError(
-            f"no jump of the target was found in {ATTEMPTS} attempts from start {start}, goal {goal}"
-        )
+        return pending
 
     def _attempt(self, u: Uniforms, number: Float, scenes: ChangingScenes) -> tuple[Bool, Float]:
         """Which of N episodes got all their jumps, and the jumps; the hand is thought to follow without detours."""

@@ -98,7 +98,7 @@ class DecisionEnds:
             raise ValueError(f"decide_at must be some of {', '.join(TRIGGERS)}, got {triggers!r}")
         number_of_at_least("horizon", horizon, timestep, " (a control step)")
         self.triggers, self.margin = frozenset(triggers), number_of_at_least("margin", margin, 0.0)
-        self.horizon, self.limit = self.steps(horizon), self.steps(time_limit)
+        self.horizon, self.limit = self.steps(min(horizon, time_limit)), self.steps(time_limit)
 
     def steps(self, time: Any) -> Any:
         """The first physics step at or after a time [s]; NEVER for an infinite one."""

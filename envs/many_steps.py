@@ -45,7 +45,7 @@ class ManyStepVectorEnv(ReachVectorEnv):
             infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
             self._start(rows, self._draw(self._generators, rows, {}))
             observation = self._observe_start()
-        return observation, reward, terminated, truncated, infos
+        return observation, reward, terminated.copy(), truncated.copy(), infos
 
 
 class ManyStepEnv(ReachEnv):

@@ -9,7 +9,7 @@ import gymnasium as gym
 from gymnasium.utils import EzPickle
 
 from viapoint.envs.action import Plan
-from viapoint.envs.arguments import real_numbers
+from viapoint.envs.arguments import as_given, real_numbers
 from viapoint.envs.execution import Rollout
 from viapoint.envs.reach_vector import METADATA, Observation, ReachVectorEnv
 
@@ -28,7 +28,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
         if "num_envs" in kwargs:
             raise TypeError("num_envs is an argument of gym.make_vec; gym.make makes one environment")
-        EzPickle.__init__(self, threads=threads, **kwargs)
+        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
         self.batch = self.batch_kind(1, threads=threads, **kwargs)
         """The batch of one that this environment is."""
         self.observation_space = self.batch.single_observation_space

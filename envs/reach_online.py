@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan, Timing
-from viapoint.envs.arguments import checked_actions, fewest_and_most, refuse_unknown
+from viapoint.envs.arguments import as_given, checked_actions, checked_plan, fewest_and_most, refuse_unknown
 from viapoint.envs.arms import ADULT, Arm
 from viapoint.envs.change_options import CHANGES, check_owners, given_changes
 from viapoint.envs.change_sampling import ChangeDistribution, ChangeSampler
@@ -93,10 +93,11 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
             "threads": threads,
         }  # fmt: skip
         super().__init__(num_envs, reward_weights=reward_weights, **kwargs)
-        EzPickle.__init__(
-            self, num_envs, moving_obstacles=moving_obstacles, n_jumps=n_jumps, decide_at=decide_at, horizon=horizon,
-            margin=margin, reward_weights=reward_weights, **kwargs,
-        )  # fmt: skip
+        kwargs |= {
+            "moving_obstacles": moving_obstacles, "n_jumps": n_jumps, "decide_at": decide_at, "horizon": horizon,
+            "margin": margin, "reward_weights": reward_weights,
+        }  # fmt: skip
+        EzPickle.__init__(self, num_envs, **as_given(kwargs))
         if timing != "optimal":
             raise ValueError(
                 f"timing must be optimal where plans are revised: passage times follow from the state; got {timing!r}"
@@ -188,11 +189,11 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
             plan: Of num_envs movements with as many via-points as those of an action.
         """
         state, shape = self.default.state, self._episodes.plan.waypoints.shape
+        plan = checked_plan(plan, state.position)
         if plan.waypoints.shape != shape:
             raise ValueError(f"plan must have waypoints of shape {shape}, got {plan.waypoints.shape}")
-        waypoints = np.array(plan.waypoints)
-        waypoints[:, 0] = state.position
-        moving = MovingPlan(waypoints, np.array(plan.durations), state.velocity, state.acceleration)
+        waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
+        moving = MovingPlan(waypoints, plan.durations.copy(), state.velocity, state.acceleration)
         return self._carry_out(moving, np.ones(self.num_envs, dtype=bool))
 
     def _carry_out(self, plan: MovingPlan, revised: Bool) -> Decision:
@@ -255,11 +256,13 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         scene = {name: value for name, value in options.items() if name not in CHANGES}
         layout = self.task.observation
         jumps, courses = given_changes(options, len(rows), layout.dimension, layout.n_rows)
-        scenes = super()._draw(tried, rows, scene)
+        draw = super()._draw
+        scenes = draw(tried, rows, scene)
         if courses is not None:
             check_owners(courses, scenes.present)
+        again = None if options else lambda some: draw(tried, rows[some], {})
         try:
-            changing = self._change_sampler([tried[i] for i in rows], scenes, jumps, courses)
+            changing = self._change_sampler([tried[i] for i in rows], scenes, jumps, courses, again=again)
         except RuntimeError as error:
             raise ValueError(f"{error}; give the jumps, too") from None
         if jumps is not None or courses is not None:

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
-from viapoint.envs.arguments import checked_actions, refuse_unknown
+from viapoint.envs.arguments import as_given, checked_actions, refuse_unknown
 from viapoint.envs.arms import ADULT, Arm
 from viapoint.envs.execution import SETTLING, Rollout
 from viapoint.envs.many_steps import ManyStepEnv, ManyStepVectorEnv
@@ -112,7 +112,8 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         if not isinstance(weights, StepRewardWeights):
             raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
         super().__init__(num_envs, reward_weights=weights, **kwargs)
-        EzPickle.__init__(self, num_envs, control_step=control_step, reward_weights=reward_weights, **kwargs)
+        kwargs = {"control_step": control_step, "reward_weights": reward_weights, **kwargs}
+        EzPickle.__init__(self, num_envs, **as_given(kwargs))
         arm, timestep = self.arm, self._simulator.timestep
         self.steering = Steering(dimension=arm.dimension, control_step=control_step, timestep=timestep)
         """What the components of an action mean."""

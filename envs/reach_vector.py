@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.action import ActionLayout, Plan, Timing
 from viapoint.envs.arguments import (
+    as_given,
     checked_actions,
     checked_plan,
     fewest_and_most,
@@ -99,11 +100,12 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         **unknown: Any,
     ) -> None:
         refuse_unknown(unknown, type(self).__init__.__annotations__)
-        EzPickle.__init__(
-            self, num_envs, arm=arm, whole_arm=whole_arm, n_via=n_via, n_obstacles=n_obstacles, timing=timing,
-            duration_range=duration_range, reward_weights=reward_weights, render_mode=render_mode,
-            width=width, height=height, threads=threads,
-        )  # fmt: skip
+        kwargs: dict[str, Any] = {
+            "arm": arm, "whole_arm": whole_arm, "n_via": n_via, "n_obstacles": n_obstacles, "timing": timing,
+            "duration_range": duration_range, "reward_weights": reward_weights, "render_mode": render_mode,
+            "width": width, "height": height, "threads": threads,
+        }  # fmt: skip
+        EzPickle.__init__(self, num_envs, **as_given(kwargs))
         arm = arm_of(arm)
         if not isinstance(whole_arm, bool | np.bool_):
             raise TypeError(f"whole_arm must be True or False, got {whole_arm!r}")

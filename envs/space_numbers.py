@@ -28,7 +28,7 @@ class Numbers:
     def __init__(self, generators: Sequence[np.random.Generator], size: int) -> None:
         """From N generators, `size` numbers for each attempt; of a generator that several share none go ahead."""
         self._generators, self._size = generators, size
-        self._apart = len({id(each) for each in generators}) == len(generators)
+        self._apart = len({id(each.bit_generator) for each in generators}) == len(generators)
         self._group = 0
         self._groups: tuple[int, ...] = ()
         self._states: list[list[Any]] = []

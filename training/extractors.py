@@ -48,7 +48,7 @@ class SceneExtractor(BaseFeaturesExtractor):
         hand, goal = observation["hand"], observation["goal"]
         start = observation.get("start", hand)
         line = goal - start if "start" in observation else direction(observation)
-        axes = torch.stack(frame(line), dim=-2)
+        axes = torch.stack(frame(_somewhere(line)), dim=-2)
         middle = 0.5 * (start + goal)
         distance = (goal - start).norm(dim=-1, keepdim=True)
         own = [2.0 * middle, 2.0 * (goal - middle), 2.0 * distance]
@@ -78,6 +78,12 @@ class SceneExtractor(BaseFeaturesExtractor):
 
 EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExtractor}
 """By the name that a model's file knows them by."""
+
+
+def _somewhere(line: Tensor) -> Tensor:
+    """The same lines but for those of no length, as after a movement that ended in the goal itself: any will do."""
+    ahead = torch.eye(line.shape[-1], dtype=line.dtype, device=line.device)[0]
+    return torch.where((line * line).sum(dim=-1, keepdim=True) > 0.0, line, ahead)
 
 
 def _turned(axes: Tensor, vectors: Tensor) -> Tensor:

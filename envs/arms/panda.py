@@ -11,6 +11,7 @@ Emika Panda, ICCMA 2021.)
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,6 +41,7 @@ TURN = 1.4
 """Greatest turn of the hand about that axis to either side, [rad]."""
 
 
+@dataclass(frozen=True)
 class PandaPosture:
     """See :class:`~viapoint.envs.arms.serial.Posture`."""
 

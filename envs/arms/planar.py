@@ -131,7 +131,12 @@ class PlanarArm:
         """
         xp = namespace_of(hand)
         (c1, s1), _ = self._directions(hand)
-        upper = self.lengths[0] / xp.sqrt(c1 * c1 + s1 * s1)
+        square = c1 * c1 + s1 * s1
+        somewhere = (
+            square > 0.0
+        )  # over the shoulder any direction would do: the posture's is that of the first axis
+        c1, one = xp.where(somewhere, c1, xp.ones_like(c1)), xp.ones_like(square)
+        upper = self.lengths[0] / xp.sqrt(xp.where(somewhere, square, one))
         elbow = last(xp.stack((c1 * upper, s1 * upper)))
         return (xp.zeros_like(elbow), elbow), (elbow, hand)
 

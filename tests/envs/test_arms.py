@@ -1,5 +1,8 @@
 """Laws of the arms."""
 
+import copy
+import pickle
+
 import mujoco
 import numpy as np
 import pytest
@@ -68,6 +71,22 @@ def test_links_are_known_without_angles(library):
     reached = (distance > ADULT.reach[0]) & (distance < ADULT.reach[1])
     np.testing.assert_allclose(end[reached], exact[reached][:, 1, 1], atol=1e-14)
     assert 0.2 < reached.mean() < 0.8
+
+
+@pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
+def test_links_are_known_with_the_hand_in_the_shoulder(library):
+    """Where no posture puts it and any direction would do; a straight movement may pass there."""
+    hand = np.zeros((2, 2))
+    for link, exact in zip(
+        ADULT.links_at(library(hand)), ADULT.links(ADULT.posture(hand))[:, :, 0].swapaxes(0, 1), strict=False
+    ):
+        np.testing.assert_allclose(np.asarray(link[0]), exact, atol=1e-14)
+
+
+def test_copies_of_an_arm_are_equal(arm):
+    for other in (pickle.loads(pickle.dumps(arm)), copy.deepcopy(arm)):
+        assert other == arm
+        assert hash(other) == hash(arm)
 
 
 def test_links_hang_together_and_have_their_lengths():

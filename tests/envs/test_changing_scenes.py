@@ -3,8 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, make, play
+from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, events, make, play
 
+from viapoint.envs.change_sampling import ChangeSampler
 from viapoint.envs.registration import ONLINE_TASKS
 
 
@@ -87,6 +88,34 @@ def test_jumps_and_courses_are_drawn_as_asked():
     speed = np.linalg.norm(scenes.courses[..., :2], axis=-1)[scenes.present]
     assert (speed > 0.0).mean() > 0.9
     assert 0.3 < scenes.turns[scenes.present].mean() < 0.7
+
+
+def test_where_no_jump_fits_another_scene_is_drawn():
+    """In one of a few hundred of these; the seeds of all others give what they would give alone."""
+    several = {"whole_arm": True, "n_obstacles": (1, 4)}
+    first, _ = gym.make_vec(JUMP, num_envs=64, **several).reset(seed=0)
+    alone = gym.make(JUMP, **several)
+    for seed in (36, 37, 38):  # none fits into what is drawn first from 37
+        for name, part in alone.reset(seed=seed)[0].items():
+            np.testing.assert_array_equal(part, first[name][seed])
+
+
+def test_a_given_scene_in_which_no_jump_fits_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        ChangeSampler, "_fits", lambda self, scenes, time, targets, _: np.zeros(targets.shape[:2], bool)
+    )
+    env = gym.make(JUMP).unwrapped
+    with pytest.raises(ValueError, match=r"no jump .* from start \[-0.3  0.4\].* give the jumps, too"):
+        env.reset(seed=0, options={"start": START, "goal": GOAL})
+    with pytest.raises(ValueError, match="no jump"):  # as there is none anywhere
+        env.reset(seed=0)
+
+
+def test_rows_of_zeros_are_no_jumps_wherever_they_stand():
+    rows = [[0.3, *OTHER], [0.0, 0.0, 0.0], [0.5, 0.1, 0.45]]
+    (gap, _), (packed, _) = make(jumps=rows), make(jumps=rows[::2])
+    np.testing.assert_array_equal(gap.batch.scenes.jumps, packed.batch.scenes.jumps)
+    assert events(play(gap)) == events(play(packed))
 
 
 def test_any_jumps_and_courses_are_played_or_refused_with_a_reason():

@@ -181,6 +181,29 @@ def test_pickles(env_id):
     assert env.reset(seed=4)[0].keys() == native.reset(seed=4)[0].keys()
 
 
+def test_a_pickled_environment_is_as_it_was_made_whatever_becomes_of_the_arguments(env_id):
+    weights = {"smoothness": 0.2}
+    for env in (
+        gym.make(env_id, reward_weights=weights).unwrapped,
+        gym.make_vec(env_id, num_envs=2, reward_weights=weights),
+    ):
+        weights["smoothness"] = 5.0
+        assert pickle.loads(pickle.dumps(env)).task.weights == env.task.weights
+        weights["smoothness"] = 0.2
+
+
+def test_what_a_step_returns_may_be_written_to(env_id):
+    """As a wrapper may that ends episodes by a limit of its own."""
+    env, same = (gym.make_vec(env_id, num_envs=3, threads=1) for _ in range(2))
+    env.reset(seed=1)
+    same.reset(seed=1)
+    for _ in range(4):
+        results = [each.step(np.zeros(env.action_space.shape)) for each in (env, same)]
+        for mine, theirs in zip(*(result[1:4] for result in results), strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+            mine[:] = 1
+
+
 def test_vector_environment_names_its_autoreset_mode_and_counts_physics_steps(env_id):
     env = gym.make_vec(env_id, num_envs=4)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP

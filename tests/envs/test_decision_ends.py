@@ -18,6 +18,11 @@ def test_decisions_end_when_their_horizon_has_passed():
     assert sum(info["elapsed"] for info in infos) == pytest.approx(infos[-1]["time"])
 
 
+def test_a_horizon_beyond_the_episode_ends_nothing():
+    env, _ = make(decide_at=("horizon",), horizon=1e300)
+    assert events(play(env)) == [Event.ARRIVAL]
+
+
 def test_a_hand_that_arrives_early_rests_until_something_happens():
     env, _ = make(jumps=[[1.5, *OTHER]], decide_at=())
     infos = play(env)

@@ -216,5 +216,10 @@ def test_a_plan_in_metres_and_seconds_can_be_performed_on_the_way():
     (_, before), (time, after) = env.last_plans
     np.testing.assert_array_equal(after.waypoints, waypoints)
     np.testing.assert_allclose(before.states(np.array([time])).acceleration, after.acceleration, atol=1e-9)
+    waypoints[:, 0] = batch.default.state.position
     with pytest.raises(ValueError, match=r"waypoints of shape \(1, 3, 2\)"):
         batch.perform(Plan(waypoints[:, ::2], np.array([[0.7]])))
+    with pytest.raises(ValueError, match=r"durations of shape \(1, 2\)"):
+        batch.perform(Plan(waypoints, np.array([0.3, 0.4])))
+    with pytest.raises(ValueError, match="must begin where the hand is"):
+        batch.perform(Plan(waypoints + 0.1, np.array([[0.3, 0.4]])))

@@ -56,6 +56,15 @@ def test_every_obstacle_that_is_there_matters_and_no_other():
         assert (different == present[:, row]).all()
 
 
+@pytest.mark.parametrize("env_id", [*IDS, "viapoint/PandaObstacles-v0", "viapoint/PlanarTargetJump-v0"])
+def test_a_hand_that_ended_in_the_goal_itself_is_seen(env_id):
+    """As it may after the last step of an episode, which learning looks at although nothing comes of it."""
+    extractor, observation = observed(env_id)
+    there = {**observation, "hand": observation["goal"]}
+    assert torch.isfinite(extractor(there)).all()
+    assert torch.isfinite(extractor.float()({name: part.float() for name, part in there.items()})).all()
+
+
 def test_velocities_are_seen_along_the_line():
     """Turning everything about the shoulder changes nothing but where start and goal are."""
     extractor, observation = observed(IDS[2])
