@@ -26,7 +26,7 @@ from typing import Any
 import tyro
 from study import gather, page, work
 from study.figures import draw
-from study.merge import merged
+from study.merge import check_conditions, merged
 from study.plan import Study
 
 from viapoint.training.files import read_json, write_bytes, write_json
@@ -36,15 +36,21 @@ Answer = tuple[bool, str]
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Do what is left to do, write the page, and return how many jobs failed."""
+    """Do what is left to do, write the page, and return how many jobs failed; 1 if the page is of other conditions."""
     study = tyro.cli(Study, args=words, config=(tyro.conf.OmitArgPrefixes,))
+    known = study.docs / "results.json"
+    before = read_json(known) if known.is_file() and "page" in study.only and not study.alone else None
+    try:
+        check_conditions(study, before or gather.conditions(study))
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 1
     failed = carry_out(work.jobs(study), study.jobs)
     if "time" in study.only:
         print(work.time_decisions(study), flush=True)
     if "page" in study.only:
-        record, known = gather.gather(study), study.docs / "results.json"
-        if known.is_file() and not study.alone:
-            record = merged(record, read_json(known))
+        record = gather.gather(study)
+        record = record if before is None else merged(record, before)
         study.docs.joinpath("images").mkdir(parents=True, exist_ok=True)
         write_json(known, record)
         write_bytes(study.docs / "results.md", page.page(record).encode())

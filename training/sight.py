@@ -1,6 +1,6 @@
 """What can be seen of a planned movement: how near it comes to the obstacles, where, and whether the arm reaches.
 
-All of it is an exact function of scene and path, of NumPy arrays and of torch tensors, and differentiable with respect
+All of it is a function of scene and path, of NumPy arrays and of torch tensors, and differentiable with respect
 to the path. The nearest pair of points is searched for without gradients, over every body, obstacle and time; only the
 pairs found are then differentiated.
 """

@@ -28,14 +28,19 @@ def gather(study: Study) -> Numbers:
         {
             "versions": versions(),
             "seeds": list(study.seeds),
-            "trial": {"n_timesteps": study.n_timesteps, "n_scenes": study.n_scenes},
-            "candidates": study.candidates,
+            **conditions(study),
             "environments": {env: _environment(env, study) for env in study.environments},
             "ablations": {env: _table(env, ABLATIONS, {}, study) for env in study.studied},
             "freedom": {env: _freedom(env, study) for env in study.studied},
         }
     )
     return record
+
+
+def conditions(study: Study) -> Numbers:
+    """What must be the same for numbers to stand side by side."""
+    trial = {"n_timesteps": study.n_timesteps, "n_scenes": study.n_scenes}
+    return {"trial": trial, "candidates": study.candidates}
 
 
 def _environment(env: str, study: Study) -> Numbers:

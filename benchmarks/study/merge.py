@@ -1,7 +1,8 @@
 """New numbers beside those that the page holds already, so that a study can grow on more than one machine.
 
 A page's numbers outlive the run folders they come from. What was not measured again stays as it is, as long as it was
-measured on the same scenes; of one method the entry with more seeds counts, of equally many the new one.
+measured on the same scenes. A method that was measured again replaces the entry there is once it tells all that this
+does, of as many seeds: on the same sets, and beside the same baselines.
 """
 
 from __future__ import annotations
@@ -9,25 +10,40 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from study.gather import improvement
-from study.plan import ABLATIONS, FREEDOM, METHODS, WHOLE, Variant
+from study.gather import conditions, improvement
+from study.plan import ABLATIONS, FREEDOM, METHODS, WHOLE, Study, Variant
 from viapoint.envs.registration import TASKS
 from viapoint.training.baselines import METHODS as BASELINE_METHODS
 
 Numbers = dict[str, Any]
-CONDITIONS = ("trial", "candidates")
-"""What must be the same in two records for their numbers to stand side by side."""
+
+
+def check_conditions(study: Study, old: Numbers) -> None:
+    """Refuse to put numbers beside others that were measured under other conditions.
+
+    Raises:
+        ValueError: The old record is of other numbers of decisions, scenes or candidates.
+    """
+    for name, mine in conditions(study).items():
+        if mine != old[name]:
+            raise ValueError(
+                f"{study.docs / 'results.json'} holds results with {name} = {old[name]}, these would be with {mine}: "
+                "name another folder with --docs, or replace them with --alone"
+            )
 
 
 def merged(new: Numbers, old: Numbers) -> Numbers:
-    """A record of what is in either; nothing of the old one where it was measured under other conditions."""
-    if any(new[name] != old[name] for name in CONDITIONS):
-        return new
-    environments = {env: dict(each) for env, each in old["environments"].items()}
+    """A record of what is in either, under the same conditions; nothing old where the scenes are others."""
+    environments = dict(old["environments"])
+    others = [
+        env
+        for env, each in new["environments"].items()
+        if env in environments and environments[env]["sets"] != each["sets"]
+    ]
     for env, each in new["environments"].items():
         known = environments.get(env, each)
-        same = known["sets"] == each["sets"]
-        environments[env] = _environment(each, known) if same else each
+        environments[env] = each if env in others else _environment(each, known)
+    old = {**old, **{name: _without(old[name], others) for name in ("ablations", "freedom")}}
     studied = {env: each for env, each in environments.items() if each["methods"] or each["baselines"]}
     return {
         **new,
@@ -36,6 +52,10 @@ def merged(new: Numbers, old: Numbers) -> Numbers:
         "ablations": _each(new["ablations"], old["ablations"], _ablations),
         "freedom": _each(new["freedom"], old["freedom"], _freedom),
     }
+
+
+def _without(numbers: Numbers, environments: Sequence[str]) -> Numbers:
+    return {env: each for env, each in numbers.items() if env not in environments}
 
 
 def _each(new: Numbers, old: Numbers, join: Callable[[Any, Any], Any]) -> Numbers:
@@ -59,10 +79,16 @@ def _freedom(new: Numbers, old: Numbers) -> Numbers:
 
 def _environment(new: Numbers, old: Numbers) -> Numbers:
     """One environment's; what compares or describes the whole agent comes from where its entry does."""
-    methods = _joined(new["methods"], old["methods"], METHODS)
+    told = all(_covers(new[name], old[name]) for name in ("failures", "compared"))
+    found = [each for each in new["methods"] if told or each["name"] != WHOLE.name]
+    methods = _joined(found, old["methods"], METHODS)
     mine = {each["name"] for each in methods if each in new["methods"]}
     whole = new if WHOLE.name in mine else old
-    baselines = {each["name"]: each for each in (*old["baselines"], *new["baselines"])}
+    baselines = {each["name"]: each for each in old["baselines"]}
+    for each in new["baselines"]:
+        known = baselines.get(each["name"], each)["sets"]
+        sets = {name: found for name, found in each["sets"].items() if _covers(found, known.get(name))}
+        baselines[each["name"]] = {**each, "sets": {**known, **sets}}
     return {
         "sets": new["sets"],
         "methods": methods,
@@ -82,9 +108,17 @@ def _joined(new: Sequence[Numbers], old: Sequence[Numbers], order: Sequence[Vari
     """One entry of each method."""
     entries = {each["name"]: each for each in old}
     for each in new:
-        known = entries.get(each["name"], each)
-        entries[each["name"]] = each if len(each["seeds"]) >= len(known["seeds"]) else known
+        known = entries.get(each["name"], {"seeds": [], "sets": {}})
+        if len(each["seeds"]) >= len(known["seeds"]) and _covers(each["sets"], known["sets"]):
+            entries[each["name"]] = each
     return [entries[name] for name in _names(order, entries)]
+
+
+def _covers(new: Any, old: Any) -> bool:
+    """Whether new numbers tell all that the old ones do."""
+    if isinstance(old, dict):
+        return not old or (isinstance(new, dict) and all(_covers(new.get(name), old[name]) for name in old))
+    return old is None or new is not None
 
 
 def _names(order: Sequence[Variant], known: Iterable[str]) -> list[str]:

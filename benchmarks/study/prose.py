@@ -29,9 +29,9 @@ machine makes it longer, never shorter.
 KNOWLEDGE = """## What the critic knows, and what it must learn
 
 By construction it knows the *plan*. An action expands into a minimum-jerk movement by formulas, so the features it
-is given are exact: how near the planned path comes to each obstacle in each stretch, whether it stays within reach,
-how jerky it is. The terms of the reward that the plan alone decides (smoothness, duration, clearance of the plan)
-are added as formulas and never learnt.
+is given are computed: how near the planned path comes to each obstacle in each stretch (near contact, to a fraction
+of a millimetre), whether it stays within reach, how jerky it is. The terms of the reward that the plan alone decides
+(smoothness, duration, clearance of the plan) are added as formulas and never learnt.
 
 It must learn what no formula says: what the physics makes of the plan (the arm lags and overshoots, torque is
 limited, a contact anywhere ends all hope of success), so how much clearance is enough; and the actor must learn

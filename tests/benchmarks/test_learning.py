@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from study import gather, page, work
-from study.merge import merged
 from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, placed
 
 from viapoint.training.compiled import CannotCompileError
@@ -185,50 +184,6 @@ def synthetic(record, names, gains):
             way["by_band"] = {band: [0.5 + gain, 0.45 + gain, 0.55 + gain] for band in way["by_band"]}
         found.append(entry)
     return found
-
-
-def part(record, names):
-    """The record of a machine that measured some of the methods only."""
-    some = copy.deepcopy(record)
-    for each in some["environments"].values():
-        each["methods"] = [method for method in each["methods"] if method["name"] in names]
-        each["curves"] = {name: curve for name, curve in each["curves"].items() if name in names}
-        if WHOLE.name not in names:
-            each["failures"] = {name: {} for name in each["failures"]}
-            each["compared"] = {name: {} for name in each["compared"]}
-        each["improvement"] = gather.improvement(each["methods"])
-    return some
-
-
-def test_parts_that_were_measured_apart_make_the_whole_page():
-    record = read_json(DOCS / "results.json")
-    assert merged(record, record) == record
-    whole, others = part(record, [WHOLE.name]), part(record, ["sac", "td3", "ppo", "tqc", "sac-step"])
-    whole["ablations"], others["freedom"] = {}, {}
-    for env in list(others["environments"])[1:]:
-        others["environments"][env]["baselines"] = []
-    assert merged(whole, others) == record
-    assert merged(others, whole) == record
-
-
-def test_of_one_method_the_entry_with_more_seeds_is_kept():
-    record = read_json(DOCS / "results.json")
-    fewer = part(record, [WHOLE.name])
-    for each in fewer["environments"].values():
-        each["methods"][0] = {**each["methods"][0], "seeds": [0], "label": "again"}
-    there = [each["methods"][0] for each in merged(fewer, record)["environments"].values()]
-    assert [each["label"] == "again" for each in there] == [
-        len(each["methods"][0]["seeds"]) == 1 for each in record["environments"].values()
-    ]
-
-
-def test_numbers_of_other_scenes_or_other_conditions_are_not_mixed():
-    record = read_json(DOCS / "results.json")
-    other = part(record, ["sac"])
-    other["environments"][ENV]["sets"]["test"]["sha256"] = "of other scenes"
-    assert [each["name"] for each in merged(other, record)["environments"][ENV]["methods"]] == ["sac"]
-    trial = {**part(record, ["sac"]), "trial": {"n_timesteps": 64, "n_scenes": 8}}
-    assert merged(trial, record) == trial
 
 
 def test_ablations_and_freedom_are_told_by_band(done):
