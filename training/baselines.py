@@ -113,14 +113,14 @@ class AgentMethod:
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """See :class:`Method`; the scenes are not looked at."""
         policy = self._model.policy
-        before = getattr(policy, "candidates", 0)
-        if self._candidates:
+        own = getattr(policy, "candidates", None)
+        if own is not None:
             policy.candidates = self._candidates
         try:
             actions, _ = self._model.predict(observation, deterministic=True)
         finally:
-            if self._candidates:
-                policy.candidates = before
+            if own is not None:
+                policy.candidates = own
         return np.asarray(actions, dtype=np.float64)
 
 

@@ -22,6 +22,7 @@ from viapoint.training.drawn_scenes import scenes_for
 from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
+from viapoint.training.frozen_scenes import SETS, FrozenScenes
 from viapoint.training.online_methods import Unrevised
 from viapoint.training.online_trial import OnlineTrial
 from viapoint.training.runs import Run, find_model, load_model
@@ -102,14 +103,15 @@ def evaluate(config: EvaluateConfig) -> None:
     """Measure, print the table, and write the results."""
     agent = find_agent(config.run, config.pretrained) if config.run or config.pretrained else None
     env_id, env_kwargs = _task_of(config, agent)
-    frozen = scenes_for(config.scenes, env_id, env_kwargs).take(slice(0, config.n_scenes))
+    whole = scenes_for(config.scenes, env_id, env_kwargs)
+    frozen = whole.take(slice(0, config.n_scenes))
     methods = _methods(config, agent, env_id, env_kwargs)
     with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
         result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
     record = result.as_json()
     report.show(record)
     if config.run is not None and (config.run / "config.json").is_file():
-        name = Path(config.scenes).stem + (".partial" if result.partial else "")  # replaces no whole one
+        name = _kept_as(config.scenes, whole, len(frozen.share), partial=result.partial)
         print(f"kept as {Run(config.run).write_evaluation(name, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
@@ -123,6 +125,13 @@ def evaluate(config: EvaluateConfig) -> None:
         failures = sort_out(last, done, agent.model, env_id, **env_kwargs)
         write(failures, config.failures, env_id, **env_kwargs)
         print(f"{len(failures.rows)} failures by kind: {config.failures}")
+
+
+def _kept_as(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
+    """A name for an evaluation in some scenes that replaces none in other ones, and no whole one by a part."""
+    name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
+    name += "" if number == len(whole.share) else f".first-{number}"
+    return name + (".partial" if partial else "")
 
 
 def _task_of(config: EvaluateConfig, agent: Agent | None) -> tuple[str, dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.courses import ChangingScenes
 from viapoint.envs.scenes import Scenes
 from viapoint.training.baselines import Method
 from viapoint.training.frozen_scenes import BANDS, DRAWN, FrozenScenes
@@ -46,7 +47,7 @@ class MethodResult:
     family: NDArray[np.str_]
     """Of each scene, '' for drawn ones, shape (n,)."""
     distance: Float
-    """From start to goal, shape (n,), [m]."""
+    """From start to goal, shape (n,), [m]; NaN where the target jumps, of which the shortest path is not known."""
     partial: bool
     """Whether it was interrupted before the last scene."""
     interrupted: bool = False
@@ -81,7 +82,7 @@ class MethodResult:
             "duration": median(self.outcomes["duration"][success]),
             "path_length": median(self.outcomes["path_length"][success]),
             "spl": success_weighted_path_length(success, self.distance, self.outcomes["path_length"])
-            if len(success)
+            if len(success) and np.isfinite(self.distance).all()
             else None,
             "decision_time": median(self.decision_times),
             "decision_time_98": _quantile(self.decision_times, 0.98)
@@ -202,10 +203,17 @@ def _evaluate_one(
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
-        distance=np.linalg.norm(frozen.scenes.goal - frozen.scenes.start, axis=-1)[:done],
+        distance=_distances(frozen.scenes)[:done],
         partial=interrupted and done < number,
         interrupted=interrupted,
     )
+
+
+def _distances(scenes: Scenes | ChangingScenes) -> Float:
+    away = np.linalg.norm(scenes.goal - scenes.start, axis=-1)
+    if isinstance(scenes, ChangingScenes):
+        return np.where(np.isfinite(scenes.jump_times).any(axis=-1), np.nan, away)
+    return np.asarray(away)
 
 
 def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: float) -> Float:

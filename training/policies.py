@@ -6,6 +6,7 @@ import functools
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
@@ -27,6 +28,7 @@ from viapoint.training.features import (
     scene_sizes,
     scene_view,
 )
+from viapoint.training.movements import on_the_way
 from viapoint.training.set_encoder import SetEncoder, layers
 from viapoint.training.sight import Observation, Sight
 
@@ -171,15 +173,19 @@ class ViaPolicy(TD3Policy):
         """As its base class; in machine code where there is some.
 
         Raises:
-            ValueError: The observation is not a dict with the parts of the observation space.
+            ValueError: The observation is not a dict with the parts of the observation space, is not finite, or the
+                hand is in the goal already, to which there is no movement.
         """
+        if isinstance(observation, tuple):  # of which the base class says more
+            return super().predict(cast(Any, observation), state, *args, **kwargs)
+        self._check_parts(observation)
         compiled = self._compiled.get(self.candidates)
-        if not isinstance(observation, tuple):  # of which the base class says more
-            self._check_parts(observation)
+        try:
             action = None if compiled is None else compiled(observation)
-            if action is not None:
-                return action, state
-        return super().predict(observation, state, *args, **kwargs)
+            return super().predict(observation, state, *args, **kwargs) if action is None else (action, state)
+        except (RuntimeError, ValueError):
+            _check_numbers(observation)  # only now: it would take a tenth of a compiled decision
+            raise
 
     def _check_parts(self, observation: Any) -> None:
         space: Any = self.observation_space
@@ -260,3 +266,15 @@ def spread_evenly(count: int, dimension: int) -> Tensor:
     engine: Any = torch.quasirandom.SobolEngine
     sobol = engine(dimension, scramble=True, seed=1).draw(count)
     return cast(Tensor, 2.0 * sobol - 1.0)
+
+
+def _check_numbers(observation: dict[str, Any]) -> None:
+    """Say what of an observation no movement can begin with."""
+    for name, part in observation.items():
+        if not np.isfinite(np.asarray(part)).all():
+            raise ValueError(f"observation must be finite; {name} is {np.asarray(part)}") from None
+    apart = np.asarray(observation["goal"]) != np.asarray(observation["hand"])
+    if not on_the_way(observation) and not apart.any(axis=-1).all():
+        raise ValueError(
+            "hand and goal must be apart: where they are the same there is no movement"
+        ) from None

@@ -185,7 +185,7 @@ def across_seeds(
 
     All agents meet the same scenes. So a draw takes seeds as whole rows and scenes as whole columns, scenes within
     their strata. Were the entries drawn one by one, an agent that fails in many scenes would pass for many agents,
-    and the interval would be far too narrow. Scores of 0 and 1 that nowhere differ show no spread to a bootstrap;
+    and the interval would be far too narrow. Scores of 0 and 1 that differ in no stratum show no spread to a bootstrap;
     then the interval is Wilson's over the scenes.
 
     Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; strata and aggregate from Agarwal et al.
@@ -210,10 +210,11 @@ def across_seeds(
     if groups.shape != table.shape[1:]:
         raise ValueError(f"strata must have shape {table.shape[1:]}, one for each scene, got {groups.shape}")
     seeds, scenes = table.shape
-    if (table == table[0, 0]).all() and table[0, 0] in (0.0, 1.0):
-        return wilson(int(table[0].sum()), scenes, confidence)
-    times_drawn = np.zeros((scenes, samples))
     group = np.unique(groups, return_inverse=True)[1]
+    first = table[0, np.unique(group, return_index=True)[1]][group]
+    if (table == first).all() and np.isin(first, (0.0, 1.0)).all():
+        return wilson(int(first.sum()), scenes, confidence)
+    times_drawn = np.zeros((scenes, samples))
     for each in range(group.max() + 1):
         rows = np.flatnonzero(group == each)
         times_drawn[rows] = generator.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), samples).T

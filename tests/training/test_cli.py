@@ -8,7 +8,9 @@ import shlex
 import pytest
 
 from viapoint.training import cli
+from viapoint.training.commands import pretrained_folder
 from viapoint.training.config import EvaluateConfig, TrainConfig
+from viapoint.training.frozen_scenes import load
 
 ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
 
@@ -79,6 +81,10 @@ def test_help_is_short_and_has_an_example(words, capsys):
         (f"play --pretrained {REACH} --video film.gif", "video must end in .mp4, got film.gif"),
         ("paper --out /etc/passwd", "out /etc/passwd cannot be written"),
         ("paper --agent nowhere", "nowhere: is no run folder"),
+        *(
+            (f"paper --agent {pretrained_folder(f'viapoint/{name}-v0')}", f"is of viapoint/{name}-v0")
+            for name in ("PlanarReach", "PandaReach", "PlanarMovingObstacles")
+        ),
         (
             'train --hyperparameters policy_kwargs={"kept":0}',
             "kept in policy_kwargs of viatd3 must be a whole",
@@ -146,8 +152,23 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
     counts = json.loads((tmp_path / "failures" / "failures.json").read_text())
     assert counts["method"] == "agent, ranks 8"
-    kept = json.loads((trained / "evaluations" / "test.json").read_text())
+    kept = json.loads((trained / "evaluations" / "test.first-4.json").read_text())
     assert list(kept["methods"]) == ["agent", "agent, ranks 8"]
+
+
+def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path):
+    few = load("test", ENV).take(slice(3, 6))
+    few.save(tmp_path / "test.npz")
+    run("evaluate", trained, "--methods", "straight", "--scenes", "test")
+    for words in (("--n-scenes", 4), ("--scenes", tmp_path / "test.npz"), ("--n-scenes", 1000)):
+        run("evaluate", trained, "--methods", "straight", *words)
+    kept = {
+        path.name: json.loads(path.read_text())["methods"]["straight line"]["scenes"]
+        for path in (trained / "evaluations").glob("test*.json")
+    }
+    assert kept["test.json"] == 1000
+    assert kept["test.first-4.json"] == 4
+    assert kept[f"test.{few.sha256[:8]}.json"] == 3
 
 
 def test_the_environment_is_that_of_the_run_or_of_the_pretrained_agent(trained, shipped, capsys):
@@ -169,7 +190,7 @@ def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
     capsys.readouterr()
     run("evaluate", folder, "--methods", "agent", "straight", "--n-scenes", 3)
     assert "with n_obstacles=3: they are drawn" in capsys.readouterr().err
-    record = json.loads((folder / "evaluations" / "test.json").read_text())
+    record = json.loads((folder / "evaluations" / "test.first-3.json").read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
     run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
     assert (tmp_path / "film.mp4").stat().st_size > 1000

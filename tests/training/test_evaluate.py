@@ -104,6 +104,8 @@ def test_the_metrics_are_what_their_names_say():
     assert summary["min_clearance"] == pytest.approx(0.0)
     assert summary["decision_time"] == pytest.approx(0.002)
     assert summary["decision_time_98"] == pytest.approx(0.00296)
+    jumping = fake(success, distance=np.append(np.full(7, 0.4), np.nan))
+    assert jumping.summary()["spl"] is None
 
 
 def test_success_is_told_by_family_where_there_are_families():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from viapoint.training.baselines import agent_method
 from viapoint.training.commands import find_agent
 from viapoint.training.policies import ViaPolicy
 from viapoint.training.trial import Trial
@@ -45,3 +46,19 @@ def test_what_cannot_be_decided_on_is_named(policy, observation):
             ValueError, match=r"must have the parts goal, hand, joints, obstacles; got .*hand"
         ):
             policy.predict(parts)
+    for value in (np.nan, np.inf):
+        goal = observation["goal"].copy()
+        goal[1, 0] = value
+        with pytest.raises(ValueError, match="observation must be finite; goal is"):
+            policy.predict({**observation, "goal": goal})
+    with pytest.raises(ValueError, match="hand and goal must be apart"):
+        policy.predict({**observation, "goal": observation["hand"]})
+
+
+def test_the_policy_alone_ranks_nothing_even_if_it_was_trained_to(policy, observation):
+    model = find_agent(None, ID).model
+    alone, ranked = (agent_method("agent", model, n).decide(observation, None) for n in (0, 8))
+    model.policy.candidates = 8
+    np.testing.assert_array_equal(agent_method("agent", model).decide(observation, None), alone)
+    assert not np.array_equal(alone, ranked)
+    assert model.policy.candidates == 8

@@ -117,8 +117,9 @@ def test_across_seeds_draws_scenes_within_their_strata():
     one = statistics.across_seeds(success[None], np.zeros(400), np.random.default_rng(1), samples=4000)
     half = 1.96 * math.sqrt(success.mean() * (1 - success.mean()) / 400)
     assert one.high - one.low == pytest.approx(2 * half, rel=0.1)
-    known = statistics.across_seeds(success[None], success, np.random.default_rng(1))
-    assert known == pytest.approx((success.mean(),) * 3)  # within a stratum all are alike
+    score = np.where(success, 0.9, 0.2)
+    known = statistics.across_seeds(score[None], success, np.random.default_rng(1))
+    assert known == pytest.approx((score.mean(),) * 3)  # within a stratum all are alike
 
 
 def test_across_seeds_covers_the_truth():
@@ -138,6 +139,9 @@ def test_across_seeds_without_any_spread_is_wilsons():
     for value in (0.0, 1.0):
         interval = statistics.across_seeds(np.full((5, 20), value), np.zeros(20), np.random.default_rng(0))
         assert interval == statistics.wilson(int(20 * value), 20)
+    strata = np.arange(20) < 5
+    interval = statistics.across_seeds(np.tile(strata, (3, 1)), strata, np.random.default_rng(0))
+    assert interval == statistics.wilson(5, 20)
 
 
 def test_probability_of_improvement_is_mann_and_whitneys():

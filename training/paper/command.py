@@ -9,8 +9,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from viapoint.training import train as training
-from viapoint.training.commands import find_agent
 from viapoint.training.config import PaperConfig
+from viapoint.training.paper.obstacles import check_agent
 from viapoint.training.paper.report import summary, write
 from viapoint.training.paper.reproduce import STEPS, Reproduction, reproduce
 
@@ -31,11 +31,11 @@ def run(config: PaperConfig) -> None:
     """Compute, draw, write, and end with an error if a verdict fails.
 
     Raises:
-        ValueError: There is no such agent; nothing is computed.
+        ValueError: There is no such agent, or it cannot move around the paper's lights; nothing is computed.
         ClaimsFailedError: A claim does not hold.
     """
     if config.agent is not None:
-        find_agent(config.agent, None)
+        check_agent(config.agent)
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, training.one_thread():
 
         def tell(name: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.action import Plan
+from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
 from viapoint.training.baselines import Method, PlannerMethod
@@ -81,6 +82,21 @@ def decide(agent: Path | None) -> Decided:
     planned = [model_profile(plan.take(row).trajectory()) for row in number]
     executed = [arm_profile(done, row) for row in number]
     return Decided(method.name, kept, plan, done, len(scenes.start), planned, executed)
+
+
+def check_agent(agent: Path) -> None:
+    """Refuse agents of tasks whose scenes cannot be those of the paper.
+
+    Raises:
+        ValueError: It moves in space, sees no obstacles, or needs several decisions for a movement.
+    """
+    found = find_agent(agent, None)
+    (task,) = found.model.get_env().get_attr("task", 0)
+    if found.env_id not in TASKS or task.arm.dimension != 2 or not task.scenes.n_obstacles[1]:
+        raise ValueError(
+            f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
+            f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
+        )
 
 
 def _method(agent: Path | None) -> tuple[Method, Trial]:
