@@ -85,19 +85,27 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     durations = own(durations)
     if (durations <= 0).any():
         return _connect_without_empty(xp, order, waypoints, durations, states)
-    return Trajectory.from_segments(_coefficients(xp, order, waypoints, durations, states), durations, xp)
+    return Trajectory.from_segments(_paced(xp, order, waypoints, durations, states), durations, xp)
 
 
 _SHORT, _LONG = 1e-3, 1e3
 """Durations [s] between which no power of them over- or underflows, in single precision either."""
 
 
-def _at_unit_pace(durations: Array, states: States) -> tuple[Array, States]:
+def _paced(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
+    """Return the coefficients, computed at a pace at which nothing over- or underflows."""
+    sizes = to_numpy(durations)
+    if sizes.size and not (sizes.min() >= _SHORT and sizes.max() <= _LONG):
+        durations, states = _at_unit_pace(xp, durations, states)
+    return _coefficients(xp, order, waypoints, durations, states)
+
+
+def _at_unit_pace(xp: Namespace, durations: Array, states: States) -> tuple[Array, States]:
     """Return durations of about 1 and the states to match: by powers of two, which change no digit."""
-    pace = unit_factors(np, durations)
+    pace = unit_factors(xp, durations)
     scaled: States = []
     for state in states:
-        row, power = [], np.ones_like(pace)
+        row, power = [], xp.ones_like(pace)
         for value in state:
             power = power / pace
             row.append(value if value is None or value is FREE else value * power)
@@ -106,8 +114,6 @@ def _at_unit_pace(durations: Array, states: States) -> tuple[Array, States]:
 
 
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
-    if xp is np and durations.size and not (durations.min() >= _SHORT and durations.max() <= _LONG):
-        durations, states = _at_unit_pace(durations, states)
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     pieces = [steps[..., s, :] for s in range(segments)]
@@ -187,7 +193,7 @@ def _connect_pattern(
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
-    solved = _coefficients(xp, order, points, lengths, chosen)
+    solved = _paced(xp, order, points, lengths, chosen)
     zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
     columns = []
     for s, is_empty in enumerate(empty):

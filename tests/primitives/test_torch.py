@@ -47,6 +47,23 @@ def test_numbers_equal_numpys(vias, dtype):
     np.testing.assert_allclose(moves[0].cost().numpy(), moves[1].cost(), rtol=10 * tolerance)
 
 
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("seconds", [1e-9, 1e-6, 1e-3, 1.0, 1e6])
+def test_single_precision_holds_any_duration_and_so_do_gradients(seconds, order):
+    """Powers of the durations leave the numbers of single precision long before the positions do."""
+    waypoints, durations = RNG.normal(size=(4, 2)), seconds * np.array([0.7, 1.0, 1.6])
+    velocity, times = RNG.normal(size=2) / seconds, np.linspace(0.0, durations.sum(), 9)
+    exact = through(waypoints, durations, order=order, start_velocity=velocity)(times)
+    given = (torch.tensor(each, dtype=torch.float32) for each in (waypoints, durations, velocity, times))
+    points, lengths, rate, when = given
+    lengths.requires_grad_()
+    found = through(points, lengths, order=order, start_velocity=rate)(when)
+    np.testing.assert_allclose(found.detach().numpy(), exact, atol=2e-4)
+    gradient = torch.autograd.grad(found.sum() * seconds, lengths)[0]
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().max() < 100.0
+
+
 @pytest.mark.parametrize("vias", [1, 2, 3])
 def test_gradients_of_passage_times_equal_finite_differences(vias):
     waypoints, velocity, acceleration = tensor(3, vias + 2, 2), tensor(3, 2, scale=0.3), tensor(3, 2)
