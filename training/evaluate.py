@@ -27,7 +27,7 @@ TIMED_DECISIONS = 200
 """Single decisions that are timed, at most."""
 TIMING_BUDGET = 3.0
 """Time after which no more are timed, [s]."""
-SLOW_DECISION = 0.05
+SLOW_DECISION = 0.1
 """A method whose single decisions take longer than this is timed by the batch, [s]."""
 
 
