@@ -111,7 +111,7 @@ def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipp
     run = train(config(tmp_path / "run", n_timesteps=32))
     words = ["evaluate", str(run.folder), "--env", ENV, "--methods", "straight", "random", "--n-scenes", "4"]
     cli.main(words)
-    whole = (run.folder / "evaluations" / "test.json").read_text()
+    whole = (run.folder / "evaluations" / "test.first-4.json").read_text()
 
     def interrupted(self, observation, scenes):
         raise KeyboardInterrupt
@@ -120,8 +120,10 @@ def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipp
     with pytest.raises(SystemExit) as end:
         cli.main(words)
     assert end.value.code == 130
-    assert (run.folder / "evaluations" / "test.json").read_text() == whole
-    assert json.loads((run.folder / "evaluations" / "test.partial.json").read_text())["partial"] is True
+    assert (run.folder / "evaluations" / "test.first-4.json").read_text() == whole
+    assert (
+        json.loads((run.folder / "evaluations" / "test.first-4.partial.json").read_text())["partial"] is True
+    )
 
 
 @pytest.fixture
