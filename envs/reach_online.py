@@ -99,9 +99,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         }  # fmt: skip
         EzPickle.__init__(self, num_envs, **as_given(kwargs))
         if timing != "optimal":
-            raise ValueError(
-                f"timing must be optimal where plans are revised: passage times follow from the state; got {timing!r}"
-            )
+            raise ValueError(f"timing must be optimal where plans are revised, got {timing!r}")
         if not isinstance(moving_obstacles, bool | np.bool_):
             raise TypeError(f"moving_obstacles must be True or False, got {moving_obstacles!r}")
         self.changes = ChangeDistribution(

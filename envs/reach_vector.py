@@ -100,12 +100,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         **unknown: Any,
     ) -> None:
         refuse_unknown(unknown, type(self).__init__.__annotations__)
-        kwargs: dict[str, Any] = {
+        EzPickle.__init__(self, num_envs, **as_given({
             "arm": arm, "whole_arm": whole_arm, "n_via": n_via, "n_obstacles": n_obstacles, "timing": timing,
             "duration_range": duration_range, "reward_weights": reward_weights, "render_mode": render_mode,
             "width": width, "height": height, "threads": threads,
-        }  # fmt: skip
-        EzPickle.__init__(self, num_envs, **as_given(kwargs))
+        }))  # fmt: skip
         arm = arm_of(arm)
         if not isinstance(whole_arm, bool | np.bool_):
             raise TypeError(f"whole_arm must be True or False, got {whole_arm!r}")

@@ -210,10 +210,9 @@ def across_seeds(
     if groups.shape != table.shape[1:]:
         raise ValueError(f"strata must have shape {table.shape[1:]}, one for each scene, got {groups.shape}")
     seeds, scenes = table.shape
-    group = np.unique(groups, return_inverse=True)[1]
-    first = table[0, np.unique(group, return_index=True)[1]][group]
-    if (table == first).all() and np.isin(first, (0.0, 1.0)).all():
-        return wilson(int(first.sum()), scenes, confidence)
+    _, at, group = np.unique(groups, return_index=True, return_inverse=True)
+    if (table == table[0, at][group]).all() and np.isin(table[0], (0.0, 1.0)).all():
+        return wilson(int(table[0].sum()), scenes, confidence)
     times_drawn = np.zeros((scenes, samples))
     for each in range(group.max() + 1):
         rows = np.flatnonzero(group == each)
