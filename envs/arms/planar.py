@@ -132,11 +132,9 @@ class PlanarArm:
         xp = namespace_of(hand)
         (c1, s1), _ = self._directions(hand)
         square = c1 * c1 + s1 * s1
-        somewhere = (
-            square > 0.0
-        )  # over the shoulder any direction would do: the posture's is that of the first axis
-        c1, one = xp.where(somewhere, c1, xp.ones_like(c1)), xp.ones_like(square)
-        upper = self.lengths[0] / xp.sqrt(xp.where(somewhere, square, one))
+        # Over the shoulder any direction would do: the posture's is that of the first axis.
+        c1, square = (xp.where(square > 0.0, each, xp.ones_like(each)) for each in (c1, square))
+        upper = self.lengths[0] / xp.sqrt(square)
         elbow = last(xp.stack((c1 * upper, s1 * upper)))
         return (xp.zeros_like(elbow), elbow), (elbow, hand)
 
