@@ -184,7 +184,7 @@ class ViaPolicy(TD3Policy):
             action = None if compiled is None else compiled(observation)
             return super().predict(observation, state, *args, **kwargs) if action is None else (action, state)
         except (RuntimeError, ValueError):
-            _check_numbers(observation)  # only now: it would take a tenth of a compiled decision
+            _check_numbers(observation)  # only now: most decisions need not pay for it
             raise
 
     def _check_parts(self, observation: Any) -> None:
