@@ -1,6 +1,46 @@
-"""What several files of tests begin with lies beside them."""
+"""What several files of tests begin with lies beside them; here is how pictures are made in them."""
 
 import sys
 from pathlib import Path
 
+import gymnasium as gym
+import pytest
+
+from viapoint.envs import rendering
+from viapoint.envs.rendering import GLUnavailableError
+
 sys.path.append(str(Path(__file__).parent))
+
+OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
+
+
+@pytest.fixture
+def quick_pictures(monkeypatch):
+    """One pass for each picture: what is tested here does not need to look good."""
+    monkeypatch.setattr(rendering, "FILM_PASSES", 1)
+    monkeypatch.setattr(rendering, "STILL_PASSES", 1)
+
+
+@pytest.fixture(scope="session")
+def opengl():
+    env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
+    env.reset(seed=0)
+    try:
+        env.render()
+    except GLUnavailableError as error:
+        pytest.skip(f"no picture can be rendered here: {error}")
+    finally:
+        env.close()
+
+
+@pytest.fixture
+def make(opengl):
+    opened = []
+
+    def made(name=OBSTACLES, mode="rgb_array", *, side=96, **kwargs):
+        opened.append(gym.make(name, render_mode=mode, **{"width": side, "height": side, **kwargs}))
+        return opened[-1]
+
+    yield made
+    for env in opened:
+        env.close()

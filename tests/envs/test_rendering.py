@@ -1,63 +1,15 @@
-import gc
-import importlib
-import os
-import subprocess
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
+from drawn import AROUND, OBSTACLES, SCENE, STRAIGHT, moved
 
-from viapoint.envs import _gl, _stage, rendering
+from viapoint.envs import _stage, rendering
 from viapoint.envs._movement import Movement, first_touch
-from viapoint.envs.rendering import GLUnavailableError, check_render_mode, frame_steps
+from viapoint.envs.rendering import check_render_mode, frame_steps
 
-OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
-SCENE = {
-    "start": [-0.1, 0.25],
-    "goal": [-0.1, 0.55],
-    "obstacles": [[-0.4, 0.6, 0.0, 0.0, 0.02], [-0.2, 0.4, 0.09, 0.0, 0.01]],
-}
-STRAIGHT = np.zeros(3, dtype=np.float32)
-AROUND = np.array([0.0, -0.5, 0.5], dtype=np.float32)
 
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch):
-    """One pass for each picture: what is tested here does not need to look good."""
-    monkeypatch.setattr(rendering, "FILM_PASSES", 1)
-    monkeypatch.setattr(rendering, "STILL_PASSES", 1)
-
-
-@pytest.fixture(scope="session")
-def _opengl():
-    env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
-    env.reset(seed=0)
-    try:
-        env.render()
-    except GLUnavailableError as error:
-        pytest.skip(f"no picture can be rendered here: {error}")
-    finally:
-        env.close()
-
-
-@pytest.fixture
-def make(_opengl):
-    opened = []
-
-    def made(name=OBSTACLES, mode="rgb_array", *, side=96, **kwargs):
-        opened.append(gym.make(name, render_mode=mode, **{"width": side, "height": side, **kwargs}))
-        return opened[-1]
-
-    yield made
-    for env in opened:
-        env.close()
-
-
-def moved(env, action):
-    env.reset(options={name: np.array(value) for name, value in SCENE.items()})
-    return env.step(action)[-1]
+pytestmark = pytest.mark.usefixtures("quick_pictures")
 
 
 def red(frame):
@@ -179,7 +131,7 @@ def test_pictures_leave_no_trace_in_the_simulation(make):
             env.reset()
 
 
-@pytest.mark.usefixtures("_opengl")
+@pytest.mark.usefixtures("opengl")
 def test_a_vector_environment_gives_a_picture_of_each():
     env = gym.make_vec(OBSTACLES, num_envs=2, render_mode="rgb_array", width=32, height=24)
     env.reset(seed=0)
@@ -188,103 +140,6 @@ def test_a_vector_environment_gives_a_picture_of_each():
     env.step(np.zeros((2, 3), dtype=np.float32))
     assert len(env.render()) == 2
     env.close()
-
-
-@pytest.mark.usefixtures("_opengl")
-def test_a_context_is_opened_with_the_first_picture_and_given_back(monkeypatch):
-    opened, freed = [], []
-    real = _gl._open
-
-    class Context:
-        def __init__(self, context):
-            self.context, self.as_current = context, context.as_current
-
-        def free(self):
-            freed.append(self)
-            self.context.free()
-
-    def counting(model):
-        context, mjr = real(model)
-        opened.append(context)
-        return Context(context), mjr
-
-    monkeypatch.setattr(_gl, "_open", counting)
-    for number in range(1, 7):
-        env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
-        env.reset(seed=0)
-        env.step(STRAIGHT)
-        assert len(opened) == number - 1
-        env.render()
-        env.render()
-        assert len(opened) == number
-        if number % 2:
-            env.close()
-            env.close()
-        del env
-        gc.collect()
-        assert len(freed) == number
-
-
-def test_after_close_a_picture_opens_a_context_again(make):
-    env = make()
-    env.reset(seed=0)
-    before = env.render()
-    env.unwrapped.batch._renderer.close()
-    np.testing.assert_array_equal(env.render(), before)
-
-
-def failing(*names):
-    real = importlib.import_module
-
-    def fail(name, *rest):
-        if name in names:
-            raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
-        return real(name, *rest)
-
-    return fail
-
-
-def test_a_missing_library_is_named_with_the_package_to_install(monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(_gl.importlib, "import_module", failing("mujoco.egl", "mujoco.glfw", "mujoco.cgl"))
-    env = gym.make(OBSTACLES, render_mode="rgb_array")
-    env.reset(seed=0)
-    with pytest.raises(GLUnavailableError, match=r"library not found.*apt-get install libegl1 libgl1"):
-        env.render()
-    env.close()
-
-
-def test_rendering_can_be_forbidden(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    env = gym.make(OBSTACLES, render_mode="rgb_array")
-    env.reset(seed=0)
-    env.step(STRAIGHT)
-    with pytest.raises(GLUnavailableError, match="MUJOCO_GL=off"):
-        env.render()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
-def test_a_window_without_a_display_names_the_other_modes(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    env = gym.make(OBSTACLES, render_mode="human")
-    with pytest.raises(GLUnavailableError, match=r"no display.*rgb_array.*xvfb-run"):
-        env.reset(seed=0)
-
-
-@pytest.mark.parametrize(
-    ("wish", "display", "platforms"),
-    [
-        ("egl", True, ("egl",)),
-        ("osmesa", False, ("osmesa",)),
-        ("", False, ("egl",)),
-        ("", True, ("glfw", "egl")),
-    ],
-)
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the choice")
-def test_egl_is_chosen_without_a_display_and_a_wish_is_respected(monkeypatch, wish, display, platforms):
-    monkeypatch.setattr(_gl, "_has_display", lambda: display)
-    assert _gl._platforms(wish) == platforms
 
 
 def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
@@ -316,69 +171,6 @@ def test_a_full_scene_is_drawn_in_part_and_not_refused(make, monkeypatch):
     env = make(side=16)
     moved(env, AROUND)
     assert env.render().shape == (16, 16, 3)
-
-
-def test_nothing_of_opengl_is_loaded_before_the_first_picture():
-    code = (
-        "import os, sys; before = dict(os.environ)\n"
-        "import gymnasium as gym, viapoint.envs\n"
-        "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array')\n"
-        "env.reset(seed=0); env.step(env.action_space.sample())\n"
-        "assert not {'OpenGL', 'OpenGL.GL', 'OpenGL.EGL', 'mujoco.egl'} & set(sys.modules)\n"
-        "assert dict(os.environ) == before\n"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
-@pytest.mark.parametrize("mode", ["rgb_array", "rgb_array_list"])
-def test_gymnasium_records_videos(make, tmp_path, mode):
-    pytest.importorskip("moviepy")
-    env = gym.wrappers.RecordVideo(
-        make(mode=mode, side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True
-    )
-    moved(env, AROUND)
-    if mode == "rgb_array_list":
-        env.render()
-    env.close()
-    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") >= (2 if mode == "rgb_array" else 40)
-
-
-def test_whole_movements_are_recorded(make, tmp_path):
-    pytest.importorskip("moviepy")
-    from viapoint.envs.recording import RecordMovements
-
-    made = make(mode="rgb_array_list", side=64)
-    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
-    moved(env, AROUND)
-    expected = 2 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
-    env.close()
-    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == expected
-
-
-@pytest.mark.usefixtures("_opengl")
-@pytest.mark.parametrize("name", ["PlanarObstaclesStep", "PlanarTargetJump"])
-def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(name, tmp_path):
-    pytest.importorskip("moviepy")
-    from viapoint.envs.recording import RecordMovements
-
-    made = gym.make(f"viapoint.envs:viapoint/{name}-v0", render_mode="rgb_array_list", width=64, height=64)
-    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
-    env.reset(seed=0)
-    steps, over = 0, False
-    while not over:
-        *_, terminated, truncated, _ = env.step(np.full(env.action_space.shape, 0.3, np.float32))
-        steps, over = steps + 1, terminated or truncated
-    expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
-    env.close()
-    assert steps > 1
-    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
-
-
-def frames_of(path):
-    reader = pytest.importorskip("imageio_ffmpeg").read_frames(str(path))
-    next(reader)
-    return sum(1 for _ in reader)
 
 
 PANDA_SCENE = {

@@ -1,6 +1,8 @@
-"""Small scenes and small trainings, shared by the tests of training."""
+"""Small scenes and small trainings, shared by the tests of training; what several files begin with lies beside them."""
 
 import signal
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ import torch
 from viapoint.training import drawn_scenes, frozen_scenes
 from viapoint.training.frozen_scenes import FrozenScenes
 from viapoint.training.trial import Trial
+
+sys.path.append(str(Path(__file__).parent))
 
 ENV = "viapoint/PlanarObstacles-v0"
 

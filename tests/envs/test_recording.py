@@ -1,0 +1,56 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from drawn import AROUND, moved
+
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "rgb_array_list"])
+def test_gymnasium_records_videos(make, tmp_path, mode):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(
+        make(mode=mode, side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True
+    )
+    moved(env, AROUND)
+    if mode == "rgb_array_list":
+        env.render()
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") >= (2 if mode == "rgb_array" else 40)
+
+
+def test_whole_movements_are_recorded(make, tmp_path):
+    pytest.importorskip("moviepy")
+    from viapoint.envs.recording import RecordMovements
+
+    made = make(mode="rgb_array_list", side=64)
+    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    moved(env, AROUND)
+    expected = 2 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == expected
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("name", ["PlanarObstaclesStep", "PlanarTargetJump"])
+def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(name, tmp_path):
+    pytest.importorskip("moviepy")
+    from viapoint.envs.recording import RecordMovements
+
+    made = gym.make(f"viapoint.envs:viapoint/{name}-v0", render_mode="rgb_array_list", width=64, height=64)
+    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    steps, over = 0, False
+    while not over:
+        *_, terminated, truncated, _ = env.step(np.full(env.action_space.shape, 0.3, np.float32))
+        steps, over = steps + 1, terminated or truncated
+    expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
+    env.close()
+    assert steps > 1
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
+
+
+def frames_of(path):
+    reader = pytest.importorskip("imageio_ffmpeg").read_frames(str(path))
+    next(reader)
+    return sum(1 for _ in reader)
