@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from viapoint.envs.action import Plan
 from viapoint.envs.beside import Beside
 from viapoint.envs.outcome import Outcome, blank, ended, least_clearance, measure, norm
+from viapoint.envs.pacing import LOOK_EVERY, pace_of
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.simulator import Record, Simulator
 
@@ -18,12 +19,6 @@ Float = NDArray[np.float64]
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
-LOOK_EVERY = 0.008
-"""Clearance and reach of the plan are looked at that often, which is every few millimetres, [s]."""
-PACED = 32
-"""At how many evenly spaced times a movement is looked at for the arm's limits."""
-TOGETHER = 256
-"""Movements that are looked at together for the limits: as many steps of the inverse dynamics for many as for one."""
 GROUP = 64
 """Movements carried out together: few enough for the cache, many enough for the threads."""
 
@@ -102,14 +97,14 @@ class Executor:
 
     def prepare(self, plan: Plan, scenes: Scenes) -> Prepared:
         """Stretch plans for the arm's limits and have their references computed beside what comes next."""
-        stretch = self._stretch(plan)
+        stretch, within = pace_of(self.arm, plan)
         paced = Plan(plan.waypoints, plan.durations * stretch[:, None])
         duration = np.asarray(paced.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         order = np.argsort(steps, kind="stable")
         groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
         beside = self._beside if len(groups) > 1 else Beside(threaded=False)
-        referred = [beside.submit(self._refer, steps, paced, scenes, sims) for sims in groups]
+        referred = [beside.submit(self._refer, steps, paced, scenes, within, sims) for sims in groups]
         return Prepared(plan, scenes, duration, stretch, referred, beside)
 
     def carry_out(self, prepared: Prepared) -> Outcome:
@@ -150,21 +145,13 @@ class Executor:
         time = np.arange(1, steps + 1) * float(self.simulator.timestep)
         return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
 
-    def _stretch(self, plan: Plan) -> Float:
-        """How much slower each movement is made for the arm's limits, shape (N,); 1 where it leaves the reach."""
-        if not self.arm.velocity_limit:
-            return np.ones(len(plan.durations))
-        factors = []
-        for first in range(0, len(plan.durations), TOGETHER):
-            some = plan.take(slice(first, first + TOGETHER))
-            times = some.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, PACED)
-            position, velocity, acceleration = some.trajectory().sample(times)
-            reachable = (self.arm.reach_margin(position) >= 0.0).all(axis=-1)
-            factors.append(np.where(reachable, self.arm.pace(position, velocity, acceleration), 1.0))
-        return np.concatenate(factors)
-
     def _refer(
-        self, steps: NDArray[np.int64], plan: Plan, scenes: Scenes, sims: NDArray[np.int64]
+        self,
+        steps: NDArray[np.int64],
+        plan: Plan,
+        scenes: Scenes,
+        within: NDArray[np.bool_],
+        sims: NDArray[np.int64],
     ) -> References:
         """References at the physics rate, and the controls that follow them, for one group."""
         rows = slice(None) if len(sims) == len(steps) else sims
@@ -179,7 +166,7 @@ class Executor:
             steps=steps[rows],
             planned=position[:, 1:],
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
-            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1),
+            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & within[rows],
             jerk_cost=np.asarray(trajectory.cost()),
             clearance=least_clearance(self.arm, seen, scenes.take(rows), whole_arm=self.whole_arm),
         )

@@ -11,8 +11,9 @@ from viapoint.envs.arms.serial import EVERY
 from viapoint.envs.beside import Beside
 from viapoint.envs.clearance import FAR
 from viapoint.envs.courses import ChangingScenes, clearance_over_time
-from viapoint.envs.execution import GROUP, LOOK_EVERY, PACED
+from viapoint.envs.execution import GROUP
 from viapoint.envs.online_episodes import Carried, jerk_cost_between
+from viapoint.envs.pacing import LOOK_EVERY, pace_of
 from viapoint.envs.revision import MovingPlan, timed
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.steering import Motion
@@ -53,28 +54,19 @@ class OnlineExecutor:
         self.simulator, self.arm, self.whole_arm = simulator, simulator.arm, whole_arm
         self._beside = beside
 
-    def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float]:
-        """Plans made as slow as the arm's limits ask for, and by which factor, shape (N,).
+    def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float, Bool]:
+        """Plans made as slow as the arm's limits ask for, by which factor, and which keep within reach, shape (N,).
 
         One that begins in motion cannot be stretched without a jump of its velocity: its whole time is prolonged.
         """
-        stretch = np.ones(len(plan.durations))
-        if not self.arm.velocity_limit:
-            return plan, stretch
-        for first in range(0, len(stretch), GROUP):
-            some = plan.take(slice(first, first + GROUP))
-            times = some.duration[:, None] * np.linspace(0.0, 1.0, PACED)
-            position, velocity, acceleration = some.trajectory().sample(times)
-            reachable = (np.asarray(self.arm.reach_margin(position)) >= 0.0).all(axis=-1)
-            factor = np.asarray(self.arm.pace(position, velocity, acceleration))
-            stretch[first : first + GROUP] = np.where(reachable, factor, 1.0)
+        stretch, within = pace_of(self.arm, plan)
         slower = MovingPlan(plan.waypoints, plan.durations * stretch[:, None], *plan[2:])
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         rows = np.flatnonzero(moving & (stretch > 1.0))
         if rows.size:
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             slower.put(rows, timed(plan.waypoints[rows], slower.duration[rows], state))
-        return slower, stretch
+        return slower, stretch, within
 
     def reachable(self, plan: MovingPlan) -> Bool:
         """Which plans stay within the arm's reach, shape (N,)."""

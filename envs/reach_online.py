@@ -232,9 +232,9 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         rows, stretch = np.flatnonzero(revised), np.ones(self.num_envs)
         if not rows.size:
             return
-        some, stretch[rows] = self._online.paced(plan.take(rows))
+        some, stretch[rows], within = self._online.paced(plan.take(rows))
         plan.put(rows, some)
-        self._episodes.running.reachable[rows] &= self._online.reachable(some)
+        self._episodes.running.reachable[rows] &= within & self._online.reachable(some)
         self._episodes.revise(plan, revised, stretch)
 
     def episodes_state(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ How hard a scene is, is measured (see :mod:`viapoint.training.difficulty`), not 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import arm_clearance, hand_clearance
+from viapoint.envs.sampler import Sampler
 from viapoint.envs.scene_distribution import SceneDistribution
 from viapoint.envs.scene_draws import PHASES, Uniforms, Witness, between, left, turned, unit
 from viapoint.envs.scene_obstacles import in_the_way, on_path
 from viapoint.envs.scene_sampling import SceneSampler
+from viapoint.envs.space_distribution import FAMILIES as SPACE_FAMILIES
 from viapoint.envs.whole_arm_obstacles import CANDIDATES, CHOICES, WholeArmObstacles
 
 if TYPE_CHECKING:
@@ -233,17 +235,24 @@ class FamilyObstacles:
         return np.asarray(clear.all(axis=-1))
 
 
-def family_sampler(task: Task, family: str) -> SceneSampler:
-    """Draws scenes of one family for a planar task.
+def family_sampler(task: Task, family: str) -> Sampler:
+    """Draws scenes of one family: of :data:`FAMILIES` in the plane, of those of ``space_distribution`` in space.
 
     Raises:
-        ValueError: There is no such family, or the task's scenes have fewer rows or another dimension.
+        ValueError: There is no such family, or it takes more obstacles than the task has.
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}")
     scenes = task.scenes
-    if not isinstance(scenes, SceneDistribution) or scenes.n_obstacles[1] < ROWS:
-        raise ValueError(f"families need a planar task with up to {ROWS} obstacles, got {scenes}")
+    in_plane = isinstance(scenes, SceneDistribution)
+    names: Iterable[str] = FAMILIES if in_plane else SPACE_FAMILIES
+    if family not in names:
+        raise ValueError(f"family must be one of {', '.join(names)}, got {family!r}")
+    needed = ROWS if in_plane else SPACE_FAMILIES[family]
+    if scenes.n_obstacles[1] < needed:
+        raise ValueError(
+            f"{family} needs a task with up to {needed} obstacles, this one has {scenes.n_obstacles[1]} at most"
+        )
+    if not isinstance(scenes, SceneDistribution):
+        return dataclasses.replace(task, scenes=dataclasses.replace(scenes, families=(family,))).sampler()
     placer = FamilyObstacles(task.arm, scenes, FAMILIES[family], whole_arm=task.whole_arm)
     distribution = dataclasses.replace(scenes, n_obstacles=(1, ROWS))
     return SceneSampler(task.arm, distribution, whole_arm=task.whole_arm, placer=placer, attempts=ATTEMPTS)

@@ -26,7 +26,6 @@ from viapoint.envs.sampler import Sampler
 from viapoint.envs.scene_families import FAMILIES, family_sampler
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.space_distribution import NARROW, SpaceDistribution
-from viapoint.envs.space_sampling import SpaceSampler
 from viapoint.envs.task import Task
 from viapoint.training.frozen_scenes import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands
 from viapoint.training.remade_scenes import add_arguments, settle, shipped
@@ -94,10 +93,8 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
 
 def hard_families(task: Task) -> dict[str, Sampler]:
     """The families of hard scenes of a task, by name."""
-    if not isinstance(task.scenes, SpaceDistribution):
-        return {name: family_sampler(task, name) for name in FAMILIES}
-    each = {name: dataclasses.replace(task.scenes, families=(name,)) for name in NARROW}
-    return {name: SpaceSampler(task.arm, of, whole_arm=task.whole_arm) for name, of in each.items()}
+    names = NARROW if isinstance(task.scenes, SpaceDistribution) else FAMILIES
+    return {name: family_sampler(task, name) for name in names}
 
 
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:

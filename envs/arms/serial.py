@@ -24,6 +24,8 @@ STEP = 1e-3
 """Over which differences of postures are taken for the joints' rates and accelerations, [s]."""
 EVERY = 8
 """The joints' references are computed at every eighth physics step and run straight in between."""
+RESERVE = 0.97
+"""Share of the limits of rate and torque that plans may use: what is left corrects them on the way."""
 ORIGIN = "origin"
 """Site at the origin of the world, from which the hand's actuators measure."""
 
@@ -149,8 +151,8 @@ class SerialArm:
         """
         xp = namespace_of(position)
         motion = self._motion(position, velocity, acceleration)
-        rates = _limits(self.velocity_limit, position)
-        left = _limits(self.torque_limit, position) - xp.abs(motion.weight)
+        rates = RESERVE * _limits(self.velocity_limit, position)
+        left = RESERVE * _limits(self.torque_limit, position) - xp.abs(motion.weight)
         left = xp.where(left > 1.0, left, xp.ones_like(left))
         fastest = xp.max(xp.abs(motion.rate) / rates, axis=-1)
         strongest = xp.sqrt(xp.max(xp.abs(motion.torque) / left, axis=-1))

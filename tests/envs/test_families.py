@@ -11,9 +11,11 @@ from viapoint.envs.arms import ADULT
 from viapoint.envs.clearance import segment_distance_squared
 from viapoint.envs.scene_families import FAMILIES, ROWS, family_sampler
 from viapoint.envs.scenes import check_scenes
+from viapoint.envs.space_distribution import FAMILIES as SPACE_FAMILIES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
+SPACE = "viapoint/PandaObstacles-v0"
 NUMBER = {HAND: 40, WHOLE_ARM: 4}
 
 
@@ -145,6 +147,25 @@ def test_what_has_no_families_is_refused(tasks):
         family_sampler(tasks[HAND], "maze")
     with pytest.raises(ValueError, match="up to 5 obstacles"):
         family_sampler(task_of(HAND, n_obstacles=2), "gate")
+    with pytest.raises(ValueError, match="clutter, pillar, shelf, gate, slot, window, tunnel, got 'ring'"):
+        family_sampler(task_of(SPACE), "ring")
+    with pytest.raises(ValueError, match="tunnel needs a task with up to 6 obstacles, this one has 5"):
+        family_sampler(task_of(SPACE, n_obstacles=5), "tunnel")
+
+
+@pytest.mark.parametrize("name", SPACE_FAMILIES)
+def test_each_family_of_space_is_drawn_by_its_name(name):
+    sampler = family_sampler(task_of(SPACE), name)
+    scenes = sampler([np.random.default_rng(i) for i in range(3)])
+    assert (scenes.present.sum(axis=-1) >= SPACE_FAMILIES[name]).all()
+    axis = scenes.obstacles[..., 3:6]
+    lying = scenes.present & (np.hypot(axis[..., 0], axis[..., 1]) > 1e-9)
+    standing = scenes.present & ~lying & (axis[..., 2] > 0.0)
+    bars, posts = {"shelf": (3, 0), "gate": (1, 2), "slot": (4, 0), "window": (2, 2), "tunnel": (2, 4)}.get(
+        name, (0, 0)
+    )
+    assert (lying.sum(axis=-1) >= bars).all()
+    assert (standing.sum(axis=-1) >= posts).all()
 
 
 def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(monkeypatch):
