@@ -76,12 +76,15 @@ class SpaceSampler:
             numbers.put_back(pending, first)
             pending = pending[first < 0]
         if len(pending):
-            between = (
-                "" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
+            where = (
+                f"; the workspace of {self.arm.name}, {self.arm.workspace} m, is small for them: ask for fewer "
+                "(n_obstacles), or give the arm a larger one"
+                if ends is None
+                else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
             )
             raise RuntimeError(
                 f"no scene with {self.distribution.n_obstacles} obstacles was found in {sum(GROUPS)} "
-                f"attempts{between}"
+                f"attempts{where}"
             )
         return scenes
 

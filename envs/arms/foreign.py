@@ -13,8 +13,14 @@ from viapoint.envs.arms.given import one_for_each, ranges_of
 
 Float = NDArray[np.float64]
 
+CLOSE = 1e-6
+"""Within which places and axes are the same, [m]."""
 VELOCITY = 2.0
 """Limit of the joints where nothing is said, [rad/s]."""
+
+
+ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""What drives a hinge itself."""
 
 
 class Foreign(NamedTuple):
@@ -45,8 +51,6 @@ def read_foreign(
     velocity_limit: Any,
 ) -> Foreign:
     """Read and check a file; see :func:`~viapoint.envs.arms.own_arm.from_mjcf`."""
-    if not path.is_file():
-        raise ValueError(f"there is no file {str(path)!r}")
     spec = _read(path)
     _known("site", (hand_site,), [site.name for site in spec.sites])
     _known("joint", joints, [joint.name for joint in spec.joints])
@@ -75,7 +79,7 @@ def read_foreign(
     ]
     if outside:
         raise ValueError(f"home is outside the range of {', '.join(outside)}")
-    model = _alone(spec, joints)
+    model = _alone(spec, joints, whole)
     _check_order(model, joints, hand_site)
     return Foreign(model, joints, hand_site, home, ranges, torque, velocity)
 
@@ -129,9 +133,9 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
     for name in joints:
         joint = model.joint(name).id
         if model.jnt_actfrclimited[joint]:
-            found.append(float(np.abs(model.jnt_actfrcrange[joint]).min()))
+            found.append(_both_ways(model.jnt_actfrcrange[joint]))
             continue
-        driven = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
+        driven = np.isin(model.actuator_trntype, ON_JOINTS) & (model.actuator_trnid[:, 0] == joint)
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(driven)]
         found.append(max(limits, default=np.nan))
     missing = [name for name, limit in zip(joints, found, strict=True) if not np.isfinite(limit)]
@@ -139,31 +143,86 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
         raise ValueError(
             f"no actuator with a limited force drives {', '.join(missing)}; add one, or give torque_limit"
         )
+    one_way = [name for name, limit in zip(joints, found, strict=True) if limit <= 0.0]
+    if one_way:
+        raise ValueError(
+            f"the force on {', '.join(one_way)} is limited to one direction; give it a range about 0 in the file, or "
+            "give torque_limit"
+        )
     return np.array(found)
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
     gear = abs(float(model.actuator_gear[index, 0]))
     if model.actuator_forcelimited[index]:
-        return gear * float(np.abs(model.actuator_forcerange[index]).min())
+        return gear * _both_ways(model.actuator_forcerange[index])
     plain = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
     if plain and model.actuator_ctrllimited[index]:
         gain = abs(float(model.actuator_gainprm[index, 0]))
-        return gear * gain * float(np.abs(model.actuator_ctrlrange[index]).min())
+        return gear * gain * _both_ways(model.actuator_ctrlrange[index])
     return np.nan
 
 
-def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjModel:
-    """The model without what drives, couples or measures, and without any other joint."""
+def _both_ways(limits: Float) -> float:
+    """What a range leaves in either direction; 0 where it is one-sided."""
+    return max(min(-float(limits[0]), float(limits[1])), 0.0)
+
+
+def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
+    """The model without what drives, couples or measures, and with every other joint held where the file's home is."""
     for part in (
         *spec.actuators, *spec.equalities, *spec.sensors, *spec.tendons, *spec.keys, *spec.excludes, *spec.pairs,
     ):  # fmt: skip
         spec.delete(part)
-    for joint in [joint for joint in spec.joints if joint.name not in joints]:
+    held = _held(whole, joints)
+    others = [joint for joint in spec.joints if joint.name not in joints]
+    for body in {joint.parent.id: joint.parent for joint in others}.values():
+        _put(body, whole, held)
+    for joint in others:
         spec.delete(joint)
     for body in spec.bodies:
         body.mocap = False
-    return spec.compile()
+    model = spec.compile()
+    _check_held(model, whole, held, joints)
+    return model
+
+
+def _held(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
+    """The places of everything with the arm as it is drawn and all other joints as in the first keyframe, if any."""
+    data = mujoco.MjData(whole)
+    if whole.nkey:
+        data.qpos[:] = whole.key_qpos[0]
+        for name in joints:
+            address = whole.joint(name).qposadr
+            data.qpos[address] = whole.qpos0[address]
+    mujoco.mj_kinematics(whole, data)
+    return data
+
+
+def _put(body: Any, whole: mujoco.MjModel, held: mujoco.MjData) -> None:
+    """Write a body's place into it."""
+    number, parent = body.id, whole.body_parentid[body.id]
+    turn = held.xmat[parent].reshape(3, 3).T
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, (turn @ held.xmat[number].reshape(3, 3)).flatten())
+    body.pos, body.quat = turn @ (held.xpos[number] - held.xpos[parent]), quaternion
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def _check_held(
+    model: mujoco.MjModel, whole: mujoco.MjModel, held: mujoco.MjData, joints: tuple[str, ...]
+) -> None:
+    """Whether the arm's joints are still where the file has them."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for name in joints:
+        here, there = model.joint(name).id, whole.joint(name).id
+        apart = np.abs(data.xanchor[here] - held.xanchor[there]).max()
+        if max(apart, np.abs(data.xaxis[here] - held.xaxis[there]).max()) > CLOSE:
+            raise ValueError(
+                f"joints that are left out cannot be held where the file's keyframe has them, as that moves {name}; "
+                "write that place into the file and leave the keyframe out"
+            )
 
 
 def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +13,20 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+FLATTEST = 1e-3
+"""Least width of a workspace, in which places are drawn, [m]."""
 BOUND = 0.95
 """Greatest coordinate of a place of the hand, [m]: observations end at 1."""
+
+
+def path_of(value: Any) -> Path:
+    """Of the arm's file."""
+    if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
+        raise TypeError(f"path must be the name of an MJCF file, got {value!r}")
+    path = Path(value)
+    if not path.is_file():
+        raise ValueError(f"there is no file {os.fspath(value)!r}")
+    return path
 
 
 def name_of(value: Any) -> str:
@@ -71,6 +85,10 @@ def box_of(values: Any) -> Float:
         raise ValueError(
             f"the hand does not get to ({', '.join(f'{x:.4g}' for x in far[0])}) m: coordinates must be less than "
             f"{BOUND} m, where observations end; give another workspace or origin"
+        )
+    if (np.abs(corners[1] - corners[0]) < FLATTEST).any():
+        raise ValueError(
+            f"workspace must be a box that is {1e3 * FLATTEST:g} mm wide or more in x, y and z, got {values!r}"
         )
     return np.sort(corners, axis=0)
 

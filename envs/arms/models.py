@@ -14,6 +14,8 @@ from viapoint.envs.arms.chain import Chain, Constants, Hinge
 
 Float = NDArray[np.float64]
 
+SMALLEST = 1e-12
+"""Principal moment of inertia of a link, [kg m^2]."""
 DIGITS = 12
 """To which constants are rounded, so that what should be zero is and costs nothing."""
 
@@ -79,6 +81,20 @@ def moving_with(model: mujoco.MjModel, name: str) -> list[int]:
 def in_frame(frame: tuple[Float, Float], point: Any) -> Constants:
     """A point of the world in a joint's frame."""
     return _constants(frame[0].T @ (np.asarray(point) - frame[1]))
+
+
+def principal(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
+    """Principal moments, shape (3,), and the quaternion that turns their axes into the frame's.
+
+    Of a flat or tiny body they are rounded to those of a possible one: positive, none above the sum of the others.
+    """
+    moments, axes = np.linalg.eigh(np.array(inertia))
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    moments = np.maximum(moments, SMALLEST)
+    moments[2] = min(moments[2], moments[0] + moments[1])
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, axes.flatten())
+    return moments, quaternion
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], centre: Float) -> Float:

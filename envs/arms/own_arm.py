@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.capsule_fit import around_points, surface
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.foreign import Foreign, read_foreign
-from viapoint.envs.arms.given import box_of, name_of, names_of, point_of, radius_of
+from viapoint.envs.arms.given import box_of, name_of, names_of, path_of, point_of, radius_of
+from viapoint.envs.arms.mapped import good_map
 from viapoint.envs.arms.mjcf import serial_arm
-from viapoint.envs.arms.models import at_zero, chain_of, in_frame, joint_frames, moving_with, read_spec
-from viapoint.envs.arms.posture_map import Box, solve_map
+from viapoint.envs.arms.models import (
+    at_zero,
+    chain_of,
+    in_frame,
+    joint_frames,
+    moving_with,
+    principal,
+    read_spec,
+)
+from viapoint.envs.arms.posture_map import Box
 from viapoint.envs.arms.reachable import FIRST_OFF_TABLE, Body, Reachable
 from viapoint.envs.arms.serial import SerialArm
 from viapoint.envs.arms.sufficient import check_room, check_strength, postures_at_corners
@@ -68,12 +77,13 @@ def from_mjcf(
     Raises:
         ValueError: Something is missing, with what there is, or the arm is too weak or has too little room.
     """
+    file = path_of(path)
     given = None if workspace is None else box_of(workspace)
     there = None if origin is None else point_of("origin", origin)
     hand_radius = radius_of(hand_radius)
-    name = name_of(Path(path).stem if name is None else name)
+    name = name_of(file.stem if name is None else name)
     foreign = read_foreign(
-        Path(path),
+        file,
         hand_site,
         names_of(joints),
         home=home,
@@ -88,16 +98,17 @@ def from_mjcf(
     hand_at = in_frame(frames[-1], at_zero(foreign.model).site(hand_site).xpos)
     reachable = Reachable(chain, hand_at, foreign, bodies, hand_radius)
     check_strength(foreign, chain, foreign.home[None], ["at home"])
-    box = reachable.box(given)
+    kept = np.stack((reachable.middle, reachable.middle)) if given is None else given
+    place = good_map(chain, hand_at, foreign.home, reachable, reachable.box(given), kept)
     arm = serial_arm(
         _written(foreign, frames, zero, bodies, reachable.touching, hand_radius).to_xml(),
         name=name,
         joint_names=foreign.joints,
         hand_site="hand",
-        place=solve_map(chain, hand_at, foreign.home, box),
-        workspace=_inside(box) if given is None else _box(given),
+        place=place,
+        workspace=_inside(place.box) if given is None else _box(given),
     )
-    check_room(arm, box)
+    check_room(arm, place.box)
     check_strength(foreign, chain, *postures_at_corners(arm))
     return arm
 
@@ -148,9 +159,8 @@ def _written(
         mujoco.mju_mat2Quat(quaternion, turn.flatten())
         place = before[0].T @ (frames[index][1] - before[1])
         parent = parent.add_body(name=f"link_{index}", pos=place, quat=quaternion, gravcomp=1.0)
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = hinge.inertia
-        parent.mass, parent.ipos, parent.fullinertia = hinge.mass, hinge.centre, (xx, yy, zz, xy, xz, yz)
-        parent.explicitinertial = True
+        parent.mass, parent.ipos, parent.explicitinertial = hinge.mass, hinge.centre, True
+        parent.inertia, parent.iquat = principal(hinge.inertia)
         torque = foreign.torque_limit[index]
         parent.add_joint(
             name=joint, axis=(0.0, 0.0, 1.0), range=foreign.joint_range[index], limited=True,

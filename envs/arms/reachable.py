@@ -28,6 +28,20 @@ NARROWEST = 0.3
 """Least width of the box along some axis, [m]: movements must find room in it."""
 
 
+def shown(place: Float) -> str:
+    """A place in words."""
+    return f"({', '.join(f'{x:.3f}' for x in place)})"
+
+
+def check_size(low: Float, high: Float) -> None:
+    """Refuse a reach in which movements do not fit."""
+    if (high - low).max() < NARROWEST or (high - low).min() < 2 * SPACING:
+        raise ValueError(
+            f"the hand reaches only a box of {np.round(high - low, 2)} m around its place at home, turned as there; "
+            "give another home"
+        )
+
+
 class Body(NamedTuple):
     """A link's capsule in its joint's frame."""
 
@@ -50,6 +64,8 @@ class Reachable:
             for j, second in enumerate(bodies)
             if second.joint - first.joint >= 2
         ]
+        self.middle = hand_pose(chain, hand_at, foreign.home)[0]
+        """The hand's place at home, shape (3,), [m]."""
         close = self._between(foreign.home[None])[0] < ROOM
         self.touching = [pair for pair, near in zip(self._pairs, close, strict=True) if near]
         """Pairs of capsules that overlap at home already, as capsules are wider than links."""
@@ -61,61 +77,91 @@ class Reachable:
         Raises:
             ValueError: A place of the workspace is out of reach, or the box is too small to move in.
         """
-        middle = hand_pose(self._chain, self._hand_at, self._foreign.home)[0]
-        low, high = (middle, middle) if workspace is None else workspace
-        around = np.arange(-FAR, FAR + 1e-9, SPACING)
+        low, high = (self.middle, self.middle) if workspace is None else workspace
+        beyond = np.arange(1, round(FAR / SPACING) + 1) * SPACING
+        between = [
+            np.linspace(a, b, int(np.ceil((b - a) / SPACING)) + 1) for a, b in zip(low, high, strict=True)
+        ]
         axes = [
-            np.concatenate((near + around[around < 0.0], np.arange(near, far + FAR + 1e-9, SPACING)))
-            for near, far in zip(low, high, strict=True)
+            np.concatenate((a - beyond[::-1], inner, b + beyond))
+            for a, inner, b in zip(low, between, high, strict=True)
         ]
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         good = self.good(places.reshape(-1, 3)).reshape(places.shape[:3])
-        begin, end = (
-            [int(np.searchsorted(axis, value - 1e-9)) for axis, value in zip(axes, corner, strict=True)]
-            for corner in (low, high)
-        )
+        begin, end = [len(beyond)] * 3, [len(beyond) + len(inner) - 1 for inner in between]
         inside = tuple(slice(b, e + 1) for b, e in zip(begin, end, strict=True))
         if not good[inside].all():
             bad = places[inside][~good[inside]][0]
             raise ValueError(
-                f"the hand does not get to ({', '.join(f'{x:.3f}' for x in bad)}) m, turned as at home, with every "
-                "joint inside its range and clear of arm and table; give another home, origin or workspace"
+                f"the hand does not get to {shown(bad)} m, turned as at home: {self._why_not(bad)}; give another "
+                "home, origin or workspace"
             )
         begin, end = _grown(good, begin, end)
         corners = [np.array([axis[k] for axis, k in zip(axes, ks, strict=True)]) for ks in (begin, end)]
-        if (corners[1] - corners[0]).max() < NARROWEST or (corners[1] - corners[0]).min() < 2 * SPACING:
-            raise ValueError(
-                f"the hand reaches only a box of {np.round(corners[1] - corners[0], 2)} m around its place at home, "
-                "turned as there; give another home"
-            )
+        check_size(corners[0], corners[1])
         return (tuple(map(float, corners[0])), tuple(map(float, corners[1])))
 
     def good(self, places: Float) -> Bool:
         """To which places the hand gets, shape (N,)."""
-        foreign = self._foreign
-        joints = solve_postures(self._chain, self._hand_at, foreign.home, places)
-        place, turn = hand_pose(self._chain, self._hand_at, joints)
-        home = hand_pose(self._chain, self._hand_at, foreign.home)[1]
-        cosine = np.clip((np.einsum("nij,ij->n", turn, home) - 1.0) / 2.0, -1.0, 1.0)
-        low, high = foreign.joint_range.T
-        good = (np.abs(place - places).max(axis=-1) < CLOSE) & (np.arccos(cosine) < TURNED)
-        good &= ((joints > low + SPARE) & (joints < high - SPARE)).all(axis=-1)
-        good &= (np.abs(places).max(axis=-1) < BOUND) & (places[:, 2] > self._hand_radius + ROOM)
-        return np.asarray(good & self._clear(joints))
+        return self.fits(places, solve_postures(self._chain, self._hand_at, self._foreign.home, places))
 
-    def _clear(self, joints: Float) -> Bool:
-        """Which postures leave links and table apart."""
+    def fits(self, places: Float, joints: Float, *, loose: float = 1.0) -> Bool:
+        """Which postures put the hand at places as it should get there, shape (N,).
+
+        Args:
+            places: Shape (N, 3), [m].
+            joints: Shape (N, J), [rad].
+            loose: By which factor limits may be nearer than they should, 1 or more.
+        """
+        (off, turned), (spare, high, apart) = self._errors(places, joints), self._room(joints)
+        good = (off < CLOSE) & (turned < TURNED * loose) & (spare > SPARE / loose).all(axis=-1)
+        good &= (np.abs(places).max(axis=-1) < BOUND) & (places[:, 2] > self._hand_radius + ROOM / loose)
+        return np.asarray(good & (high > ROOM / loose).all(axis=-1) & (apart > ROOM / loose).all(axis=-1))
+
+    def _errors(self, places: Float, joints: Float) -> tuple[Float, Float]:
+        """How far the hand is from places [m], and turned from home [rad], shape (N,) each."""
+        place, turn = hand_pose(self._chain, self._hand_at, joints)
+        home = hand_pose(self._chain, self._hand_at, self._foreign.home)[1]
+        cosine = np.clip((np.einsum("nij,ij->n", turn, home) - 1.0) / 2.0, -1.0, 1.0)
+        return np.abs(place - places).max(axis=-1), np.arccos(cosine)
+
+    def _room(self, joints: Float) -> tuple[Float, Float, Float]:
+        """How far joints are inside their ranges (N, J) [rad], links above the table and apart (N, .) [m]."""
+        low, high = self._foreign.joint_range.T
         ends = self._ends(joints)
-        high = np.stack(
-            [
-                ends[:, i, :, 2].min(axis=-1) - body.radius
-                for i, body in enumerate(self._bodies)
-                if body.joint >= FIRST_OFF_TABLE
-            ],
-            axis=-1,
+        above = [
+            ends[:, i, :, 2].min(axis=-1) - self._bodies[i].radius
+            for i in range(len(self._bodies))
+            if self._bodies[i].joint >= FIRST_OFF_TABLE
+        ]
+        return (
+            np.minimum(joints - low, high - joints),
+            np.stack(above, axis=-1),
+            self._between(joints, self._apart),
         )
-        distances = self._between(joints, self._apart)
-        return np.asarray((high > ROOM).all(axis=-1) & (distances > ROOM).all(axis=-1))
+
+    def _why_not(self, place: Float) -> str:
+        """What is wrong with the posture that is found for a place that is not good."""
+        if np.abs(place).max() >= BOUND:
+            return f"coordinates must be less than {BOUND} m, where observations end"
+        if place[2] <= self._hand_radius + ROOM:
+            return f"it is less than {1e3 * ROOM:.0f} mm above the table"
+        joints = solve_postures(self._chain, self._hand_at, self._foreign.home, place[None])
+        ((off,), (turned,)), (spare, above, apart) = self._errors(place[None], joints), self._room(joints)
+        names = self._foreign.joints
+        if off >= CLOSE or turned >= TURNED:
+            return f"no posture near home gets nearer than {1e3 * off:.0f} mm and {turned:.2f} rad"
+        if (spare <= SPARE).any():
+            worst = int(spare[0].argmin())
+            return (
+                f"{names[worst]} comes to {joints[0, worst]:.2f} rad, less than {SPARE} rad inside its range"
+            )
+        if (above <= ROOM).any():
+            off_table = [body for body in self._bodies if body.joint >= FIRST_OFF_TABLE]
+            link = names[off_table[int(above[0].argmin())].joint]
+            return f"the link of {link} comes closer than {1e3 * ROOM:.0f} mm to the table"
+        first, second = (names[self._bodies[k].joint] for k in self._apart[int(apart[0].argmin())])
+        return f"the links of {first} and {second} come closer than {1e3 * ROOM:.0f} mm to one another"
 
     def _ends(self, joints: Float) -> Float:
         places = tuple((body.joint, end) for body in self._bodies for end in body.ends)

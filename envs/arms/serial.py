@@ -26,6 +26,8 @@ EVERY = 8
 """The joints' references are computed at every eighth physics step and run straight in between."""
 RESERVE = 0.97
 """Share of the limits of rate and torque that plans may use: what is left corrects them on the way."""
+LEAST = 0.01
+"""Share of the limit of torque that a joint is taken to have left for moving, however heavy what it holds."""
 ORIGIN = "origin"
 """Site at the origin of the world, from which the hand's actuators measure."""
 
@@ -152,8 +154,8 @@ class SerialArm:
         xp = namespace_of(position)
         motion = self._motion(position, velocity, acceleration)
         rates = RESERVE * _limits(self.velocity_limit, position)
-        left = RESERVE * _limits(self.torque_limit, position) - xp.abs(motion.weight)
-        left = xp.where(left > 1.0, left, xp.ones_like(left))
+        torques = _limits(self.torque_limit, position)
+        left = xp.maximum(RESERVE * torques - xp.abs(motion.weight), LEAST * torques)
         fastest = xp.max(xp.abs(motion.rate) / rates, axis=-1)
         strongest = xp.sqrt(xp.max(xp.abs(motion.torque) / left, axis=-1))
         factor = xp.max(xp.maximum(fastest, strongest), axis=-1)

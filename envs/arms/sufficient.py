@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.foreign import Foreign
 from viapoint.envs.arms.posture_map import Box
-from viapoint.envs.arms.serial import SerialArm
+from viapoint.envs.arms.serial import RESERVE, SerialArm
 from viapoint.envs.space_distribution import SpaceDistribution
 from viapoint.envs.space_sampling import SpaceSampler
 
@@ -34,12 +34,12 @@ def check_strength(foreign: Foreign, chain: Chain, joints: Float, places: Sequen
         ValueError: With the joint, its limit and what it would need.
     """
     weight = np.abs(chain.torques(joints, 0.0 * joints, 0.0 * joints)[1])
-    lacking = weight - foreign.torque_limit
+    lacking = weight - RESERVE * foreign.torque_limit
     if (lacking >= 0.0).any():
         where, joint = np.unravel_index(lacking.argmax(), lacking.shape)
         raise ValueError(
-            f"torque_limit of {foreign.joints[joint]} is {foreign.torque_limit[joint]:g} N m, but to hold the arm "
-            f"{places[where]} against gravity takes {weight[where, joint]:.4g} N m"
+            f"torque_limit of {foreign.joints[joint]} is {foreign.torque_limit[joint]:g} N m, of which {RESERVE:.0%} "
+            f"are used, but to hold the arm {places[where]} against gravity takes {weight[where, joint]:.4g} N m"
         )
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from foreign_arms import HOME, JOINTS, UR5E, ur5e
 from gymnasium.envs.registration import EnvSpec
 
 import viapoint.envs
@@ -20,9 +21,6 @@ from viapoint.envs.registration import OWN_ARM_TASKS
 assert viapoint.envs, "importing it registers the environments"
 
 DOCS = Path(__file__).parents[2] / "docs"
-UR5E = DOCS / "ur5e.xml"
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
 FETCH = {
     "hand_site": "robot0:grip",
     "joints": [
@@ -35,10 +33,6 @@ FETCH = {
     "torque_limit": (33.8, 131.7, 76.9, 66.1, 29.3, 25.7, 7.3),
     "home": (0.0, -0.5, 0.0, 1.3, 0.0, 0.77, 0.0),
 }  # fmt: skip
-
-
-def ur5e(**changes):
-    return Arm.from_mjcf(UR5E, **{"hand_site": "hand", "joints": JOINTS, "home": HOME, **changes})
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,25 @@
+"""The arm of the page, as its file and variants of it have it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from viapoint.envs.arms import Arm
+
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+
+
+def ur5e(**changes):
+    return Arm.from_mjcf(**{"path": UR5E, "hand_site": "hand", "joints": JOINTS, "home": HOME, **changes})
+
+
+def written(path, *changes):
+    """The file of the page with words replaced, at `path`; each word must be there."""
+    text = UR5E.read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path

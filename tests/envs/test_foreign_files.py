@@ -1,0 +1,164 @@
+"""What other people's files bring: joints that are left out, odd inertias and forces, and what is refused."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from foreign_arms import HOME, JOINTS, UR5E, ur5e, written
+
+import viapoint.envs
+
+assert viapoint.envs, "importing it registers the environments"
+
+SHOULDER = '<body name="shoulder" pos="0 0 0.1625">'
+LIFT = SHOULDER + '<joint name="lift" type="slide" axis="0 0 1" range="0.1 0.5" actuatorfrclimited="false"/>'
+KEYFRAME = '</worldbody><keyframe><key qpos="{}"/></keyframe>'
+
+
+def hand_of(path, joints):
+    """Where MuJoCo has the hand at a configuration of the file's model, [m]."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:] = joints
+    mujoco.mj_kinematics(model, data)
+    return data.site("hand").xpos
+
+
+@pytest.mark.parametrize("lift", [0.1, 0.2])
+def test_joints_that_are_left_out_stay_where_the_keyframe_has_them(tmp_path, lift):
+    carried = (
+        '<body name="carriage">' + LIFT.replace(SHOULDER, "") + '<geom size=".01" pos="0 0 .05"/>' + SHOULDER
+    )
+    qpos = (lift, *HOME)
+    keyframe = ("</worldbody>", KEYFRAME.format(" ".join(map(str, qpos))))
+    path = written(
+        tmp_path / "lift.xml",
+        (SHOULDER, carried),
+        ("</body>\n  </worldbody>", "</body></body></worldbody>"),
+        keyframe,
+    )
+    arm = ur5e(path=path, home=None)
+    np.testing.assert_allclose(arm.hand(np.array(HOME)), hand_of(path, qpos), atol=1e-9)
+
+
+def test_where_they_cannot_they_are_named(tmp_path):
+    """A second hinge of a body, after the one that moves: its place is no place of the body alone."""
+    second = '<joint name="wrist_1" class="wrist"/><joint name="twist" class="wrist" axis="1 0 0"/>'
+    qpos = " ".join(map(str, (*HOME[:4], 0.5, *HOME[4:])))
+    path = written(
+        tmp_path / "twist.xml",
+        ('<joint name="wrist_1" class="wrist"/>', second),
+        ("</worldbody>", KEYFRAME.format(qpos)),
+    )
+    with pytest.raises(
+        ValueError, match=r"left out cannot be held where the file's keyframe has them.*wrist_1"
+    ):
+        ur5e(path=path)
+
+
+@pytest.mark.parametrize(
+    "inertial",
+    [
+        '<inertial pos="0 0 0.16" mass="1e-7" diaginertia="3e-13 3e-13 3e-13"/>',
+        '<inertial pos="-.2 0 0" mass="2.8" diaginertia="0.01 0.02 0.03" euler="0.1 0.2 0.3"/>',
+    ],
+)
+def test_bodies_may_be_tiny_or_flat(tmp_path, inertial):
+    before = '<body name="wrist_3" pos="0 0 0.0997" quat="1 -1 0 0">'
+    path = written(tmp_path / "odd.xml", (before, before + inertial))
+    model = ur5e(path=path).compile(0, True)
+    whole = mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_allclose(
+        model.body_mass.sum(), whole.body_mass[2:].sum() + whole.body_mass[1], rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("limit", "factor"), [(0.3, 2.0), (1.0, 1.3)])
+def test_weak_joints_are_given_time(limit, factor):
+    """The base of an arm carries no weight, so it may be as weak as it likes."""
+    arm = ur5e(velocity_limit=np.pi, torque_limit=[limit, 150, 150, 28, 28, 28])
+    env = gym.make_vec("viapoint/Reach-v0", num_envs=16, arm=arm)
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros((16, 4), np.float32))
+    assert info["is_success"].all()
+    assert info["stretch"].mean() > factor
+    env.close()
+
+
+def test_limits_of_motors_that_pull_one_way_are_refused_by_joint(tmp_path):
+    path = written(tmp_path / "one.xml", ('actuatorfrcrange="-28 28"', 'actuatorfrcrange="0 28"'))
+    with pytest.raises(ValueError, match="force on wrist_1, wrist_2, wrist_3 is limited to one direction"):
+        ur5e(path=path)
+
+
+def test_actuators_may_act_on_the_joint_in_its_parents_frame(tmp_path):
+    motor = '</worldbody><actuator><motor jointinparent="elbow" ctrlrange="-120 120"/></actuator>'
+    elbow = ('range="-3.1416 3.1416"/>', 'range="-3.1416 3.1416" actuatorfrclimited="false"/>')
+    arm = ur5e(path=written(tmp_path / "parent.xml", elbow, ("</worldbody>", motor)))
+    assert arm.torque_limit[JOINTS.index("elbow")] == 120.0
+
+
+@pytest.mark.parametrize(
+    ("path", "error", "words"),
+    [
+        ("", ValueError, "there is no file ''"),
+        (5, TypeError, "path must be the name of an MJCF file, got 5"),
+        (None, TypeError, "path must be the name of an MJCF file, got None"),
+        (b"arm.xml", TypeError, "path must be the name of an MJCF file"),
+    ],
+)
+def test_paths_that_are_none_are_refused(path, error, words):
+    with pytest.raises(error, match=words):
+        ur5e(path=path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"origin": (0.0, 0.0, -0.8)}, "coordinates must be less than 0.95 m, where observations end"),
+        ({"origin": (0.0, 0.0, 0.25)}, "above the table|to the table"),
+        ({"home": (0.28, -1.55, -1.93, -1.232, 0.0, 0.28), "joint_range": [(-6, 6)] * 4 + [(0.0, 6), (-6, 6)]},
+         r"wrist_2 comes to 0\.00 rad, less than 0\.05 rad inside its range"),
+        ({"workspace": ((0.3, -0.4, 0.2), (0.55, 0.4, 0.2))}, "workspace must be a box that is 1 mm wide or more"),
+        ({"workspace": ((0.3, -0.4, 0.2), (0.9, 0.4, 0.4))}, "no posture near home gets nearer than"),
+    ],
+)  # fmt: skip
+def test_why_the_hand_does_not_get_somewhere_is_said(changes, words):
+    with pytest.raises(ValueError, match=words):
+        ur5e(**changes)
+
+
+def test_a_workspace_that_is_reached_is_taken_whatever_its_corners():
+    box = ((0.24, -0.40, 0.09), (0.61, 0.41, 0.37))
+    arm = ur5e(workspace=box)
+    assert arm.workspace == box
+    low, high = np.array(arm.place.box)
+    assert (low <= box[0]).all()
+    assert (high >= box[1]).all()
+
+
+PANDA_JOINTS = [f"joint{number}" for number in range(1, 8)]
+TWISTED = [0.42, -0.6, -0.53, -2.65, -0.2, 2.81, 0.2]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"home": (0.3, -0.55, -1.84, -1.55, 1.38, -0.27)},
+        {"path": UR5E.parents[1] / "envs/assets/panda.xml", "joints": PANDA_JOINTS, "home": TWISTED},
+    ],
+)
+def test_postures_are_good_everywhere_in_the_reach_and_follow_the_hand(changes):
+    arm = ur5e(**changes)
+    low, high = np.array(arm.place.box)
+    rng = np.random.default_rng(0)
+    places = rng.uniform(low, high, (5000, 3))
+    joints = arm.posture(places)
+    np.testing.assert_allclose(arm.hand(joints), places, atol=1e-6)
+    least, most = np.array(arm.joint_range).T
+    assert (np.minimum(joints - least, most - joints) > 0.02).all()
+    step = 1e-4 * rng.normal(size=(5000, 3))
+    near = np.clip(places + step, low, high)
+    turned = np.abs(arm.posture(near) - joints).max(axis=-1)
+    assert (turned <= 30.0 * np.linalg.norm(near - places, axis=-1) + 1e-12).all()
