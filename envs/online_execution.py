@@ -22,6 +22,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
+PROLONGED, ENOUGH = 6, 1.002
+"""How often the time of a plan in motion is prolonged at most, and by which factor it need not be once more."""
 SIMILAR, SLACK = 1.15, 4
 """A group's longest decision takes at most that many times the steps of its shortest, and so many more."""
 
@@ -57,15 +59,22 @@ class OnlineExecutor:
     def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float, Bool]:
         """Plans made as slow as the arm's limits ask for, by which factor, and which keep within reach, shape (N,).
 
-        One that begins in motion cannot be stretched without a jump of its velocity: its whole time is prolonged.
+        One that begins in motion cannot be stretched without a jump of its velocity: its whole time is prolonged, and
+        again where that is not enough.
         """
         stretch, within = pace_of(self.arm, plan)
         slower = MovingPlan(plan.waypoints, plan.durations * stretch[:, None], *plan[2:])
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         rows = np.flatnonzero(moving & (stretch > 1.0))
-        if rows.size:
+        for _ in range(PROLONGED):
+            if not rows.size:
+                break
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             slower.put(rows, timed(plan.waypoints[rows], slower.duration[rows], state))
+            again = pace_of(self.arm, slower.take(rows)).stretch
+            rows, again = rows[again > ENOUGH], again[again > ENOUGH]
+            stretch[rows] *= again
+            slower.durations[rows] *= again[:, None]
         return slower, stretch, within
 
     def reachable(self, plan: MovingPlan) -> Bool:

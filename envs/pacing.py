@@ -40,10 +40,10 @@ def pace_of(arm: Arm, plan: Any) -> Pace:
         arm: That would move.
         plan: N movements, with `durations` of their segments [s], `trajectory()` and `take(rows)`.
     """
-    number = len(plan.durations)
+    number, segments = plan.durations.shape
     stretch, within = np.ones(number), np.ones(number, dtype=bool)
-    # Longer ones are looked at no less often where their clearance is computed.
-    short = plan.durations.sum(axis=-1) < LOOKS * LOOK_EVERY
+    # Others are looked at no less often where their clearance is computed.
+    short = (plan.durations < LOOK_EVERY * looks_of(segments)).any(axis=-1)
     rows = np.arange(number) if arm.velocity_limit else np.flatnonzero(short)
     for first in range(0, len(rows), TOGETHER):
         some = rows[first : first + TOGETHER]
@@ -51,11 +51,16 @@ def pace_of(arm: Arm, plan: Any) -> Pace:
     return Pace(stretch, within)
 
 
+def looks_of(segments: int) -> int:
+    """At how many times each of so many segments is looked at."""
+    return max(-(-LOOKS // segments), LEAST)
+
+
 def _looked_at(arm: Arm, plan: Any) -> Pace:
     """The same of some of them, with all of their segments."""
     durations = plan.durations
     number, segments = durations.shape
-    each = max(-(-LOOKS // segments), LEAST)
+    each = looks_of(segments)
     ends = np.cumsum(durations, axis=-1)
     apart = durations / each
     times = (ends - durations)[..., None] + apart[..., None] * np.arange(each + 1)

@@ -77,8 +77,8 @@ class SpaceSampler:
             pending = pending[first < 0]
         if len(pending):
             where = (
-                f"; the workspace of {self.arm.name}, {self.arm.workspace} m, is small for them: ask for fewer "
-                "(n_obstacles), or give the arm a larger one"
+                f" in the workspace {self.arm.workspace} m of {self.arm.name}; an arm of your own may need a larger "
+                "one, or fewer obstacles (n_obstacles)"
                 if ends is None
                 else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}"
             )

@@ -176,8 +176,9 @@ def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) 
         spec.delete(part)
     held = _held(whole, joints)
     others = [joint for joint in spec.joints if joint.name not in joints]
-    for body in {joint.parent.id: joint.parent for joint in others}.values():
-        _put(body, whole, held)
+    if whole.nkey:
+        for body in {joint.parent.id: joint.parent for joint in others}.values():
+            _put(body, whole, held)
     for joint in others:
         spec.delete(joint)
     for body in spec.bodies:
@@ -200,11 +201,12 @@ def _held(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
 
 
 def _put(body: Any, whole: mujoco.MjModel, held: mujoco.MjData) -> None:
-    """Write a body's place into it."""
+    """Write a body's place into it, in a frame of its own: it may be in another."""
     number, parent = body.id, whole.body_parentid[body.id]
     turn = held.xmat[parent].reshape(3, 3).T
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, (turn @ held.xmat[number].reshape(3, 3)).flatten())
+    body.set_frame(body.parent.add_frame())
     body.pos, body.quat = turn @ (held.xpos[number] - held.xpos[parent]), quaternion
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 

@@ -67,7 +67,8 @@ def _smaller(box: Box, bad: Float, kept: Float) -> Box:
     for axis, side in itertools.product(range(3), (0, 1)):
         corners = np.array(box)
         corners[side, axis] += SPACING if side == 0 else -SPACING
-        if (corners[0] > kept[0] + 1e-9).any() or (corners[1] < kept[1] - 1e-9).any():
+        within = corners[0, axis] <= kept[0, axis] if side == 0 else corners[1, axis] >= kept[1, axis]
+        if not within:
             continue
         left = int(((bad >= corners[0]) & (bad <= corners[1])).all(axis=-1).sum())
         faces.append((left, -float(corners[1, axis] - corners[0, axis]), corners))

@@ -16,6 +16,8 @@ Float = NDArray[np.float64]
 
 SMALLEST = 1e-12
 """Principal moment of inertia of a link, [kg m^2]."""
+THICK = 2e-5
+"""By how much less than the sum of the others a moment is at least, relative to it: files have six digits."""
 DIGITS = 12
 """To which constants are rounded, so that what should be zero is and costs nothing."""
 
@@ -86,12 +88,13 @@ def in_frame(frame: tuple[Float, Float], point: Any) -> Constants:
 def principal(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
     """Principal moments, shape (3,), and the quaternion that turns their axes into the frame's.
 
-    Of a flat or tiny body they are rounded to those of a possible one: positive, none above the sum of the others.
+    Of a flat or tiny body they are those of a possible one: positive, and none as great as the sum of the others, so
+    that they can be written down with fewer digits.
     """
     moments, axes = np.linalg.eigh(np.array(inertia))
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     moments = np.maximum(moments, SMALLEST)
-    moments[2] = min(moments[2], moments[0] + moments[1])
+    moments[2] = min(moments[2], (1.0 - THICK) * (moments[0] + moments[1]))
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, axes.flatten())
     return moments, quaternion

@@ -58,7 +58,8 @@ def from_mjcf(
     """The record of the arm in an MJCF file.
 
     The file's links, joints, inertias and limits are taken over into a model of our kind: one capsule around the geoms
-    of each link, other joints held still, everything else left out. The hand keeps the turn that it has at home.
+    of each link, other joints held where the first keyframe has them, everything else left out. The hand keeps the turn
+    that it has at home.
 
     Args:
         path: The file.
@@ -75,6 +76,7 @@ def from_mjcf(
         hand_radius: [m].
 
     Raises:
+        TypeError: The path is none.
         ValueError: Something is missing, with what there is, or the arm is too weak or has too little room.
     """
     file = path_of(path)

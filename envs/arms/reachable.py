@@ -145,7 +145,7 @@ class Reachable:
         if np.abs(place).max() >= BOUND:
             return f"coordinates must be less than {BOUND} m, where observations end"
         if place[2] <= self._hand_radius + ROOM:
-            return f"it is less than {1e3 * ROOM:.0f} mm above the table"
+            return f"the hand, of radius {self._hand_radius:g} m, comes closer than {1e3 * ROOM:.0f} mm to the table"
         joints = solve_postures(self._chain, self._hand_at, self._foreign.home, place[None])
         ((off,), (turned,)), (spare, above, apart) = self._errors(place[None], joints), self._room(joints)
         names = self._foreign.joints

@@ -7,6 +7,7 @@ import pytest
 from viapoint.envs.action import ActionLayout
 from viapoint.envs.arms import ADULT
 from viapoint.envs.arms.panda import PANDA
+from viapoint.envs.decision_ends import Event
 from viapoint.envs.pacing import pace_of
 
 REACH = "viapoint.envs:viapoint/PandaReach-v0"
@@ -32,12 +33,21 @@ def everywhere(plan, looks=1000):
     ("n_via", "timing"), [(1, "optimal"), (3, "optimal"), (3, "learned"), (8, "optimal")]
 )
 def test_limits_hold_between_the_looks_and_no_movement_is_slower_than_that_takes(n_via, timing):
-    plan = plans(ActionLayout(n_via=n_via, timing=timing, **SPACE), 150, 0.4)
+    plan = plans(ActionLayout(n_via=n_via, timing=timing, **SPACE), 300, 0.4)
     stretch, within = pace_of(PANDA, plan)
     some = np.flatnonzero(within)
     needed = PANDA.pace(*everywhere(plan.take(some)))
     assert (needed > 1.0).mean() > 0.1
     np.testing.assert_allclose(stretch[some], needed, rtol=5e-3)
+
+
+def test_a_movement_that_is_too_fast_between_the_looks_alone_is_slowed_down():
+    plan = plans(ActionLayout(**SPACE), 150, 0.4)
+    plan = plan.take(np.flatnonzero(pace_of(PANDA, plan).within))
+    faster = plan._replace(durations=plan.durations / 4.0)
+    needed = PANDA.pace(*everywhere(faster)) / 1.002
+    just_above = faster._replace(durations=faster.durations * needed[:, None])
+    assert (pace_of(PANDA, just_above).stretch > 1.0).all()
 
 
 def test_a_peak_between_two_looks_does_not_make_the_arm_sag():
@@ -61,6 +71,24 @@ def test_a_short_plan_that_leaves_the_reach_is_seen_and_the_others_are_slowed_do
     assert 0.3 < ran.mean() < 1.0
     assert (info["stretch"][ran] > 1.0).all()
     assert (info["tracking_error"][ran] < 5e-3).all()
+    for rollout, moved in zip(env.last_rollout, ran, strict=True):
+        rates = np.abs(np.diff(rollout.joints, axis=0)) / 0.004
+        assert not moved or (rates < np.array(PANDA.velocity_limit)).all()
+
+
+def test_plans_that_are_revised_in_motion_keep_to_the_limits_too():
+    env = gym.make_vec("viapoint.envs:viapoint/PandaMovingObstacles-v0", num_envs=64).unwrapped
+    env.reset(seed=0)
+    rng, paced, moving = np.random.default_rng(0), [], 0
+    real = env._online.paced
+    env._online.paced = lambda plan: paced.append(real(plan)) or paced[-1]
+    for _ in range(5):
+        env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
+    for plan, stretch, within in paced:
+        some = np.flatnonzero(within & (stretch > 1.0) & (plan.velocity != 0.0).any(axis=-1))
+        moving += len(some)
+        assert (pace_of(PANDA, plan.take(some)).stretch < 1.005).all()
+    assert moving > 10
 
 
 @pytest.mark.parametrize("duration", [0.05, 0.2, 1.0])
@@ -75,3 +103,14 @@ def test_of_an_arm_without_limits_only_short_plans_are_looked_at(duration):
     assert outside.tolist() == [False, True]
     assert stretch.tolist() == [1.0, 1.0]
     assert within.tolist() == [True, duration > 0.25]
+
+
+def test_plans_that_leave_the_reach_between_looks_end_episodes(monkeypatch):
+    env = gym.make_vec("viapoint.envs:viapoint/PandaMovingObstacles-v0", num_envs=3).unwrapped
+    env.reset(seed=0)
+    real = env._online.paced
+    monkeypatch.setattr(env._online, "reachable", lambda plan: np.ones(len(plan.durations), bool))
+    monkeypatch.setattr(env._online, "paced", lambda plan: (*real(plan)[:2], np.array([True, False, True])))
+    action = np.zeros(env.action_space.shape, np.float32)
+    *_, info = env.step(action)
+    assert (info["event"] == Event.REACH).tolist() == [False, True, False]
