@@ -169,14 +169,14 @@ def _both_ways(limits: Float) -> float:
 
 
 def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
-    """The model without what drives, couples or measures, and with every other joint held where the file's home is."""
+    """The model without what drives, couples or measures, every other joint held as in the first keyframe, if any."""
     for part in (
         *spec.actuators, *spec.equalities, *spec.sensors, *spec.tendons, *spec.keys, *spec.excludes, *spec.pairs,
     ):  # fmt: skip
         spec.delete(part)
-    held = _held(whole, joints)
     others = [joint for joint in spec.joints if joint.name not in joints]
-    if whole.nkey:
+    held = _held(whole, joints) if whole.nkey else None
+    if held:
         for body in {joint.parent.id: joint.parent for joint in others}.values():
             _put(body, whole, held)
     for joint in others:
@@ -184,18 +184,18 @@ def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) 
     for body in spec.bodies:
         body.mocap = False
     model = spec.compile()
-    _check_held(model, whole, held, joints)
+    if held:
+        _check_held(model, whole, held, joints)
     return model
 
 
 def _held(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
-    """The places of everything with the arm as it is drawn and all other joints as in the first keyframe, if any."""
+    """The places of everything with the arm as it is drawn and all other joints as in the first keyframe."""
     data = mujoco.MjData(whole)
-    if whole.nkey:
-        data.qpos[:] = whole.key_qpos[0]
-        for name in joints:
-            address = whole.joint(name).qposadr
-            data.qpos[address] = whole.qpos0[address]
+    data.qpos[:] = whole.key_qpos[0]
+    for name in joints:
+        address = whole.joint(name).qposadr
+        data.qpos[address] = whole.qpos0[address]
     mujoco.mj_kinematics(whole, data)
     return data
 

@@ -76,7 +76,7 @@ def from_mjcf(
         hand_radius: [m].
 
     Raises:
-        TypeError: The path is none.
+        TypeError: The path is no name of a file.
         ValueError: Something is missing, with what there is, or the arm is too weak or has too little room.
     """
     file = path_of(path)
