@@ -55,7 +55,7 @@ METHODS = (
 )
 """Each algorithm as its preset says."""
 WHOLE = METHODS[0]
-DEFAULT_METHODS = (*get_args(Algorithm), "sac-step")
+DEFAULT_METHODS = (*get_args(Algorithm), "sac-step", "ppo-step")
 TWINS = {whole: step for step, whole in STEP_TASKS.items()}
 """Step-wise twin of an environment."""
 ABLATIONS = (

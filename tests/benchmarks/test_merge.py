@@ -7,7 +7,7 @@ from pathlib import Path
 import learning
 from study import gather
 from study.merge import merged
-from study.plan import WHOLE
+from study.plan import METHODS, WHOLE
 
 from viapoint.training.files import read_json
 
@@ -31,7 +31,7 @@ def part(record, names):
 def test_parts_that_were_measured_apart_make_the_whole_page():
     record = read_json(DOCS / "results.json")
     assert merged(record, record) == record
-    whole, others = part(record, [WHOLE.name]), part(record, ["sac", "td3", "ppo", "tqc", "sac-step"])
+    whole, others = part(record, [WHOLE.name]), part(record, [each.name for each in METHODS[1:]])
     whole["ablations"], others["freedom"] = {}, {}
     for env in list(others["environments"])[1:]:
         others["environments"][env]["baselines"] = []
