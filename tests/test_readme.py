@@ -16,6 +16,7 @@ ROWS = {
     "TQC": ("tqc", "alone"),
     "TD3": ("td3", "alone"),
     "PPO": ("ppo", "alone"),
+    "PPO, an action in every control step": ("ppo-step", "alone"),
     "best of 80 random actions, each simulated": ("random80", None),
     "motion planner from a library (OMPL's RRT-Connect, made smooth)": ("ompl", None),
 }
@@ -43,5 +44,6 @@ def test_the_table_of_the_study_is_that_of_its_file(label):
     (method,) = (each for each in results["methods"] + results["baselines"] if each["name"] == name)
     test, hard = (method["sets"][each][how] if how else method["sets"][each] for each in ("test", "hard"))
     learnt = [f"{method['training']['decisions']:,}", str(len(method["seeds"]))] if how else ["-", "-"]
-    cells = [label, *learnt, success(test), success(hard), f"{test['jerk'][0]:.2f}"]
+    jerk = test["jerk"][0]
+    cells = [label, *learnt, success(test), success(hard), f"{jerk:.0f}" if jerk >= 100.0 else f"{jerk:.2f}"]
     assert f"| {' | '.join(cells)} |" in README

@@ -35,7 +35,7 @@ COLOURS = {
     "tqc-step": "#1d4a37",
 }
 SHOWN_BASELINES = {"random80": ("0.55", "D"), "constant": ("0.55", "s"), "stored": ("0.2", "_")}
-DOTS_PER_INCH, SHADES = 100, 48
+DOTS_PER_INCH, SHADES = 100, 96
 
 
 def draw(record: Numbers, folder: Path) -> list[Path]:
@@ -77,7 +77,7 @@ def _learning(axes: Any, curves: Numbers) -> None:
             ax.fill_between(x, rates.min(axis=1), rates.max(axis=1), color=colour, alpha=0.18, linewidth=0.0)
         ax.set_xscale("log")
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+        ax.xaxis.set_major_formatter(FuncFormatter(_in_short))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlabel(label, fontsize=8)
         _tidy(ax)
@@ -111,6 +111,14 @@ def _abilities(ax: Axes, numbers: Numbers, name: str) -> None:
     ax.set_title(f"{name} scenes, by solution share (easy to hard)", fontsize=8.5)
     ax.set_ylabel("success [%]" if ax.get_subplotspec().is_first_col() else "", fontsize=8)  # type: ignore[union-attr]
     _tidy(ax)
+
+
+def _in_short(value: float, _: Any) -> str:
+    """A number of a tick: 0.03, 300, 10k, 3M."""
+    for unit, suffix in ((1e6, "M"), (1e3, "k")):
+        if value >= unit:
+            return f"{value / unit:g}{suffix}"
+    return f"{value:g}"
 
 
 def _tidy(ax: Axes) -> None:

@@ -107,7 +107,10 @@ def _success(found: Numbers, bands: Sequence[str]) -> list[str]:
 
 
 def _beside(found: Numbers) -> list[str]:
-    return ["-" if found[key] is None else f"{found[key][0]:.2f}" for key in ("jerk", "duration")]
+    values = [found[key] and found[key][0] for key in ("jerk", "duration")]
+    return [
+        "-" if value is None else f"{value:,.0f}" if value >= 100.0 else f"{value:.2f}" for value in values
+    ]
 
 
 def _effort(entry: Numbers) -> list[str]:
