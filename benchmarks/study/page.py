@@ -107,10 +107,11 @@ def _success(found: Numbers, bands: Sequence[str]) -> list[str]:
 
 
 def _beside(found: Numbers) -> list[str]:
-    values = [found[key] and found[key][0] for key in ("jerk", "duration")]
-    return [
-        "-" if value is None else f"{value:,.0f}" if value >= 100.0 else f"{value:.2f}" for value in values
-    ]
+    return ["-" if found[key] is None else _multiple(found[key][0]) for key in ("jerk", "duration")]
+
+
+def _multiple(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.2f}"
 
 
 def _effort(entry: Numbers) -> list[str]:
