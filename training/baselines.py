@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes import Scenes
+from viapoint.training.geometry_search import GeometrySearch
 from viapoint.training.motion_planner import MotionPlannerMethod
 from viapoint.training.online_methods import OnlinePlanner, Unrevised
 from viapoint.training.online_trial import new_trial
@@ -132,6 +133,13 @@ def agent_method(name: str, model: Any, candidates: int = 0) -> Method:
     return AgentMethod(name, model, candidates)
 
 
+def _search(n_checks: int) -> Callable[[Trial], Method]:
+    return lambda trial: GeometrySearch(trial.task, n_checks)
+
+
+SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
+"""Searches among computed plans by name, with the number of plans that each checks for a decision."""
+
 METHODS: dict[str, Callable[[Trial], Method]] = {
     "straight": Straight,
     "constant": Constant,
@@ -140,6 +148,7 @@ METHODS: dict[str, Callable[[Trial], Method]] = {
     "random80": lambda trial: RandomVias(trial, 80),
     "planner": PlannerMethod,
     "ompl": MotionPlannerMethod,
+    **SEARCHES,
 }
 """The baselines by the name the command line knows them by."""
 
@@ -148,6 +157,7 @@ ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
     "random": lambda trial: RandomVias(trial, 1),
     "planner": OnlinePlanner,
     "unrevised": lambda trial: Unrevised(Straight(trial), trial),
+    **SEARCHES,
 }
 """Those where plans are revised on the way."""
 

@@ -133,8 +133,9 @@ class EvaluateConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """Some of agent, straight, constant, random, random16, random80, planner, ompl and, where plans are revised on
-    the way, unrevised: the first plan alone."""
+    """Some of agent, straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
+    search4096 (the best of that many computed plans) and, where plans are revised on the way, unrevised: the first plan
+    alone."""
     candidates: int = 0
     """If not 0, the agent gets a second row, in which its critic ranks that many actions at each decision."""
     compiled: bool = False

@@ -13,6 +13,7 @@ DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 
 METHODS = (
     "agent", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
+    "search16", "search64", "search512", "search4096",
 )  # fmt: skip
 """Everything that can be measured; not every environment has each of them."""
 ELSEWHERE = {

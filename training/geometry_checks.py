@@ -1,0 +1,346 @@
+"""Clearance, reach and reward of planned movements, computed without a simulation."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.clearance import FAR, point_distance_squared, segment_distance_squared
+from viapoint.envs.execution import SETTLING
+from viapoint.envs.observation import ObservationLayout, ObstacleRows
+from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT, GOAL_ERROR_UNIT
+from viapoint.envs.task import Task
+from viapoint.training.planned import Numbers, Observation, PlannedMovements, is_replanning, part, planned
+
+Single = NDArray[np.float32]
+Index = NDArray[np.intp]
+
+CLEARANCE_MARGIN = 0.001
+"""Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
+REACH_MARGIN = 0.001
+"""Least reach margin of a movement that the search prefers, [m]."""
+NODES = 16
+"""Instants at which every movement is looked at."""
+DEEP = -0.055
+"""Clearance below which no instant is looked at closely, [m]: the reward ends at CLEARANCE_RANGE."""
+CLOSE = 0.1
+"""Clearance above which no instant is looked at closely, [m]."""
+FINER = 12
+"""Close looks in each interval between two instants."""
+STENCIL = 4
+"""Instants from which places between them are interpolated."""
+OUTSIDE = -1e6
+"""Merit below that of every plan within the margins."""
+BLOCK = 1 << 14
+"""Places of the hand that are looked at together, so that temporary arrays stay in the cache."""
+
+
+class PlanChecks(NamedTuple):
+    """Checks of H planned movements in each of B scenes, shape (B, H) each."""
+
+    clearance: Single
+    """Least clearance over the movement, [m], at most FAR.
+
+    Between DEEP and CLOSE it is right to half a millimetre. Beyond them it is the least of NODES instants, and a
+    little too large.
+    """
+    reach_margin: Single
+    """Least distance inside the arm's reach, [m]; negative where the movement leaves it."""
+    reward: Single
+    """Reward if the physics follows the plan."""
+
+
+def check_plans(observation: Observation, actions: Numbers, task: Task) -> PlanChecks:
+    """Compute clearance, reach margin and reward of the plans of H actions in each of B scenes.
+
+    Obstacles with velocities go on as they move now. The reward has all terms of
+    :func:`~viapoint.envs.reward.reward_terms`; where an episode is several decisions, success counts if the time that
+    is left suffices. A collision's goal error is not known and counts as none.
+
+    Args:
+        observation: Parts of B observations, shape (B, .) each.
+        actions: Shape (B, H, m), in [-1, 1].
+        task: The environment's.
+
+    Example:
+        >>> import gymnasium, numpy, viapoint.envs
+        >>> env = gymnasium.make_vec("viapoint/PlanarReach-v0", num_envs=2).unwrapped
+        >>> observation, _ = env.reset(seed=0)
+        >>> checks = check_plans(observation, numpy.zeros((2, 1, 3)), env.task)
+        >>> checks.clearance.tolist(), checks.reward.round(3).tolist()
+        ([[1.0], [1.0]], [[1.1], [1.1]])
+    """
+    found = PlanChecks(*(np.empty(actions.shape[:2], np.float32) for _ in PlanChecks._fields))
+    obstacles = _Obstacles.seen(observation, task)
+    shares = np.linspace(0.0, 1.0, NODES)
+    for rows in _blocks(obstacles.number, max(1, BLOCK // (actions.shape[1] * len(shares)))):
+        some = part(observation, rows)
+        moves = planned(some, actions[rows], task, shares)
+        clearance = _least_clearance(moves, obstacles.take(rows), task, shares)
+        reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
+        for mine, theirs in zip(
+            found, (clearance, reach, _reward(some, moves, clearance, reach, task)), strict=True
+        ):
+            mine[rows] = theirs
+    return found
+
+
+def best_plan(
+    checks: PlanChecks, clearance_margin: float = CLEARANCE_MARGIN, reach_margin: float = REACH_MARGIN
+) -> Index:
+    """Return the index of the best plan of each scene, shape (B,).
+
+    It has the greatest reward of those whose clearance and reach exceed the margins; where none does, the greatest
+    smaller one of clearance and reach margin.
+
+    Args:
+        checks: Of H plans in each of B scenes.
+        clearance_margin: [m].
+        reach_margin: [m].
+    """
+    return merit(checks, clearance_margin, reach_margin).argmax(axis=-1)
+
+
+def merit(checks: PlanChecks, clearance_margin: float, reach_margin: float) -> NDArray[np.float64]:
+    """Return the number by which :func:`best_plan` orders plans, shape (B, H): the reward of those within the margins.
+
+    That of all others is far below; the smaller one of clearance and reach margin orders them.
+    """
+    within = (checks.clearance > clearance_margin) & (checks.reach_margin > reach_margin)
+    least = np.minimum(checks.clearance, checks.reach_margin, dtype=np.float64)
+    return np.where(within, checks.reward, least + OUTSIDE)
+
+
+class _Obstacles(NamedTuple):
+    """Obstacles of B scenes, those that are present first."""
+
+    rows: Single
+    """Shape (B, n, 2 D + 1), [m]; absent ones have a radius so negative that they are far from everything."""
+    number: Index
+    """Obstacles of each scene, shape (B,)."""
+    velocity: Single | None
+    """Shape (B, n, D), [m/s]; None where obstacles stand still."""
+
+    @classmethod
+    def seen(cls, observation: Observation, task: Task) -> _Obstacles:
+        """Return the obstacles that observations tell."""
+        d, number = task.arm.dimension, len(observation["hand"])
+        if "obstacles" not in observation:
+            return cls(np.zeros((number, 0, 2 * d + 1), np.float32), np.zeros(number, np.intp), None)
+        flat, row_size = observation["obstacles"], 2 * d + 2
+        seen: ObstacleRows = ObservationLayout.of(task.arm, flat.shape[-1] // row_size).obstacles(flat)
+        present = seen.present > 0.5
+        radius = np.where(present, seen.radius, -2.0 * FAR)[..., None]
+        rows = np.concatenate((seen.centre, seen.half_axis, radius), axis=-1, dtype=np.float32)
+        order = np.argsort(~present, axis=-1, kind="stable")[..., None]
+        velocity = None
+        if "obstacle_velocities" in observation:
+            every = np.asarray(observation["obstacle_velocities"], np.float32).reshape(*present.shape, d)
+            velocity = np.take_along_axis(every, order, axis=1) if every.any() else None
+        return cls(np.take_along_axis(rows, order, axis=1), present.sum(axis=-1), velocity)
+
+    def take(self, rows: Any) -> _Obstacles:
+        """Return those of some scenes, with no more rows than these need."""
+        number = self.number[rows]
+        most = int(number.max(initial=0))
+        velocity = None if self.velocity is None else self.velocity[rows, :most]
+        return _Obstacles(self.rows[rows, :most], number, velocity)
+
+
+def _blocks(number: Index, size: int) -> Iterator[Any]:
+    """Yield the indices of scenes that are looked at together; they have about equally many obstacles."""
+    if len(number) <= size:
+        yield slice(None)
+        return
+    order = np.argsort(number, kind="stable")
+    yield from (order[first : first + size] for first in range(0, len(order), size))
+
+
+class _Bodies(NamedTuple):
+    """One capsule of an arm, or the hand, during B H movements."""
+
+    first: Numbers
+    """One end of the axis, shape (B, T, H, D), [m]."""
+    second: Numbers | None
+    """The other end; None where the body is a sphere."""
+    radius: float
+    """[m]."""
+
+    def distance_squared(self, rows: Numbers, drift: Numbers | None) -> Numbers:
+        """Return the squared distance from obstacles, for axes whose instants are all in one axis."""
+        if self.second is None:
+            return np.asarray(point_distance_squared(self.first, rows, drift))
+        return np.asarray(segment_distance_squared(self.first, self.second, rows, drift))
+
+    def map(self, function: Any) -> _Bodies:
+        """Return the body with both ends transformed."""
+        return self._replace(
+            first=function(self.first), second=None if self.second is None else function(self.second)
+        )
+
+
+def _bodies(places: Numbers, task: Task) -> list[_Bodies]:
+    """Return what must clear the obstacles, with the hand at places of shape (B, T, H, D)."""
+    arm, hand = task.arm, _Bodies(places, None, task.arm.hand_radius)
+    if not task.whole_arm:
+        return [hand]
+    quick = getattr(arm, "links_at", None)
+    links = _links(arm, places) if quick is None else quick(places)
+    bodies = [_Bodies(*ends, radius) for ends, radius in zip(links, arm.link_radii, strict=True)]
+    # The last link ends in the hand, which is inside it unless it is thicker.
+    return bodies if arm.hand_radius <= arm.link_radii[-1] else [*bodies, hand]
+
+
+def _links(arm: Arm, places: Numbers) -> list[tuple[Numbers, Numbers]]:
+    """Return both ends of each link of an arm in space, shape (B, T, H, 3) each, their components apart in memory."""
+    ends = np.moveaxis(np.asarray(arm.links(arm.posture(places))), (-3, -2, -1), (0, 1, 2))
+    single = np.moveaxis(np.ascontiguousarray(ends, np.float32), 2, -1)
+    return [(first, second) for first, second in single]
+
+
+def _least_clearance(
+    moves: PlannedMovements, obstacles: _Obstacles, task: Task, shares: NDArray[np.float64]
+) -> Single:
+    """Return the least clearance of movements, shape (B, H), [m]."""
+    places = np.asarray(moves.path, np.float32).swapaxes(1, 2)
+    number, times, tried, _ = places.shape
+    least = np.full((number, tried), FAR, np.float32)
+    if not obstacles.rows.shape[1]:
+        return least
+    drift = None
+    if obstacles.velocity is not None:
+        elapsed = moves.duration[:, None].astype(np.float32) * shares[:, None].astype(np.float32)
+        drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
+    bodies = _bodies(places, task)
+    profiles = []
+    for body in bodies:
+        flat = body.map(lambda ends: ends.reshape(number, times * tried, -1))
+        squared = flat.distance_squared(obstacles.rows, drift)
+        profiles.append(squared.reshape(number, -1, times, tried))
+        radius = obstacles.rows[..., -1] + np.float32(body.radius)
+        coarse = np.sqrt(profiles[-1].min(axis=2)) - radius[..., None]
+        np.minimum(least, coarse.min(axis=1), out=least)
+    limit = np.where((least > DEEP) & (least < CLOSE), least, np.float32(-2.0 * FAR))
+    for body, squared in zip(bodies, profiles, strict=True):
+        near = _near(body, squared, obstacles, limit)
+        if len(near[0]):
+            np.minimum.at(
+                least, (near[0], near[3]), _close_look(body, near, obstacles, moves.duration, shares)
+            )
+    return least
+
+
+def _near(body: _Bodies, squared: Numbers, obstacles: _Obstacles, limit: Numbers) -> tuple[Index, ...]:
+    """Return the scenes, obstacles, instants and movements at which a body may come nearest, shape (M,) each.
+
+    These are local minima in time, from which a straight movement of half an interval may lead below the limit.
+
+    Args:
+        body: Of the arm.
+        squared: Distance of its axis from those of obstacles, shape (B, n, T, H), [m^2].
+        obstacles: Of the scenes.
+        limit: Clearance of interest, shape (B, H), [m].
+    """
+    reach = limit[:, None] + (obstacles.rows[..., -1] + np.float32(body.radius))[..., None]
+    bound = np.where(reach > 0.0, reach * reach, np.float32(-1.0))[:, :, None] + _half_steps(body)[:, None]
+    near = squared <= bound
+    near[:, :, 1:] &= squared[:, :, 1:] <= squared[:, :, :-1]
+    near[:, :, :-1] &= squared[:, :, :-1] <= squared[:, :, 1:]
+    return np.nonzero(near)
+
+
+def _half_steps(body: _Bodies) -> Numbers:
+    """Return the square of half of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
+    steps = [np.diff(ends, axis=1) for ends in (body.first, body.second) if ends is not None]
+    squares = [sum(step[..., i] * step[..., i] for i in range(step.shape[-1])) for step in steps]
+    square = 0.25 * functools.reduce(np.maximum, squares)
+    longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
+    longer[:, :-1], longer[:, -1] = square, square[:, -1]
+    np.maximum(longer[:, 1:-1], square[:, :-1], out=longer[:, 1:-1])
+    return longer
+
+
+def _close_look(
+    body: _Bodies,
+    near: tuple[Index, ...],
+    obstacles: _Obstacles,
+    duration: Numbers,
+    shares: NDArray[np.float64],
+) -> Single:
+    """Return the least clearance between the instants around some, shape (M,), [m].
+
+    Args:
+        body: That is near.
+        near: Scenes, obstacles, instants and movements, shape (M,) each.
+        obstacles: Of the scenes.
+        duration: Of the movements, shape (B, H), [s].
+        shares: Of the instants.
+    """
+    scene, which, instant, movement = near
+    first, weights, times = _interpolation(len(shares))
+    nodes = first[instant, None] + np.arange(STENCIL)
+    ends = body.map(lambda part: weights[instant] @ part[scene[:, None], nodes, movement[:, None]])
+    row = obstacles.rows[scene, which, None]
+    drift = None
+    if obstacles.velocity is not None:
+        elapsed = duration[scene, movement, None] * times[instant]
+        drift = (obstacles.velocity[scene, which, None] * elapsed[..., None].astype(np.float32))[:, None]
+    lowest = _lowest(ends.distance_squared(row, drift)[:, 0])
+    return np.asarray(np.sqrt(lowest) - (row[:, 0, -1] + np.float32(body.radius)))
+
+
+def _lowest(values: Numbers) -> Numbers:
+    """Return the least value of each row, or of the parabola through the three values around it, shape (M,)."""
+    each = np.arange(len(values))
+    at = values[:, 1:-1].argmin(axis=-1)
+    before, middle, after = (values[each, at + i] for i in range(3))
+    slope, curvature = 0.5 * (after - before), after - 2.0 * middle + before
+    between = curvature > np.abs(slope)
+    drop = 0.5 * slope * slope / np.where(between, curvature, 1.0)
+    return np.maximum(np.where(between, middle - drop, np.minimum(np.minimum(before, after), middle)), 0.0)
+
+
+@functools.cache
+def _interpolation(number: int) -> tuple[Index, Single, NDArray[np.float64]]:
+    """Return how places between instants are interpolated, by Lagrange's formula.
+
+    Returns:
+        The first of STENCIL instants around each, shape (T,), the weights of their places at the close looks around it,
+        shape (T, L, STENCIL), and the shares of the duration at these looks, shape (T, L).
+    """
+    instant = np.arange(number)
+    first = np.clip(instant - STENCIL // 2 + 1, 0, number - STENCIL)
+    looks = np.arange(-FINER, FINER + 1) / FINER
+    places = np.clip(instant[:, None] + looks, 0, number - 1)
+    nodes = (first[:, None] + np.arange(STENCIL))[:, None]
+    others = np.array([[j for j in range(STENCIL) if j != i] for i in range(STENCIL)])
+    apart = nodes[..., None] - nodes[..., others]
+    weights = ((places[..., None, None] - nodes[..., others]) / apart).prod(axis=-1)
+    return first, weights.astype(np.float32), places / (number - 1)
+
+
+def _reward(
+    observation: Observation, moves: PlannedMovements, clearance: Numbers, reach: Numbers, task: Task
+) -> Numbers:
+    """Return the reward of movements that go as planned, shape (B, H)."""
+    weights, relative = task.weights, moves.duration / task.action.centre_duration
+    reachable, touches = reach >= 0.0, clearance < 0.0
+    succeeds = (reachable & ~touches).astype(np.float32)
+    if is_replanning(observation):
+        spare = observation["time_left"] - moves.duration
+        succeeds *= np.clip(spare / SETTLING - 1.0, 0.0, 1.0)
+    line = observation["goal"] - observation["hand"]
+    away = np.minimum(np.sqrt((line * line).sum(axis=-1, keepdims=True)) / GOAL_ERROR_UNIT, 1.0)
+    return np.asarray(
+        weights.success * succeeds
+        - weights.collision * (reachable & touches)
+        + weights.clearance * np.clip(clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT
+        - weights.goal_error * np.where(reachable, 0.0, away)
+        - weights.smoothness * moves.effort
+        - weights.duration * (relative - 1.0)
+    )

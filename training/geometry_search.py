@@ -1,0 +1,217 @@
+"""Search for a movement with computed geometry: no network and no simulation."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from viapoint.envs.action import Plan
+from viapoint.envs.scenes import Scenes, problems
+from viapoint.envs.task import Task
+from viapoint.training.geometry_checks import CLEARANCE_MARGIN, REACH_MARGIN, check_plans, merit
+from viapoint.training.planned import Numbers, Observation, is_replanning
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+CENTRES = 4
+"""Best candidates that a round of refinement samples around."""
+SPREAD = 0.25
+"""Half the side of the cube around each of them, in the action space; each round halves it."""
+
+
+class GeometrySearch:
+    """Planner that checks a fixed set of actions with computed geometry and takes the best one.
+
+    The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. Their plans
+    are ordered by :func:`~viapoint.training.geometry_checks.best_plan`. Where nothing moves, clearance does not depend
+    on the duration; then all candidates but the first have the duration of the greatest reward.
+
+    Args:
+        task: The task of an environment, or the id of a registered one.
+        n_checks: Candidates checked before any refinement, 1 or more.
+        refinements: Rounds in which `per_round` more candidates are checked around the best ones.
+        per_round: Candidates of each round.
+        clearance_margin: Clearance that the chosen plan exceeds if any candidate does, [m].
+        reach_margin: Reach margin that it exceeds likewise, [m].
+        **kwargs: Of the environment, if an id is given.
+
+    Raises:
+        ValueError: A number is out of range.
+
+    Example:
+        >>> import viapoint.envs
+        >>> search = GeometrySearch("viapoint/PlanarObstacles-v0", n_checks=64)
+        >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
+        >>> plan.waypoints.shape, plan.durations.shape
+        ((3, 2), (2,))
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        n_checks: int = 512,
+        *,
+        refinements: int = 0,
+        per_round: int = 64,
+        clearance_margin: float = CLEARANCE_MARGIN,
+        reach_margin: float = REACH_MARGIN,
+        **kwargs: Any,
+    ) -> None:
+        for name, value, least in (
+            ("n_checks", n_checks, 1),
+            ("refinements", refinements, 0),
+            ("per_round", per_round, 1),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+        self.task = task_of(task, **kwargs) if isinstance(task, str) else task
+        self.n_checks, self.refinements, self.per_round = int(n_checks), int(refinements), int(per_round)
+        self._margins = float(clearance_margin), float(reach_margin)
+
+    @property
+    def total_checks(self) -> int:
+        """Number of candidates that are checked for one decision."""
+        return self.n_checks + self.refinements * self.per_round
+
+    @property
+    def name(self) -> str:
+        """Name in tables of results."""
+        return f"search, {self.total_checks} checks"
+
+    def decide(self, observation: Observation, scenes: Any = None) -> Float:
+        """Return the best action of each of B observations, shape (B, m).
+
+        Args:
+            observation: Parts of shape (B, .) each.
+            scenes: Not looked at; part of the protocol :class:`~viapoint.training.baselines.Method`.
+        """
+        number = len(observation["hand"])
+        actions = self._candidates(observation)
+        tried = np.broadcast_to(actions, (number, *actions.shape))
+        worth = merit(check_plans(observation, tried, self.task), *self._margins)
+        best, value = _top(tried, worth, CENTRES if self.refinements else 1)
+        for each in range(self.refinements):
+            near = self._around(best, SPREAD * 0.5**each)
+            worth = merit(check_plans(observation, near, self.task), *self._margins)
+            best, value = _top(
+                np.concatenate((best, near), axis=1), np.concatenate((value, worth), axis=1), CENTRES
+            )
+        return best[:, 0].astype(np.float64)
+
+    def predict(
+        self,
+        observation: Mapping[str, Any],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Single, None]:
+        """Return the best action of one observation, shape (m,), or of a batch, shape (B, m), and no state.
+
+        The signature is that of Stable-Baselines3's `predict`; only the observation is used.
+        """
+        parts = {name: np.asarray(part) for name, part in observation.items()}
+        if parts["hand"].ndim > 1:
+            return self.decide(parts).astype(np.float32), None
+        return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
+
+    def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
+        """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
+
+        Where no candidate stays clear and in reach, it is the one that comes nearest to that.
+
+        Args:
+            start: Place of the hand, shape (D,), [m].
+            goal: Shape (D,), [m].
+            obstacles: Any number of rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; None for none.
+
+        Raises:
+            ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
+                or an obstacle is too large.
+        """
+        d = self.task.arm.dimension
+        ends = [_numbers(name, value, (d,))[None] for name, value in (("start", start), ("goal", goal))]
+        rows = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
+        scene = Scenes(*ends, _numbers("obstacles", rows, (None, 2 * d + 1))[None])
+        for wrong, reason in problems(scene, self.task.arm, whole_arm=self.task.whole_arm):
+            if wrong.any():
+                raise ValueError(reason(0))
+        seen = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1).reshape(1, -1)
+        observation = {"hand": scene.start, "goal": scene.goal, **({"obstacles": seen} if seen.size else {})}
+        return self.task.action.decode(self.decide(observation), scene.start, scene.goal).take(0)
+
+    def _candidates(self, observation: Observation) -> Single:
+        """Return the actions that are checked first, shape (n_checks, m)."""
+        size, d = self.task.action.size, self.task.action.n_via * self.task.action.dimension
+        if is_replanning(observation) or not d:
+            return _sobol(self.n_checks, size)
+        others = _sobol(self.n_checks, size - 1)
+        timed = np.insert(others, d, self._best_duration(), axis=1)
+        timed[0] = 0.0
+        return timed
+
+    def _best_duration(self) -> float:
+        """Return the duration component of the greatest reward: 5 w_smoothness log(T) - w_duration T is greatest."""
+        weights, (low, high) = self.task.weights, self.task.action.duration_range
+        relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
+        return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
+
+    def _around(self, best: Single, spread: float) -> Single:
+        """Return `per_round` actions around the best ones, shape (B, per_round, m)."""
+        steps = spread * _sobol(self.per_round, self.task.action.size)
+        centre = best[:, np.arange(self.per_round) % best.shape[1]]
+        return np.clip(centre + steps, -1.0, 1.0)
+
+
+def task_of(env_id: str, **kwargs: Any) -> Task:
+    """Return the task of a registered environment made with `kwargs`."""
+    env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
+    task: Task = env.unwrapped.task
+    env.close()
+    return task
+
+
+@functools.cache
+def _sobol(number: int, size: int) -> Single:
+    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
+    from torch.quasirandom import SobolEngine
+
+    engine = SobolEngine(size)
+    engine.fast_forward(2)  # a corner and the middle
+    points = 2.0 * engine.draw(max(number - 1, 1)).numpy()[: number - 1] - 1.0
+    actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
+    actions.flags.writeable = False
+    return actions
+
+
+def _top(actions: Numbers, worth: Float, count: int) -> tuple[Single, Float]:
+    """Return the `count` best of H actions in each of B scenes, shape (B, count, m), and their merit (B, count)."""
+    order = np.argsort(-worth, axis=-1, kind="stable")[:, :count]
+    each = np.arange(len(worth))[:, None]
+    return np.asarray(actions[each, order], np.float32), worth[each, order]
+
+
+def _numbers(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float:
+    """Return finite numbers of a shape.
+
+    Raises:
+        ValueError: They are something else.
+    """
+    wanted = f"({', '.join('n' if size is None else str(size) for size in shape)}{',' * (len(shape) == 1)})"
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers [m] of shape {wanted}, got {value!r}") from None
+    fits = array.ndim == len(shape) and all(
+        size in (None, n) for size, n in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array
