@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs._arrays import squared_length
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.clearance import FAR, point_distance_squared, segment_distance_squared
 from viapoint.envs.execution import SETTLING
@@ -55,7 +56,7 @@ class PlanChecks(NamedTuple):
     """Reward if the physics follows the plan."""
 
 
-def check_plans(observation: Observation, actions: Numbers, task: Task) -> PlanChecks:
+def check_plans(observation: Observation, actions: Numbers, task: Task, until: float = np.inf) -> PlanChecks:
     """Compute clearance, reach margin and reward of the plans of H actions in each of B scenes.
 
     Obstacles with velocities go on as they move now. The reward has all terms of
@@ -66,6 +67,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task) -> PlanC
         observation: Parts of B observations, shape (B, .) each.
         actions: Shape (B, H, m), in [-1, 1].
         task: The environment's.
+        until: Time after which clearance does not matter, [s].
 
     Example:
         >>> import gymnasium, numpy, viapoint.envs
@@ -81,7 +83,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task) -> PlanC
     for rows in _blocks(obstacles.number, max(1, BLOCK // (actions.shape[1] * len(shares)))):
         some = part(observation, rows)
         moves = planned(some, actions[rows], task, shares)
-        clearance = _least_clearance(moves, obstacles.take(rows), task, shares)
+        clearance = _least_clearance(moves, obstacles.take(rows), task, shares, until)
         reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
         for mine, theirs in zip(
             found, (clearance, reach, _reward(some, moves, clearance, reach, task)), strict=True
@@ -103,7 +105,7 @@ def best_plan(
         clearance_margin: [m].
         reach_margin: [m].
     """
-    return merit(checks, clearance_margin, reach_margin).argmax(axis=-1)
+    return np.asarray(merit(checks, clearance_margin, reach_margin).argmax(axis=-1))
 
 
 def merit(checks: PlanChecks, clearance_margin: float, reach_margin: float) -> NDArray[np.float64]:
@@ -191,7 +193,9 @@ def _bodies(places: Numbers, task: Task) -> list[_Bodies]:
         return [hand]
     quick = getattr(arm, "links_at", None)
     links = _links(arm, places) if quick is None else quick(places)
-    bodies = [_Bodies(*ends, radius) for ends, radius in zip(links, arm.link_radii, strict=True)]
+    bodies = [
+        _Bodies(first, second, radius) for (first, second), radius in zip(links, arm.link_radii, strict=True)
+    ]
     # The last link ends in the hand, which is inside it unless it is thicker.
     return bodies if arm.hand_radius <= arm.link_radii[-1] else [*bodies, hand]
 
@@ -204,7 +208,7 @@ def _links(arm: Arm, places: Numbers) -> list[tuple[Numbers, Numbers]]:
 
 
 def _least_clearance(
-    moves: PlannedMovements, obstacles: _Obstacles, task: Task, shares: NDArray[np.float64]
+    moves: PlannedMovements, obstacles: _Obstacles, task: Task, shares: NDArray[np.float64], until: float
 ) -> Single:
     """Return the least clearance of movements, shape (B, H), [m]."""
     places = np.asarray(moves.path, np.float32).swapaxes(1, 2)
@@ -212,9 +216,8 @@ def _least_clearance(
     least = np.full((number, tried), FAR, np.float32)
     if not obstacles.rows.shape[1]:
         return least
-    drift = None
+    drift, elapsed = None, moves.duration[:, None].astype(np.float32) * shares[:, None].astype(np.float32)
     if obstacles.velocity is not None:
-        elapsed = moves.duration[:, None].astype(np.float32) * shares[:, None].astype(np.float32)
         drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
     bodies = _bodies(places, task)
     profiles = []
@@ -222,6 +225,8 @@ def _least_clearance(
         flat = body.map(lambda ends: ends.reshape(number, times * tried, -1))
         squared = flat.distance_squared(obstacles.rows, drift)
         profiles.append(squared.reshape(number, -1, times, tried))
+        if until < np.inf:
+            np.copyto(profiles[-1], np.float32(np.inf), where=(elapsed > until)[:, None])
         radius = obstacles.rows[..., -1] + np.float32(body.radius)
         coarse = np.sqrt(profiles[-1].min(axis=2)) - radius[..., None]
         np.minimum(least, coarse.min(axis=1), out=least)
@@ -257,8 +262,7 @@ def _near(body: _Bodies, squared: Numbers, obstacles: _Obstacles, limit: Numbers
 def _half_steps(body: _Bodies) -> Numbers:
     """Return the square of half of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
     steps = [np.diff(ends, axis=1) for ends in (body.first, body.second) if ends is not None]
-    squares = [sum(step[..., i] * step[..., i] for i in range(step.shape[-1])) for step in steps]
-    square = 0.25 * functools.reduce(np.maximum, squares)
+    square: Numbers = 0.25 * functools.reduce(np.maximum, [squared_length(step) for step in steps])
     longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
     longer[:, :-1], longer[:, -1] = square, square[:, -1]
     np.maximum(longer[:, 1:-1], square[:, :-1], out=longer[:, 1:-1])
@@ -302,7 +306,8 @@ def _lowest(values: Numbers) -> Numbers:
     slope, curvature = 0.5 * (after - before), after - 2.0 * middle + before
     between = curvature > np.abs(slope)
     drop = 0.5 * slope * slope / np.where(between, curvature, 1.0)
-    return np.maximum(np.where(between, middle - drop, np.minimum(np.minimum(before, after), middle)), 0.0)
+    lowest: Numbers = np.where(between, middle - drop, np.minimum(np.minimum(before, after), middle))
+    return np.maximum(lowest, 0.0)
 
 
 @functools.cache

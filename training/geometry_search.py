@@ -13,14 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from viapoint.envs.action import Plan
 from viapoint.envs.scenes import Scenes, problems
 from viapoint.envs.task import Task
-from viapoint.training.geometry_checks import CLEARANCE_MARGIN, REACH_MARGIN, check_plans, merit
-from viapoint.training.planned import Numbers, Observation, is_replanning
+from viapoint.training.geometry_checks import CLEARANCE_MARGIN, OUTSIDE, REACH_MARGIN, check_plans, merit
+from viapoint.training.planned import Numbers, Observation, is_replanning, part
 
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 CENTRES = 4
 """Best candidates that a round of refinement samples around."""
+KEEP = 0.1
+"""Reward by which another plan must be better than the one under way, as each change of plan costs jerk."""
+HORIZONS = (1.2, 0.9, 0.6, 0.3)
+"""Times for which a plan shall at least be clear where none is clear to its end, [s]: obstacles may change course."""
 SPREAD = 0.25
 """Half the side of the cube around each of them, in the action space; each round halves it."""
 
@@ -94,11 +98,17 @@ class GeometrySearch:
         number = len(observation["hand"])
         actions = self._candidates(observation)
         tried = np.broadcast_to(actions, (number, *actions.shape))
-        worth = merit(check_plans(observation, tried, self.task), *self._margins)
+        worth = self._worth(observation, tried)
+        if is_replanning(observation):
+            worth[:, 0] += KEEP
+            for horizon in HORIZONS:
+                blocked = np.flatnonzero((worth < 0.5 * OUTSIDE).all(axis=-1))
+                if blocked.size:
+                    worth[blocked] = self._worth(part(observation, blocked), tried[blocked], horizon)
         best, value = _top(tried, worth, CENTRES if self.refinements else 1)
         for each in range(self.refinements):
             near = self._around(best, SPREAD * 0.5**each)
-            worth = merit(check_plans(observation, near, self.task), *self._margins)
+            worth = self._worth(observation, near)
             best, value = _top(
                 np.concatenate((best, near), axis=1), np.concatenate((value, worth), axis=1), CENTRES
             )
@@ -135,15 +145,15 @@ class GeometrySearch:
                 or an obstacle is too large.
         """
         d = self.task.arm.dimension
-        ends = [_numbers(name, value, (d,))[None] for name, value in (("start", start), ("goal", goal))]
+        first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
         rows = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
-        scene = Scenes(*ends, _numbers("obstacles", rows, (None, 2 * d + 1))[None])
+        scene = Scenes(first, last, _numbers("obstacles", rows, (None, 2 * d + 1))[None])
         for wrong, reason in problems(scene, self.task.arm, whole_arm=self.task.whole_arm):
             if wrong.any():
                 raise ValueError(reason(0))
         seen = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1).reshape(1, -1)
-        observation = {"hand": scene.start, "goal": scene.goal, **({"obstacles": seen} if seen.size else {})}
-        return self.task.action.decode(self.decide(observation), scene.start, scene.goal).take(0)
+        observation: Observation = {"hand": first, "goal": last, **({"obstacles": seen} if seen.size else {})}
+        return self.task.action.decode(self.decide(observation), first, last).take(0)
 
     def _candidates(self, observation: Observation) -> Single:
         """Return the actions that are checked first, shape (n_checks, m)."""
@@ -160,6 +170,9 @@ class GeometrySearch:
         weights, (low, high) = self.task.weights, self.task.action.duration_range
         relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
         return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
+
+    def _worth(self, observation: Observation, actions: Numbers, until: float = np.inf) -> Float:
+        return merit(check_plans(observation, actions, self.task, until), *self._margins)
 
     def _around(self, best: Single, spread: float) -> Single:
         """Return `per_round` actions around the best ones, shape (B, per_round, m)."""
@@ -181,7 +194,7 @@ def _sobol(number: int, size: int) -> Single:
     """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
     from torch.quasirandom import SobolEngine
 
-    engine = SobolEngine(size)
+    engine: Any = SobolEngine(size)  # type: ignore[no-untyped-call]
     engine.fast_forward(2)  # a corner and the middle
     points = 2.0 * engine.draw(max(number - 1, 1)).numpy()[: number - 1] - 1.0
     actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)

@@ -182,7 +182,7 @@ def _revised(observation: Observation, actions: Numbers, task: Task, shares: Num
     vias = _for_each(observation["via"], actions).reshape(shape) + offsets @ axes if number else offsets
     duration = _revised_duration(observation, actions[..., number * d], layout)
     points = np.concatenate((place[:, :, None], vias, goal[:, :, None]), axis=2)
-    began = {"start_velocity": velocity, "start_acceleration": acceleration}
+    began: Any = {"start_velocity": velocity, "start_acceleration": acceleration}
     durations = primitives.passage_durations(points, duration, **began)
     trajectory = primitives.through(points, durations, **began)
     found = _sampled(trajectory, duration, line[:, None], task, shares)
@@ -195,7 +195,7 @@ def _revised_duration(observation: Observation, component: Numbers, layout: Acti
     low, high = layout.duration_range
     remaining = np.maximum(observation["remaining"].astype(np.float64), 0.5 * low)
     factor = np.exp(component * (0.5 * np.log(high / low)))
-    return np.clip(remaining * factor, 0.5 * low, np.maximum(remaining, high))
+    return np.asarray(np.clip(remaining * factor, 0.5 * low, np.maximum(remaining, high)))
 
 
 def _sampled(
