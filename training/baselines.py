@@ -106,31 +106,38 @@ class PlannerMethod:
 
 
 class AgentMethod:
-    """A trained agent; with candidates, its critic ranks that many neighbours of its proposals."""
+    """A trained agent.
 
-    def __init__(self, name: str, model: Any, candidates: int = 0) -> None:
-        self.name, self._model, self._candidates = name, model, candidates
+    Args:
+        name: As it stands in the table.
+        model: That decides.
+        checks: How many of its proposals are checked by exact geometry at each decision; None leaves the model's own
+            setting.
+    """
+
+    def __init__(self, name: str, model: Any, checks: int | None = None) -> None:
+        self.name, self._model, self._checks = name, model, checks
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """See :class:`Method`; the scenes are not looked at."""
         policy = self._model.policy
-        own = getattr(policy, "candidates", None)
-        if own is not None:
-            policy.candidates = self._candidates
+        own = getattr(policy, "checks", None)
+        if own is not None and self._checks is not None:
+            policy.checks = self._checks
         try:
             actions, _ = self._model.predict(observation, deterministic=True)
         finally:
             if own is not None:
-                policy.candidates = own
+                policy.checks = own
         return np.asarray(actions, dtype=np.float64)
 
 
-def agent_method(name: str, model: Any, candidates: int = 0) -> Method:
-    """A trained agent as a method, whether one action of it is a whole movement or lasts a control step."""
+def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
+    """Return a trained agent as a method, whether an action of it is a whole movement or lasts a control step."""
     env = model.get_env()
     if is_step_wise(env.env_id):
         return StepAgentMethod(name, model, env.env_id, env.env_kwargs)
-    return AgentMethod(name, model, candidates)
+    return AgentMethod(name, model, checks)
 
 
 def _search(n_checks: int) -> Callable[[Trial], Method]:
@@ -169,8 +176,8 @@ def check_method(name: str, env_id: str) -> None:
         ValueError: There is none of that name.
     """
     known = _known(env_id)
-    if name not in known and name != "agent":
-        raise ValueError(f"method must be agent or one of {', '.join(known)} in {env_id}, got {name!r}")
+    if name not in known and name not in ("agent", "untrained"):
+        raise ValueError(f"method must be agent, untrained or one of {', '.join(known)} in {env_id}, got {name!r}")
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:

@@ -25,6 +25,7 @@ from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import SETS, FrozenScenes
 from viapoint.training.online_methods import Unrevised
 from viapoint.training.online_trial import OnlineTrial
+from viapoint.training.model_files import untrained
 from viapoint.training.runs import Run, find_model, load_model
 from viapoint.training.step_agent import is_step_wise, whole_task
 
@@ -44,20 +45,19 @@ class Agent(NamedTuple):
     env_kwargs: dict[str, Any]
     folder: Path
 
-    def method(self, candidates: int = 0) -> Method:
-        """The agent as a method; with candidates, its critic ranks that many at each decision."""
-        if candidates and not hasattr(self.model.policy, "ranked"):
-            kind = type(self.model).__name__
-            raise ValueError(f"candidates are ranked by ViaTD3 only; this agent is a {kind}")
-        name = f"agent, ranks {candidates}" if candidates else "agent"
-        return agent_method(name, self.model, candidates)
+    def method(self, checks: int = 0) -> Method:
+        """Return the agent as a method that checks so many of its proposals by exact geometry."""
+        return agent_method(self._named("agent", checks), self.model, checks)
 
-    def compile_decisions(self, candidates: int = 0) -> None:
-        """See :meth:`viapoint.training.policies.ViaPolicy.compile_decisions`."""
-        if not hasattr(self.model.policy, "compile_decisions"):
+    def untrained(self, checks: int = 0) -> Method:
+        """Return the same network before training, as a method."""
+        return agent_method(self._named("untrained", checks), untrained(self.model), checks)
+
+    def _named(self, name: str, checks: int) -> str:
+        if checks and not hasattr(self.model.policy, "checks"):
             kind = type(self.model).__name__
-            raise ValueError(f"decisions are compiled of ViaTD3 only; this agent is a {kind}")
-        self.model.policy.compile_decisions(candidates)
+            raise ValueError(f"proposals are checked by ViaQ only; this agent is a {kind}")
+        return f"{name}, {checks} checks" if checks else name
 
 
 def find_agent(run: Path | None, pretrained: str | None) -> Agent:
@@ -162,17 +162,10 @@ def _methods(
     for name in config.methods:
         if name == "unrevised" and agent:
             methods.append(Unrevised(agent.method(), OnlineTrial(env_id, **env_kwargs)))
-        elif name != "agent":
+        elif name not in ("agent", "untrained"):
             methods.append(make_method(name, env_id, **env_kwargs))
         elif agent:
-            for count in sorted({0, config.candidates}):
-                methods.append(agent.method(count))
-                if config.compiled:
-                    print(
-                        f"{methods[-1].name}: compiling its decision, which takes a minute or two",
-                        file=sys.stderr,
-                    )
-                    agent.compile_decisions(count)
+            methods += [getattr(agent, "method" if name == "agent" else name)(n) for n in config.checks]
     return methods
 
 
@@ -184,7 +177,7 @@ def play(config: PlayConfig) -> None:
     scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
     rows = spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    method = agent.method(config.candidates)
+    method = agent.method(config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
     film(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()

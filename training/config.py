@@ -31,12 +31,12 @@ from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 class TrainConfig:
     """Train an agent.
 
-    Example: viapoint train --env viapoint/PlanarObstacles-v0 --algo viatd3 --seed 0 --out runs/first
+    Example: viapoint train --env viapoint/PlanarObstacles-v0 --algo viaq --seed 0 --out runs/first
     """
 
     env: str = DEFAULT_ENV
     """Id of the environment; an unknown one is answered with all that there are."""
-    algo: Algorithm = "viatd3"
+    algo: Algorithm = "viaq"
     """Learning algorithm; training/presets.py holds the settings of each."""
     seed: int = 0
     """Seed of everything that is random: equal seeds give equal agents on one machine."""
@@ -133,13 +133,11 @@ class EvaluateConfig:
     pretrained: str | None = None
     """Id of an environment whose shipped agent is taken instead."""
     methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """Some of agent, straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
-    search4096 (the best of that many computed plans) and, where plans are revised on the way, unrevised: the first plan
-    alone."""
-    candidates: int = 0
-    """If not 0, the agent gets a second row, in which its critic ranks that many actions at each decision."""
-    compiled: bool = False
-    """Make machine code of single decisions first: a minute or two for each row of the agent."""
+    """Some of agent, untrained (the same network before training), straight, constant, random, random16, random80,
+    planner, ompl, search16, search64, search512 and search4096 (the best of that many computed plans) and, where plans
+    are revised on the way, unrevised: the first plan alone."""
+    checks: tuple[int, ...] = (0,)
+    """One row of the agent for each number: how many of its proposals are checked by exact geometry, 0 for none."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int | None = None
@@ -156,16 +154,21 @@ class EvaluateConfig:
         check_methods(self.methods)
         if self.env is not None:
             check_env(self.env)
-        check_one_source(self.run, self.pretrained, needed="agent" in self.methods)
+        check_one_source(
+            self.run, self.pretrained, needed=bool({"agent", "untrained"} & set(self.methods))
+        )
         if self.run is None and self.pretrained is None and self.env is None:
             raise ValueError("without an agent, --env must say which environment is meant")
-        check_whole("candidates", self.candidates, 0)
+        for number in self.checks:
+            check_whole("checks", number, 0)
+        if not self.checks:
+            raise ValueError("checks must name at least one number, such as 0")
         if self.n_scenes is not None:
             check_whole("n_scenes", self.n_scenes, 1)
         check_file("json", self.json)
         check_folder("failures", self.failures)
-        for name in ("candidates", "compiled", "failures"):
-            if getattr(self, name) and "agent" not in self.methods:
+        for name, asked in (("checks", any(self.checks)), ("failures", self.failures is not None)):
+            if asked and not {"agent", "untrained"} & set(self.methods):
                 raise ValueError(f"{name} concerns the agent, which is not among the methods")
 
 
@@ -186,15 +189,15 @@ class PlayConfig:
     """validation, test, hard, or a file of scenes."""
     n_scenes: int = 8
     """How many of them, evenly spread over the set."""
-    candidates: int = 0
-    """Actions that the agent's critic ranks at each decision; 0 is the policy alone."""
+    checks: int = 0
+    """How many of the agent's proposals are checked by exact geometry; 0 for none."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         check_one_source(self.run, self.pretrained, needed=True)
         check_file("video", self.video, ".mp4")
         check_whole("n_scenes", self.n_scenes, 1)
-        check_whole("candidates", self.candidates, 0)
+        check_whole("checks", self.checks, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,8 +262,8 @@ class DemoConfig:
     """Decisions to train for; two thirds of the preset's if not given, so that nobody waits for long."""
     n_scenes: int | None = None
     """Test scenes to evaluate on; all if not given."""
-    candidates: int = 80
-    """Actions that the agent's critic ranks in its second row of the table."""
+    checks: int = 16
+    """How many of the agent's proposals are checked by exact geometry in its second row of the table."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
@@ -269,7 +272,7 @@ class DemoConfig:
         check_has_scenes(self.env)
         check_folder("out", self.out)
         check_whole("seed", self.seed, 0)
-        check_whole("candidates", self.candidates, 1)
+        check_whole("checks", self.checks, 1)
         for name in ("n_timesteps", "n_scenes"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), 1)

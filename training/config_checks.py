@@ -12,7 +12,7 @@ from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 
 METHODS = (
-    "agent", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
+    "agent", "untrained", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
     "search16", "search64", "search512", "search4096",
 )  # fmt: skip
 """Everything that can be measured; not every environment has each of them."""

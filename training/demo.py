@@ -25,7 +25,7 @@ from viapoint.training.runs import Run
 from viapoint.training.train import one_thread, train
 from viapoint.training.video import film
 
-BASELINES = ("straight", "random")
+BASELINES = ("search16", "search512", "straight", "random")
 PICTURES = 12
 """In the gallery."""
 MOVEMENTS = 4
@@ -142,14 +142,14 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     identity = {
         "sha256": frozen.sha256,
         "weights_sha256": hashlib.sha256((agent.folder / "weights.safetensors").read_bytes()).hexdigest(),
-        "candidates": config.candidates,
+        "checks": config.checks,
     }
     if path.exists():
         record = read_json(path)
         if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
             print(f"{path} holds its evaluation: starting from it")
             return record
-    methods: list[Method] = [agent.method(), agent.method(config.candidates)]
+    methods: list[Method] = [agent.method(), agent.method(config.checks), agent.untrained()]
     methods += [*(make_method(name, config.env) for name in BASELINES), Certified(frozen)]
     with progress_bar(methods, len(frozen.share)) as progress, one_thread():
         result = evaluate(methods, frozen, config.env, progress=progress)

@@ -116,6 +116,9 @@ HYPERPARAMETERS: dict[str, Allowed] = {
     "vf_coef": NOT_NEGATIVE,
     "max_grad_norm": POSITIVE,
     "target_kl": _or(POSITIVE, NONE),
+    # ViaQ
+    "explore_candidates": _whole(2),
+    "next_candidates": _whole(1),
     # ViaTD3
     "explore_uniformly": SHARE,
     "noise": NOT_NEGATIVE,
@@ -138,6 +141,12 @@ PARTICULAR: dict[str, dict[str, Allowed]] = {
 
 VIA_POLICY: dict[str, Allowed] = {
     "width": _whole(4),  # what looks at obstacles is a quarter as wide
+    "form": Allowed("places or action", lambda value: value in ("places", "action")),
+    "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
+    "instants": _whole(2),
+    "refinements": _whole(0),
+    "per_refinement": _whole(1),
+    "checks": _whole(0),
     "rounds": _whole(0),
     "kept": _whole(1),
     "candidates": _whole(0),

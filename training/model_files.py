@@ -35,8 +35,10 @@ from viapoint.training.limits import (
 from viapoint.training.timed_buffers import timed, unit_of
 from viapoint.training.vec_env import ViaVecEnv
 from viapoint.training.via_td3 import ViaTD3
+from viapoint.training.viaq import ViaQ
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "viaq": ViaQ,
     "viatd3": ViaTD3,
     "sac": SAC,
     "td3": TD3,
@@ -161,6 +163,17 @@ def build(
     if discount_unit is not None:
         arguments |= _by_time(algorithm, env, arguments, discount_unit)
     return kind(policy, env, seed=seed, device="cpu", **arguments)
+
+
+def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
+    """Return a model like this one before its training, with weights of seed 0."""
+    record, env = describe(model), model.get_env()
+    assert isinstance(env, ViaVecEnv)
+    hyperparameters = dict(record["hyperparameters"])
+    hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
+    return build(
+        record["algorithm"], record["policy"], env, hyperparameters, discount_unit=record["discount_unit"], seed=0
+    )
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
 
-Algorithm = Literal["viatd3", "sac", "td3", "ppo", "tqc"]
+Algorithm = Literal["viaq", "viatd3", "sac", "td3", "ppo", "tqc"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +78,14 @@ _STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
 PRESETS: dict[str, Preset] = {
+    "viaq": _preset(
+        64,
+        40_000,
+        "ViaQPolicy",  # its defaults are its settings
+        eval_every=5_000,
+        checkpoint_every=20_000,
+        learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
+    ),
     "viatd3": _preset(
         64,
         6_400,
@@ -122,6 +130,7 @@ STEP_PRESETS: dict[str, Preset] = {
 """The same where an action lasts one control step, which then counts as a decision."""
 
 REACH_PRESETS: dict[str, Preset] = {
+    "viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000),
     "viatd3": dataclasses.replace(PRESETS["viatd3"], n_timesteps=1_280),
 }
 """Where nothing is in the way, less will do."""

@@ -217,4 +217,5 @@ def timed(
 def unit_of(model: BaseAlgorithm) -> float | None:
     """The unit [s] by which a model discounts; None where it discounts by decisions."""
     buffer = getattr(model, "replay_buffer", None) or getattr(model, "rollout_buffer", None)
-    return buffer.time_discount.unit if isinstance(buffer, TimedReplayBuffer | TimedRolloutBuffer) else None
+    discount = getattr(buffer, "time_discount", None)
+    return None if discount is None else float(discount.unit)

@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
+from viapoint.envs.reward import RewardTerms
 from viapoint.training.discount import ELAPSED
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
@@ -22,6 +23,8 @@ Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
 REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration", "reachable")
 """What of an episode's outcome goes into the info dictionaries."""
+TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
+"""Terms of a decision's reward, which go into the info dictionaries."""
 
 
 class ViaVecEnv(VecEnv):
@@ -114,11 +117,17 @@ class ViaVecEnv(VecEnv):
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def _began_infos(self, info: Mapping[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
-        """One info per copy, with the time that its decision took where that is told."""
-        told = [part[ELAPSED] for part in (info, info.get("final_info", {})) if ELAPSED in part]
-        if not told:
+        """Return one info per copy, with the time that its decision took and the terms of its reward, where known."""
+        final = info.get("final_info", {})
+        columns = {}
+        for name in (ELAPSED, *TERMS):
+            told = [part[name] for part in (info, final) if name in part]
+            if told:
+                columns[name] = np.where(done, told[-1], told[0]).tolist()
+        if not columns:
             return [{} for _ in range(self.num_envs)]
-        return [{ELAPSED: seconds} for seconds in np.where(done, told[-1], told[0]).tolist()]
+        names = tuple(columns)
+        return [dict(zip(names, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def _close_episodes(
         self,

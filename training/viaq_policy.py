@@ -1,0 +1,460 @@
+"""Policy of viaq: candidates, a critic that orders them, and exact checks of the most promising ones."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor, nn
+
+from viapoint.envs.action import frame
+from viapoint.envs.arms import ARMS
+from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.task import Task
+from viapoint.training.geometry_checks import best_plan, check_plans
+from viapoint.training.planned import Observation, direction, is_replanning, planned
+from viapoint.training.viaq_critic import (
+    PairMinimum,
+    Parts,
+    Poses,
+    ReachMinimum,
+    bodies_of,
+    cut_obstacles,
+    dense,
+)
+
+Form = Literal["places", "action"]
+Pooling = Literal["minimum", "sum"]
+Numbers = NDArray[np.floating[Any]]
+
+EFFORT = 3
+"""Numbers that tell the effort of a plan: log jerk, log duration, relative duration."""
+BEST = 8
+"""How many of the best candidates are refined in each round."""
+SPREAD = 0.15
+"""Standard deviation of the first round of refinement; each further round halves it."""
+ROWS = 16_384
+"""Plans whose values are computed together."""
+
+
+class Values(NamedTuple):
+    """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
+
+    margin: Tensor
+    """Predicted clearance, [m]."""
+    clear: Tensor
+    """Logit of the probability that nothing is touched."""
+    arrives: Tensor
+    """Logit of the probability of success where nothing is touched."""
+    clearance: Tensor
+    """Predicted clearance term of the reward."""
+    rest: Tensor
+    """Predicted sum of the terms for smoothness and duration."""
+
+
+class PlanInputs(NamedTuple):
+    """Inputs of the critic: H plans in each of B scenes."""
+
+    actions: Tensor
+    """Shape (B, H, m)."""
+    ends: Tensor
+    """Start, goal and, on the way, the present motion, shape (B, E)."""
+    effort: Tensor
+    """Shape (B, H, EFFORT)."""
+    hand: Tensor
+    """Planned places of the hand, shape (B, H, T, D), [m]."""
+    poses: Poses | None
+    """Planned poses of the arm's bodies; None where the critic takes the action itself."""
+    parts: Parts | None
+    """Parts of the obstacles for the planned poses."""
+    rows: Tensor
+    """Obstacles in the frame of start and goal, shape (B, n, F)."""
+    present: Tensor
+    """Shape (B, n), bool."""
+
+
+class _Saturated(torch.autograd.Function):
+    """Clamp whose gradient pulls values back into the range, but never pushes them farther out."""
+
+    @staticmethod
+    def forward(context: Any, values: Tensor, low: float, high: float) -> Tensor:
+        context.save_for_backward(values)
+        context.bounds = low, high
+        return values.clamp(low, high)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        (values,), (low, high) = context.saved_tensors, context.bounds
+        outwards = ((values > high) & (gradient < 0.0)) | ((values < low) & (gradient > 0.0))
+        return torch.where(outwards, 0.0, gradient), None, None
+
+
+class ViaQCritic(nn.Module):
+    """Value of plans: effort, and success as it follows from the least margin of all pairs.
+
+    With the margin m(s, a) and the reach r(s, a), both minima (see :mod:`viapoint.training.viaq_critic`),
+
+        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(r + c(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(m) + e(s, a)
+
+    Args:
+        task: Of the environment.
+        replanning: Whether episodes are several decisions.
+        form: Input of the pair networks: the arm's planned `places`, or the `action` itself.
+        pooling: `minimum` over obstacles, or `sum` of their features (Deep Sets).
+        heads: Networks for the action form, of which the minimum is taken.
+        width: Of the hidden layers of the pair networks.
+    """
+
+    def __init__(
+        self, task: Task, *, replanning: bool, form: Form, pooling: Pooling, heads: int, width: int
+    ) -> None:
+        super().__init__()
+        d, size = task.arm.dimension, task.action.size
+        ends = (4 * d + 3) if replanning else (2 * d + 1)
+        row = (3 * d + 1) if replanning else (2 * d + 1)
+        self.form, self.pooling, self.replanning = form, pooling, replanning
+        self.pairs: Any = None
+        if form == "places":
+            self.pairs = PairMinimum(d, bodies_of(task), width)
+            self.reach: Any = ReachMinimum(d, 48)
+        else:
+            outputs = heads if pooling == "minimum" else width
+            self.pairs = dense(ends + row + size, width, width, outputs)
+            self.pooled = dense(width + ends + size, width, 1) if pooling == "sum" else None
+            self.reach = dense(ends + size, 64, 64, 1)
+        self.rest = dense(ends + size + EFFORT, 64, 64, 3)
+        self.linear = nn.Linear(EFFORT, 1)
+        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
+        """Logarithm of k in 1/m, and b."""
+        weights = task.weights
+        self.scales = nn.Parameter(
+            torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
+        )
+        """w_s, w_c, w_g and w_m: the environment's, unless only the sum of the terms is known."""
+
+    def forward(self, inputs: PlanInputs) -> Values:
+        """Return the predictions for each plan."""
+        ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        plan = torch.cat((ends, inputs.actions), dim=-1)
+        if self.form == "places":
+            assert inputs.poses is not None and inputs.parts is not None
+            margin, reach = self.pairs(inputs.poses, inputs.parts), self.reach(inputs.hand)
+        else:
+            margin, reach = self._of_actions(plan, inputs), self.reach(plan)[..., 0]
+        rest = self.rest(torch.cat((plan, inputs.effort), dim=-1))
+        low, high = CLEARANCE_RANGE
+        clearance = _Saturated.apply(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        return Values(
+            margin,
+            margin * torch.exp(self.slope[0]) + self.slope[1],
+            reach + rest[..., 1],
+            clearance + rest[..., 2] if self.replanning else clearance,
+            rest[..., 0] + self.linear(inputs.effort)[..., 0],
+        )
+
+    def value(self, values: Values) -> Tensor:
+        """Return Q, shape (B, H)."""
+        clear = torch.sigmoid(values.clear)
+        success = clear * torch.sigmoid(values.arrives)
+        won, lost, missed, _ = self.scales
+        total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
+        return total + values.clearance + values.rest
+
+    def _of_actions(self, plan: Tensor, inputs: PlanInputs) -> Tensor:
+        """Return the margin from actions and obstacles, shape (B, H), [m]."""
+        plans, rows = plan.shape[1], inputs.rows.shape[1]
+        pairs = torch.cat(
+            (
+                plan[:, :, None].expand(-1, -1, rows, -1),
+                inputs.rows[:, None].expand(-1, plans, -1, -1),
+            ),
+            dim=-1,
+        )
+        values = self.pairs(pairs)
+        present = inputs.present[:, None, :, None]
+        if self.pooled is not None:
+            summed = (values.relu() * present).sum(dim=2)
+            return 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
+        far = torch.where(present, values, torch.full_like(values, 20.0))
+        margin: Tensor = 0.05 * far.amin(dim=(2, 3)) if rows else torch.ones_like(plan[..., 0])
+        return margin
+
+
+class ViaQPolicy(BasePolicy):
+    """Choose the best of many candidates by a critic and, if wanted, by exact checks of the most promising ones.
+
+    Args:
+        observation_space: Of the environment.
+        action_space: Of the environment.
+        lr_schedule: Learning rate against the progress that remains.
+        task: The environment's task as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
+        form: Input of the critic's pair networks: `places` or `action`.
+        pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
+        heads: Networks for the action form, of which the minimum is taken.
+        width: Of the hidden layers of the pair networks.
+        instants: Instants of a plan at which the arm's planned places are taken.
+        candidates: Actions that are spread evenly over the action space (Sobol points).
+        refinements: Rounds of candidates around the best ones.
+        per_refinement: Candidates of each round.
+        checks: How many of the most promising candidates are checked by exact geometry; 0 for none.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Any,
+        *,
+        task: Mapping[str, Any],
+        form: Form = "places",
+        pooling: Pooling = "minimum",
+        heads: int = 1,
+        width: int = 32,
+        instants: int = 16,
+        candidates: int = 256,
+        refinements: int = 2,
+        per_refinement: int = 64,
+        checks: int = 0,
+        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            **kwargs,
+        )
+        self.task = Task.from_dict(task, ARMS)
+        self.replanning = is_replanning(observation_space.spaces)
+        self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
+        self.checks = checks
+        self.instants = instants
+        self.shares = instants_of(instants)
+        self.settings: dict[str, Any] = {"form": form, "pooling": pooling, "heads": heads, "width": width}
+        self.critic = self.make_critic()
+        self.critic_target = self.make_critic() if self.replanning else None
+        if self.critic_target is not None:
+            self.critic_target.load_state_dict(self.critic.state_dict())
+            self.critic_target.requires_grad_(False)
+        self.optimizer = self.optimizer_class(
+            self.critic.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def make_critic(self) -> ViaQCritic:
+        """Return a new critic for the task."""
+        return ViaQCritic(self.task, replanning=self.replanning, **self.settings)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **super()._get_constructor_parameters(),
+            **self.settings,
+            "task": self.task.as_dict(),
+            "lr_schedule": lambda _: 0.0,
+            "instants": self.instants,
+            "candidates": self.candidates,
+            "refinements": self.refinements,
+            "per_refinement": self.per_refinement,
+            "checks": self.checks,
+        }
+
+    def inputs(self, observation: Observation, actions: Numbers) -> PlanInputs:
+        """Return what the critic sees of H actions in each of B scenes, shape (B, H, m)."""
+        places = self.settings["form"] == "places"
+        moves = planned(observation, actions, self.task, self.shares)
+        relative = moves.duration / self.task.action.centre_duration
+        effort = np.stack((moves.effort, np.log(relative), relative - 1.0), axis=-1)
+        ends, rows, present = seen_from_line(observation, self.task)
+        poses = parts = None
+        if places and "obstacles" in observation:
+            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * self.shares)
+            obstacles = self.task.observation.obstacles(observation["obstacles"])
+            whole = np.concatenate(
+                (obstacles.centre, obstacles.half_axis, obstacles.radius[..., None]), axis=-1
+            )
+            velocity = observation.get("obstacle_velocities")
+            moving = None if velocity is None else velocity.reshape(obstacles.centre.shape)
+            parts = cut_obstacles(whole, obstacles.present > 0.5, moving)
+        elif places:
+            poses, parts = _nothing(self.task, moves.path)
+        return PlanInputs(
+            _tensor(actions), _tensor(ends), _tensor(effort), _tensor(moves.path), poses, parts,
+            _tensor(rows), torch.from_numpy(present),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def values(self, observation: Observation, actions: Numbers) -> Numbers:
+        """Return the critic's Q of H actions in each of B scenes, shape (B, H)."""
+        several = max(ROWS // (actions.shape[1] * self.instants), 1)
+        pieces = []
+        for first in range(0, len(actions), several):
+            some = slice(first, first + several)
+            inputs = self.inputs({name: part[some] for name, part in observation.items()}, actions[some])
+            pieces.append(self.critic.value(self.critic(inputs)).numpy())
+        return np.concatenate(pieces)
+
+    def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
+        """Return candidates, shape (B, N, m), and the critic's Q of each, shape (B, N); the first is the zero action."""
+        number, size = len(observation["hand"]), self.task.action.size
+        actions = np.broadcast_to(spread_actions(self.candidates, size), (number, self.candidates, size))
+        values = self.values(observation, actions)
+        for each in range(self.refinements):
+            near = self._near(actions, values, each)
+            actions = np.concatenate((actions, near), axis=1)
+            values = np.concatenate((values, self.values(observation, near)), axis=1)
+        return actions, values
+
+    def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
+        """Return candidates around the best ones, shape (B, per_refinement, m)."""
+        best = min(BEST, actions.shape[1])
+        top = np.argpartition(-values, best - 1, axis=1)[:, :best]
+        chosen = np.take_along_axis(actions, top[..., None], axis=1)
+        steps = spread_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
+        around = chosen[:, np.arange(self.per_refinement) % best]
+        return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
+
+    def decide(self, observation: Observation) -> Numbers:
+        """Return the chosen actions, shape (B, m)."""
+        actions, values = self.propose(observation)
+        rows = np.arange(len(actions))
+        if not self.checks:
+            return actions[rows, values.argmax(axis=1)]
+        count = min(self.checks, actions.shape[1])
+        if self.replanning:  # keeping the plan is always among the checked
+            values[:, 0] = np.inf
+        top = np.argpartition(-values, count - 1, axis=1)[:, :count]
+        checked = np.take_along_axis(actions, top[..., None], axis=1)
+        return checked[rows, best_plan(check_plans(observation, checked, self.task))]
+
+    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
+        """Return the chosen actions, shape (B, m)."""
+        return self._predict(observation, deterministic)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        arrays = {name: part.cpu().numpy() for name, part in observation.items()}
+        return torch.from_numpy(np.ascontiguousarray(self.decide(arrays), dtype=np.float32))
+
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Return actions for one observation or a batch, as SB3's policies do.
+
+        Raises:
+            ValueError: The observation is not a dict with the parts of the observation space, is not finite, or the
+                hand is in the goal already, to which there is no movement.
+        """
+        if not isinstance(observation, tuple):
+            self._check_parts(observation)
+        return super().predict(observation, state, *args, **kwargs)
+
+    def _check_parts(self, observation: Any) -> None:
+        space: Any = self.observation_space
+        wanted = ", ".join(space.spaces)
+        if not isinstance(observation, dict):
+            raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
+        if observation.keys() != space.spaces.keys():
+            raise ValueError(
+                f"observation must have the parts {wanted}; got {', '.join(map(str, observation))}"
+            )
+        for name, part in observation.items():
+            if not np.isfinite(np.asarray(part)).all():
+                raise ValueError(f"observation must be finite; {name} is {np.asarray(part)}")
+        apart = np.asarray(observation["goal"]) != np.asarray(observation["hand"])
+        if not self.replanning and not apart.any(axis=-1).all():
+            raise ValueError("hand and goal must be apart: where they are the same there is no movement")
+
+
+def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
+    """Return the planned poses of the arm's bodies for paths of the hand, shape (B, H, T, D), [m]."""
+    if not task.whole_arm:
+        return Poses(_tensor(np.moveaxis(path, -1, 0)[None]), None, _tensor(time))
+    links = np.asarray(task.arm.links(task.arm.posture(path)))
+    first, last = (np.moveaxis(links[..., end, :], (-2, -1), (0, 1)) for end in (0, 1))
+    axis = last - first
+    axis = axis / np.sqrt((axis * axis).sum(axis=1, keepdims=True))
+    return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time))
+
+
+def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
+    """Return ends, obstacle rows and their presence in the frame of the line from hand to goal.
+
+    Returns:
+        Start, goal, distance and, on the way, the present motion, shape (B, E); rows of centre, half-axis, radius and,
+        on the way, velocity, shape (B, n, F); presence, shape (B, n). Numbers are of order one.
+    """
+    start, goal, line = observation["hand"], observation["goal"], direction(observation)
+    axes = np.stack(frame(line), axis=-1)
+    ends = [2.0 * start, 2.0 * goal, 2.0 * np.sqrt((line * line).sum(axis=-1, keepdims=True))]
+    if is_replanning(observation):
+        for name, scale in (("velocity", 1.0), ("acceleration", 0.1)):
+            ends.append((observation[name][:, None] @ axes)[:, 0] * scale)
+        ends += [observation["remaining"], observation["time_left"]]
+    together = np.concatenate(ends, axis=-1)
+    width = 2 * task.arm.dimension + 1 + (task.arm.dimension if is_replanning(observation) else 0)
+    if "obstacles" not in observation:
+        return together, np.zeros((len(start), 1, width)), np.zeros((len(start), 1), dtype=bool)
+    rows = task.observation.obstacles(observation["obstacles"])
+    centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
+    half = rows.half_axis @ axes
+    half = np.where(half[..., 1:2] < 0.0, -half, half)  # a capsule has no sense of direction
+    seen = [5.0 * centre, 5.0 * half, 5.0 * rows.radius[..., None]]
+    if is_replanning(observation):
+        seen.append(3.0 * observation["obstacle_velocities"].reshape(centre.shape) @ axes)
+    return together, np.concatenate(seen, axis=-1), np.asarray(rows.present > 0.5)
+
+
+def instants_of(number: int) -> NDArray[np.float32]:
+    """Return shares of a movement's duration, shape (number,), closer together where the hand is fast."""
+    share = np.linspace(0.0, 1.0, 2001)
+    gone = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    return np.interp((np.arange(number) + 0.5) / number, 0.7 * gone + 0.3 * share, share).astype(np.float32)
+
+
+@functools.cache
+def spread_actions(count: int, size: int) -> NDArray[np.float32]:
+    """Return the zero action and points spread evenly over the action space (Sobol), shape (count, size)."""
+    points = 2.0 * _sobol(max(count - 1, 1), size, seed=1) - 1.0
+    return np.concatenate((np.zeros((1, size), np.float32), points))[:count]
+
+
+@functools.cache
+def spread_steps(count: int, size: int, seed: int) -> NDArray[np.float32]:
+    """Return steps of a standard normal distribution, evenly spread, shape (count, size)."""
+    uniform = torch.from_numpy(_sobol(count, size, seed=seed + 2)).clamp(1e-4, 1.0 - 1e-4)
+    steps: NDArray[np.float32] = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
+    return steps
+
+
+def check_choices(form: Any, pooling: Any) -> None:
+    """Refuse forms and poolings that there are not, by name."""
+    for name, value, allowed in (("form", form, get_args(Form)), ("pooling", pooling, get_args(Pooling))):
+        if value not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
+    if form == "places" and pooling != "minimum":
+        raise ValueError("pooling must be minimum where the form is places")
+
+
+def _sobol(count: int, size: int, seed: int) -> NDArray[np.float32]:
+    engine: Any = torch.quasirandom.SobolEngine
+    points: NDArray[np.float32] = engine(size, scramble=True, seed=seed).draw(count).numpy()
+    return points
+
+
+def _nothing(task: Task, path: Numbers) -> tuple[Poses, Parts]:
+    """Return poses and obstacles of scenes without obstacles."""
+    scenes, d = len(path), task.arm.dimension
+    poses = Poses(_tensor(np.moveaxis(path, -1, 0)[None]), None, _tensor(np.zeros(path.shape[:3])))
+    return poses, cut_obstacles(np.zeros((scenes, 1, 2 * d + 1)), np.zeros((scenes, 1), dtype=bool))
+
+
+def _tensor(values: Any) -> Tensor:
+    """Return a tensor of single precision; constants that many calls share are copied."""
+    return torch.from_numpy(np.require(values, dtype=np.float32, requirements="CW"))
