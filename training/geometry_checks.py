@@ -27,6 +27,8 @@ REACH_MARGIN = 0.001
 """Least reach margin of a movement that the search prefers, [m]."""
 NODES = 16
 """Instants at which every movement is looked at."""
+SHARES = np.linspace(0.0, 1.0, NODES)
+"""Shares of the duration at these instants."""
 DEEP = -0.055
 """Clearance below which no instant is looked at closely, [m]: the reward ends at CLEARANCE_RANGE."""
 CLOSE = 0.1
@@ -37,6 +39,10 @@ STENCIL = 4
 """Instants from which places between them are interpolated."""
 OUTSIDE = -1e6
 """Merit below that of every plan within the margins."""
+PLANNED = 1 << 17
+"""Places of the hand that are computed together before some of them are looked at."""
+FIRST = 64
+"""Plans of each scene that are looked at first; then twice as many, and so on."""
 BLOCK = 1 << 14
 """Places of the hand that are looked at together, so that temporary arrays stay in the cache."""
 
@@ -79,11 +85,10 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
     """
     found = PlanChecks(*(np.empty(actions.shape[:2], np.float32) for _ in PlanChecks._fields))
     obstacles = _Obstacles.seen(observation, task)
-    shares = np.linspace(0.0, 1.0, NODES)
-    for rows in _blocks(obstacles.number, max(1, BLOCK // (actions.shape[1] * len(shares)))):
+    for rows in _blocks(obstacles.number, max(1, BLOCK // (actions.shape[1] * NODES))):
         some = part(observation, rows)
-        moves = planned(some, actions[rows], task, shares)
-        clearance = _least_clearance(moves, obstacles.take(rows), task, shares, until)
+        moves = planned(some, actions[rows], task, SHARES)
+        clearance = _least_clearance(moves, obstacles.take(rows), task, until, (DEEP, CLOSE))
         reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
         for mine, theirs in zip(
             found, (clearance, reach, _reward(some, moves, clearance, reach, task)), strict=True
@@ -116,6 +121,66 @@ def merit(checks: PlanChecks, clearance_margin: float, reach_margin: float) -> N
     within = (checks.clearance > clearance_margin) & (checks.reach_margin > reach_margin)
     least = np.minimum(checks.clearance, checks.reach_margin, dtype=np.float64)
     return np.where(within, checks.reward, least + OUTSIDE)
+
+
+def worth_of_best(
+    observation: Observation,
+    actions: Numbers,
+    task: Task,
+    margins: tuple[float, float],
+    until: float = np.inf,
+    bonus: float = 0.0,
+) -> NDArray[np.float64]:
+    """Return what :func:`merit` of :func:`check_plans` returns for the best plan of each scene, faster.
+
+    Jerk, duration and reach bound the reward of a plan. So clearance is looked at in the order of this bound, until no
+    other plan can be better (branch and bound).
+
+    Args:
+        observation: Parts of B observations, shape (B, .) each.
+        actions: Shape (B, H, m), in [-1, 1].
+        task: The environment's.
+        margins: Of clearance and reach, [m].
+        until: Time after which clearance does not matter, [s].
+        bonus: Reward that the first action gets besides.
+
+    Returns:
+        Shape (B, H). Minus infinity where another plan is better or no worse; all of it where no plan is within the
+        margins.
+    """
+    worth = np.full(actions.shape[:2], -np.inf)
+    obstacles = _Obstacles.seen(observation, task)
+    for rows in _blocks(obstacles.number, max(1, PLANNED // (actions.shape[1] * NODES))):
+        some = part(observation, rows)
+        moves = planned(some, actions[rows], task, SHARES)
+        reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
+        bound = _reward(some, moves, np.full_like(reach, FAR), reach, task)
+        bound = np.where(reach > margins[1], bound, -np.inf)
+        bound[:, 0] += bonus
+        worth[rows] = _branch_and_bound(moves, bound, obstacles.take(rows), task, margins[0], until)
+    return worth
+
+
+def _branch_and_bound(
+    moves: PlannedMovements, bound: Numbers, obstacles: _Obstacles, task: Task, margin: float, until: float
+) -> Numbers:
+    worth = np.full(bound.shape, -np.inf)
+    order = np.argsort(-bound, axis=-1, kind="stable")
+    open_scenes, first, count = np.arange(len(bound)), 0, FIRST
+    while open_scenes.size and first < bound.shape[1]:
+        these = open_scenes[:, None], order[open_scenes, first : first + count]
+        some = PlannedMovements(*(field[these] for field in moves))
+        clearance = _least_clearance(
+            some, obstacles.take(open_scenes), task, until, (margin, CLEARANCE_RANGE[1])
+        )
+        lost = np.clip(clearance, *CLEARANCE_RANGE) - CLEARANCE_RANGE[1]
+        reward = bound[these] + task.weights.clearance * lost / CLEARANCE_UNIT
+        worth[these] = np.where(clearance > margin, reward, -np.inf)
+        first, count = first + count, 2 * count
+        if first < bound.shape[1]:
+            following = bound[open_scenes, order[open_scenes, first]]
+            open_scenes = open_scenes[(worth[open_scenes].max(axis=-1) < following) & (following > -np.inf)]
+    return worth
 
 
 class _Obstacles(NamedTuple):
@@ -208,65 +273,82 @@ def _links(arm: Arm, places: Numbers) -> list[tuple[Numbers, Numbers]]:
 
 
 def _least_clearance(
-    moves: PlannedMovements, obstacles: _Obstacles, task: Task, shares: NDArray[np.float64], until: float
+    moves: PlannedMovements, obstacles: _Obstacles, task: Task, until: float, exact: tuple[float, float]
 ) -> Single:
-    """Return the least clearance of movements, shape (B, H), [m]."""
+    """Return the least clearance of movements, shape (B, H), [m].
+
+    Args:
+        moves: H in each of B scenes.
+        obstacles: Of the scenes.
+        task: The environment's.
+        until: Time after which clearance does not matter, [s].
+        exact: Clearance between which the result is looked at closely, [m].
+    """
     places = np.asarray(moves.path, np.float32).swapaxes(1, 2)
     number, times, tried, _ = places.shape
     least = np.full((number, tried), FAR, np.float32)
     if not obstacles.rows.shape[1]:
         return least
-    drift, elapsed = None, moves.duration[:, None].astype(np.float32) * shares[:, None].astype(np.float32)
+    drift, elapsed = None, moves.duration[:, None].astype(np.float32) * SHARES[:, None].astype(np.float32)
     if obstacles.velocity is not None:
         drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
-    bodies = _bodies(places, task)
     profiles = []
-    for body in bodies:
+    for body in _bodies(places, task):
         flat = body.map(lambda ends: ends.reshape(number, times * tried, -1))
-        squared = flat.distance_squared(obstacles.rows, drift)
-        profiles.append(squared.reshape(number, -1, times, tried))
+        squared = flat.distance_squared(obstacles.rows, drift).reshape(number, -1, times, tried)
         if until < np.inf:
-            np.copyto(profiles[-1], np.float32(np.inf), where=(elapsed > until)[:, None])
-        radius = obstacles.rows[..., -1] + np.float32(body.radius)
-        coarse = np.sqrt(profiles[-1].min(axis=2)) - radius[..., None]
-        np.minimum(least, coarse.min(axis=1), out=least)
-    limit = np.where((least > DEEP) & (least < CLOSE), least, np.float32(-2.0 * FAR))
-    for body, squared in zip(bodies, profiles, strict=True):
-        near = _near(body, squared, obstacles, limit)
+            np.copyto(squared, np.float32(np.inf), where=(elapsed > until)[:, None])
+        profile = _Profile(body, (obstacles.rows[..., -1] + np.float32(body.radius))[..., None], squared)
+        profiles.append(profile)
+        np.minimum(least, (np.sqrt(profile.lowest) - profile.radii).min(axis=1), out=least)
+    limit = np.where(least > exact[0], np.minimum(least, np.float32(exact[1])), np.float32(-2.0 * FAR))
+    for profile in profiles:
+        near = profile.near(limit)
         if len(near[0]):
-            np.minimum.at(
-                least, (near[0], near[3]), _close_look(body, near, obstacles, moves.duration, shares)
-            )
+            closely = _close_look(profile.body, near, obstacles, moves.duration)
+            np.minimum.at(least, (near[0], near[3]), closely)
     return least
 
 
-def _near(body: _Bodies, squared: Numbers, obstacles: _Obstacles, limit: Numbers) -> tuple[Index, ...]:
-    """Return the scenes, obstacles, instants and movements at which a body may come nearest, shape (M,) each.
+class _Profile:
+    """Squared distances of one body from n obstacles at T instants of H movements in each of B scenes."""
 
-    These are local minima in time, from which a straight movement of half an interval may lead below the limit.
+    def __init__(self, body: _Bodies, radii: Numbers, squared: Numbers) -> None:
+        self.body = body
+        self.radii = radii
+        """Sums of the radii of body and obstacles, shape (B, n, 1), [m]."""
+        self.squared = squared
+        """Distances of axes, shape (B, n, T, H), [m^2]."""
+        self.lowest = squared.min(axis=2)
+        """Least of the instants, shape (B, n, H), [m^2]."""
 
-    Args:
-        body: Of the arm.
-        squared: Distance of its axis from those of obstacles, shape (B, n, T, H), [m^2].
-        obstacles: Of the scenes.
-        limit: Clearance of interest, shape (B, H), [m].
-    """
-    reach = limit[:, None] + (obstacles.rows[..., -1] + np.float32(body.radius))[..., None]
-    bound = np.where(reach > 0.0, reach * reach, np.float32(-1.0))[:, :, None] + _half_steps(body)[:, None]
-    near = squared <= bound
-    near[:, :, 1:] &= squared[:, :, 1:] <= squared[:, :, :-1]
-    near[:, :, :-1] &= squared[:, :, :-1] <= squared[:, :, 1:]
-    return np.nonzero(near)
+    def near(self, limit: Numbers) -> tuple[Index, Index, Index, Index]:
+        """Return the scenes, obstacles, instants and movements of nearest approaches, shape (M,) each.
 
+        These are local minima in time, from which a straight movement of half an interval may lead below the limit.
 
-def _half_steps(body: _Bodies) -> Numbers:
-    """Return the square of half of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
-    steps = [np.diff(ends, axis=1) for ends in (body.first, body.second) if ends is not None]
-    square: Numbers = 0.25 * functools.reduce(np.maximum, [squared_length(step) for step in steps])
-    longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
-    longer[:, :-1], longer[:, -1] = square, square[:, -1]
-    np.maximum(longer[:, 1:-1], square[:, :-1], out=longer[:, 1:-1])
-    return longer
+        Args:
+            limit: Clearance of interest, shape (B, H), [m].
+        """
+        reach = np.maximum(limit[:, None] + self.radii, 0.0)
+        bound, steps = np.where(reach > 0.0, reach * reach, -np.inf), self._half_steps()
+        scene, obstacle, movement = np.nonzero(self.lowest <= bound + steps.max(axis=1)[:, None])
+        some = self.squared[scene, obstacle, :, movement]
+        near = some <= bound[scene, obstacle, movement, None] + steps[scene, :, movement]
+        near[:, 1:] &= some[:, 1:] <= some[:, :-1]
+        near[:, :-1] &= some[:, :-1] <= some[:, 1:]
+        each, instant = np.nonzero(near)
+        return scene[each], obstacle[each], instant, movement[each]
+
+    def _half_steps(self) -> Numbers:
+        """Return the square of half of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
+        ends = [each for each in (self.body.first, self.body.second) if each is not None]
+        squares = [squared_length(each[:, 1:] - each[:, :-1]) for each in ends]
+        square: Numbers = np.float32(0.25) * functools.reduce(np.maximum, squares)
+        longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
+        longer[:, :-1], longer[:, -1] = square, square[:, -1]
+        np.maximum(longer[:, 1:-1], square[:, :-1], out=longer[:, 1:-1])
+        return longer
 
 
 def _close_look(
@@ -274,7 +356,6 @@ def _close_look(
     near: tuple[Index, ...],
     obstacles: _Obstacles,
     duration: Numbers,
-    shares: NDArray[np.float64],
 ) -> Single:
     """Return the least clearance between the instants around some, shape (M,), [m].
 
@@ -283,10 +364,9 @@ def _close_look(
         near: Scenes, obstacles, instants and movements, shape (M,) each.
         obstacles: Of the scenes.
         duration: Of the movements, shape (B, H), [s].
-        shares: Of the instants.
     """
     scene, which, instant, movement = near
-    first, weights, times = _interpolation(len(shares))
+    first, weights, times = _interpolation(NODES)
     nodes = first[instant, None] + np.arange(STENCIL)
     ends = body.map(lambda part: weights[instant] @ part[scene[:, None], nodes, movement[:, None]])
     row = obstacles.rows[scene, which, None]

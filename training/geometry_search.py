@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from viapoint.envs.action import Plan
 from viapoint.envs.scenes import Scenes, problems
 from viapoint.envs.task import Task
-from viapoint.training.geometry_checks import CLEARANCE_MARGIN, OUTSIDE, REACH_MARGIN, check_plans, merit
+from viapoint.training.geometry_checks import (
+    CLEARANCE_MARGIN,
+    REACH_MARGIN,
+    check_plans,
+    merit,
+    worth_of_best,
+)
 from viapoint.training.planned import Numbers, Observation, is_replanning, part
 
 Float = NDArray[np.float64]
@@ -99,12 +105,6 @@ class GeometrySearch:
         actions = self._candidates(observation)
         tried = np.broadcast_to(actions, (number, *actions.shape))
         worth = self._worth(observation, tried)
-        if is_replanning(observation):
-            worth[:, 0] += KEEP
-            for horizon in HORIZONS:
-                blocked = np.flatnonzero((worth < 0.5 * OUTSIDE).all(axis=-1))
-                if blocked.size:
-                    worth[blocked] = self._worth(part(observation, blocked), tried[blocked], horizon)
         best, value = _top(tried, worth, CENTRES if self.refinements else 1)
         for each in range(self.refinements):
             near = self._around(best, SPREAD * 0.5**each)
@@ -171,8 +171,20 @@ class GeometrySearch:
         relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
         return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
 
-    def _worth(self, observation: Observation, actions: Numbers, until: float = np.inf) -> Float:
-        return merit(check_plans(observation, actions, self.task, until), *self._margins)
+    def _worth(self, observation: Observation, actions: Numbers) -> Float:
+        """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse."""
+        replanning = is_replanning(observation)
+        worth = np.full(actions.shape[:2], -np.inf)
+        blocked = np.arange(len(actions))
+        for horizon in (np.inf, *HORIZONS) if replanning else (np.inf,):
+            some, bonus = part(observation, blocked), KEEP if replanning else 0.0
+            worth[blocked] = worth_of_best(some, actions[blocked], self.task, self._margins, horizon, bonus)
+            blocked = np.flatnonzero(np.isneginf(worth).all(axis=-1))
+            if not blocked.size:
+                return worth
+        checks = check_plans(part(observation, blocked), actions[blocked], self.task)
+        worth[blocked] = merit(checks, *self._margins)
+        return worth
 
     def _around(self, best: Single, spread: float) -> Single:
         """Return `per_round` actions around the best ones, shape (B, per_round, m)."""
