@@ -140,8 +140,12 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     return AgentMethod(name, model, checks)
 
 
-def _search(n_checks: int) -> Callable[[Trial], Method]:
-    return lambda trial: GeometrySearch(trial.task, n_checks)
+def _search(total: int) -> Callable[[Trial], Method]:
+    """Return what makes a search that spends half of its checks on refinement, which solves more scenes (measured)."""
+    rounds = 2 if total < 256 else 4
+    return lambda trial: GeometrySearch(
+        trial.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
+    )
 
 
 SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
@@ -177,7 +181,9 @@ def check_method(name: str, env_id: str) -> None:
     """
     known = _known(env_id)
     if name not in known and name not in ("agent", "untrained"):
-        raise ValueError(f"method must be agent, untrained or one of {', '.join(known)} in {env_id}, got {name!r}")
+        raise ValueError(
+            f"method must be agent, untrained or one of {', '.join(known)} in {env_id}, got {name!r}"
+        )
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:

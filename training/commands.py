@@ -23,9 +23,9 @@ from viapoint.training.evaluate import evaluate as measure
 from viapoint.training.failures import sort_out, write
 from viapoint.training.files import write_json
 from viapoint.training.frozen_scenes import SETS, FrozenScenes
+from viapoint.training.model_files import untrained
 from viapoint.training.online_methods import Unrevised
 from viapoint.training.online_trial import OnlineTrial
-from viapoint.training.model_files import untrained
 from viapoint.training.runs import Run, find_model, load_model
 from viapoint.training.step_agent import is_step_wise, whole_task
 

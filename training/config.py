@@ -154,9 +154,7 @@ class EvaluateConfig:
         check_methods(self.methods)
         if self.env is not None:
             check_env(self.env)
-        check_one_source(
-            self.run, self.pretrained, needed=bool({"agent", "untrained"} & set(self.methods))
-        )
+        check_one_source(self.run, self.pretrained, needed=bool({"agent", "untrained"} & set(self.methods)))
         if self.run is None and self.pretrained is None and self.env is None:
             raise ValueError("without an agent, --env must say which environment is meant")
         for number in self.checks:

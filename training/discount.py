@@ -63,8 +63,8 @@ def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
         ValueError: The unit is no positive number, or the algorithm's episodes are one decision there.
     """
     _check_unit("discount_unit", unit)
-    if algorithm == "viatd3" and env_id not in ONLINE_TASKS:
-        raise ValueError(f"discount_unit must be None for viatd3: episodes of {env_id} are one decision")
+    if algorithm == "viaq" and env_id not in ONLINE_TASKS:
+        raise ValueError(f"discount_unit must be None for viaq: episodes of {env_id} are one decision")
 
 
 def _check_unit(name: str, unit: float) -> None:

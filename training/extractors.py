@@ -11,7 +11,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
 from viapoint.envs.action import frame
-from viapoint.training.movements import direction
+from viapoint.envs.scenes import SHORTEST
+from viapoint.training.planned import is_replanning
 
 PLACES = 5.0
 """Metres times this are of size one: obstacles lie within a few decimetres of the line."""
@@ -47,8 +48,9 @@ class SceneExtractor(BaseFeaturesExtractor):
         """Shape (B, features_dim)."""
         hand, goal = observation["hand"], observation["goal"]
         start = observation.get("start", hand)
-        line = goal - start if "start" in observation else direction(observation)
-        axes = torch.stack(frame(_somewhere(line)), dim=-2)
+        axes = torch.stack(
+            frame(_direction(goal - start, SHORTEST if is_replanning(observation) else 0.0)), dim=-2
+        )
         middle = 0.5 * (start + goal)
         distance = (goal - start).norm(dim=-1, keepdim=True)
         own = [2.0 * middle, 2.0 * (goal - middle), 2.0 * distance]
@@ -80,10 +82,11 @@ EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExt
 """By the name that a model's file knows them by."""
 
 
-def _somewhere(line: Tensor) -> Tensor:
-    """The same lines but for those of no length, as after a movement that ended in the goal itself: any will do."""
+def _direction(line: Tensor, shortest: float) -> Tensor:
+    """Replace lines that are shorter, or of no length, by the first axis; see `viapoint.training.planned.direction`."""
+    square = (line * line).sum(dim=-1, keepdim=True)
     ahead = torch.eye(line.shape[-1], dtype=line.dtype, device=line.device)[0]
-    return torch.where((line * line).sum(dim=-1, keepdim=True) > 0.0, line, ahead)
+    return torch.where((square > 0.0) & (square >= shortest**2), line, ahead)
 
 
 def _turned(axes: Tensor, vectors: Tensor) -> Tensor:

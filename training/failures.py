@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes import Scenes
@@ -23,6 +22,8 @@ GRAZE = 0.005
 """A plan that enters an obstacle by no more than this grazes it, [m]."""
 PICTURES = 8
 """Of each kind, at most."""
+PROPOSALS = 16
+"""Most promising candidates of an agent that count as its proposals."""
 
 
 class Kind(NamedTuple):
@@ -99,7 +100,7 @@ def sort_out(
     Args:
         result: Of the agent.
         frozen: The scenes it met, in order.
-        agent: The model; one that proposes several movements is asked for all of them.
+        agent: The model; of one that ranks candidates the PROPOSALS best ones are tried, too.
         env_id: Of its environment.
         **env_kwargs: Of its environment.
     """
@@ -121,20 +122,24 @@ def _another_succeeds(
     agent: Any, scenes: Scenes, env_id: str, env_kwargs: Mapping[str, Any]
 ) -> NDArray[np.bool_] | None:
     """Whether any of the agent's proposals succeeds in each of n scenes; None where it has none."""
-    actor: Any = getattr(agent.policy, "actor", None)
     number = len(scenes.start)
-    if not hasattr(actor, "propose"):
+    if not hasattr(agent.policy, "propose"):
         return None
     if not number:
         return np.zeros(0, dtype=bool)
     trial = Trial(env_id, **env_kwargs)
-    observation, _ = agent.policy.obs_to_tensor(trial.observe(scenes))
-    with torch.no_grad():
-        proposals = actor.propose(observation)[0].numpy().astype(np.float64)
-    every = scenes.take(np.repeat(np.arange(number), proposals.shape[1]))
-    success = trial(every, proposals.reshape(-1, proposals.shape[-1])).success
+    actions = proposals(agent.policy, trial.observe(scenes))
+    every = scenes.take(np.repeat(np.arange(number), actions.shape[1]))
+    success = trial(every, actions.reshape(-1, actions.shape[-1])).success
     trial.close()
     return np.asarray(success.reshape(number, -1).any(axis=-1))
+
+
+def proposals(policy: Any, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return the candidates of greatest value in each of B scenes, shape (B, PROPOSALS, m), best first."""
+    actions, values = policy.propose(observation)
+    best = np.argsort(-values, axis=1, kind="stable")[:, :PROPOSALS]
+    return np.take_along_axis(actions, best[..., None], axis=1).astype(np.float64)
 
 
 def write(failures: Failures, folder: Path, env_id: str, **env_kwargs: Any) -> list[Path]:

@@ -78,7 +78,6 @@ AUTOMATIC = Allowed('"auto" or "auto_START"', _is_automatic)
 AUTO = Allowed('"auto"', lambda value: value == "auto")
 STEPS = Allowed('a whole number, 1 or more, or [N,"step"]', _is_steps)
 SETTINGS = Allowed('settings by name, {"net_arch":[256,256]}', lambda value: isinstance(value, Mapping))
-OBJECTIVE = Allowed("reward or log_success", lambda value: value in ("reward", "log_success"))
 SHARE = _between(0, 1)
 
 HYPERPARAMETERS: dict[str, Allowed] = {
@@ -117,44 +116,32 @@ HYPERPARAMETERS: dict[str, Allowed] = {
     "max_grad_norm": POSITIVE,
     "target_kl": _or(POSITIVE, NONE),
     # ViaQ
+    "explore_uniformly": SHARE,
+    "temperature": POSITIVE,
     "explore_candidates": _whole(2),
     "next_candidates": _whole(1),
-    # ViaTD3
-    "explore_uniformly": SHARE,
-    "noise": NOT_NEGATIVE,
-    "temperature": POSITIVE,
-    "promising": _whole(1),
-    "others": _whole(0),
-    "further": _whole(0),
-    "fresh_scenes": _whole(1),
-    "augment": FLAG,
-    "objective": OBJECTIVE,
-    "smoothness": FLAG,
 }
-"""By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaTD3."""
+"""By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaQ."""
 
 PARTICULAR: dict[str, dict[str, Allowed]] = {
     "ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)},
-    "viatd3": {"action_noise": Allowed("null, as its own is called noise", NONE.fits)},
+    "viaq": {"action_noise": Allowed("null, as it explores by itself", NONE.fits)},
 }
 """What is narrower for one algorithm."""
 
 VIA_POLICY: dict[str, Allowed] = {
-    "width": _whole(4),  # what looks at obstacles is a quarter as wide
     "form": Allowed("places or action", lambda value: value in ("places", "action")),
     "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
+    "heads": _whole(1),
+    "width": _whole(1),
     "instants": _whole(2),
+    "candidates": _whole(1),
     "refinements": _whole(0),
     "per_refinement": _whole(1),
     "checks": _whole(0),
-    "rounds": _whole(0),
-    "kept": _whole(1),
-    "candidates": _whole(0),
-    "heads": _or(_whole(1), NONE),
-    "trajectory_features": FLAG,
     "optimizer_kwargs": _or(SETTINGS, NONE),
 }
-"""What `policy_kwargs` of ViaTD3 may hold, by name; the environment tells the task."""
+"""Allowed `policy_kwargs` of ViaQ, by name; the task is taken from the environment."""
 
 
 def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
@@ -167,23 +154,27 @@ def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
         raise ValueError(f"hyperparameters must be values by name, got {values!r}")
     table = {**HYPERPARAMETERS, **PARTICULAR.get(algo, {})}
     _check(f"of {algo}", table, values)
-    if algo == "viatd3":
+    if algo == "viaq":
         policy = values.get("policy_kwargs") or {}
         unknown = sorted(set(policy) - set(VIA_POLICY))
         if unknown:
             raise ValueError(
-                f"policy_kwargs of viatd3 have no {unknown[0]!r}; they have {', '.join(VIA_POLICY)}"
+                f"policy_kwargs of viaq have no {unknown[0]!r}; they have {', '.join(VIA_POLICY)}"
             )
         check_via_policy(policy)
 
 
 def check_via_policy(values: Mapping[str, Any]) -> None:
-    """Refuse `policy_kwargs` of ViaTD3 that make no sense; names that are not in the table are passed over.
+    """Refuse `policy_kwargs` of ViaQ that make no sense; names that are not in the table are passed over.
 
     Raises:
         ValueError: A value is not allowed.
     """
-    _check("in policy_kwargs of viatd3", VIA_POLICY, values)
+    _check("in policy_kwargs of viaq", VIA_POLICY, values)
+    if values.get("form", "places") == "places" and values.get("pooling", "minimum") != "minimum":
+        raise ValueError(
+            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is places"
+        )
 
 
 def _check(where: str, table: Mapping[str, Allowed], values: Mapping[str, Any]) -> None:

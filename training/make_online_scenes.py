@@ -21,11 +21,10 @@ from tqdm import tqdm
 from viapoint.envs.courses import ChangingScenes, clearance_over_time
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training.frozen_scenes import FrozenScenes
-from viapoint.training.movements import movements
-from viapoint.training.online_methods import OnlinePlanner
+from viapoint.training.online_methods import INSTANTS, OnlinePlanner
 from viapoint.training.online_trial import OnlineTrial
+from viapoint.training.planned import planned
 from viapoint.training.remade_scenes import add_arguments, settle
-from viapoint.training.sight import INSTANTS
 
 SIZES = {"validation": 200, "test": 500}
 SEEDS = {"validation": 1_000_000, "test": 2_000_000}
@@ -71,7 +70,7 @@ def shares(trial: OnlineTrial, scenes: ChangingScenes) -> NDArray[np.float64]:
     for row in range(number if scenes.present.any() else 0):
         scene, generator = scenes.take([row]), np.random.default_rng(row)
         actions = generator.uniform(-1.0, 1.0, (1, PLANS, task.action.size)).astype(np.float32)
-        moves = movements(trial.observe(scene), actions, task)
+        moves = planned(trial.observe(scene), actions, task, INSTANTS)
         every = scene.take(np.zeros(PLANS, dtype=np.int64))
         rows = every.places(moves.duration[0, :, None] * INSTANTS)
         least: Any = clearance_over_time(

@@ -34,12 +34,10 @@ from viapoint.training.limits import (
 )
 from viapoint.training.timed_buffers import timed, unit_of
 from viapoint.training.vec_env import ViaVecEnv
-from viapoint.training.via_td3 import ViaTD3
 from viapoint.training.viaq import ViaQ
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "viaq": ViaQ,
-    "viatd3": ViaTD3,
     "sac": SAC,
     "td3": TD3,
     "ppo": PPO,
@@ -172,7 +170,12 @@ def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
     hyperparameters = dict(record["hyperparameters"])
     hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
     return build(
-        record["algorithm"], record["policy"], env, hyperparameters, discount_unit=record["discount_unit"], seed=0
+        record["algorithm"],
+        record["policy"],
+        env,
+        hyperparameters,
+        discount_unit=record["discount_unit"],
+        seed=0,
     )
 
 

@@ -8,23 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.courses import clearance_over_time
-from viapoint.training.anchors import AnchorsOnTheWay
-from viapoint.training.movements import movements
 from viapoint.training.online_trial import OnlineTrial
-from viapoint.training.sight import INSTANTS
+from viapoint.training.planned import planned
 from viapoint.training.trial import Trials
+from viapoint.training.viaq_policy import spread_actions
 
 Float = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
 
 ENOUGH = 0.004
 """Clearance from which on more of it is worth nothing to the planner, [m]."""
-FIRST, LATER, ROUNDS = 96, 24, 4
-"""Actions that the planner tries at random, and around the best so far, how often."""
+FIRST, LATER, ROUNDS = 128, 24, 4
+"""Actions that the planner tries first, actions that it tries around the best so far, and how often it does so."""
 SPREAD = 0.4
 """Of the first of those rounds."""
 GROUP = 25
 """Scenes that it looks at together."""
+INSTANTS = np.arange(1, 49, dtype=np.float32) / 48
+"""Shares of a plan's duration at which its clearance is computed."""
 
 
 class Unrevised:
@@ -63,7 +64,6 @@ class OnlinePlanner:
 
     def __init__(self, trial: OnlineTrial, seed: int = 0) -> None:
         self._task, self._limit = trial.task, trial.time_limit
-        self._anchors = AnchorsOnTheWay(trial.task)
         self._generator = np.random.default_rng(seed)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
@@ -76,9 +76,7 @@ class OnlinePlanner:
 
     def _search(self, observation: Observation, scenes: Any) -> Float:
         number, size = len(scenes.start), self._task.action.size
-        anchors = self._anchors.actions(observation)
-        random = self._generator.uniform(-1.0, 1.0, (number, FIRST, size))
-        actions = np.concatenate((anchors, random), axis=1).astype(np.float32)
+        actions = np.broadcast_to(spread_actions(FIRST, size), (number, FIRST, size))
         merit = self._merit(observation, actions, scenes)
         best, rows = merit.argmax(axis=1), np.arange(number)
         chosen, worth = actions[rows, best], merit[rows, best]
@@ -94,7 +92,7 @@ class OnlinePlanner:
 
     def _merit(self, observation: Observation, actions: NDArray[np.float32], scenes: Any) -> Float:
         """Clearance as far as it is wanting, then effort and time, shape (N, H)."""
-        task, moves = self._task, movements(observation, actions, self._task)
+        task, moves = self._task, planned(observation, actions, self._task, INSTANTS)
         number, tried = actions.shape[:2]
         reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
         effort = task.weights.smoothness * moves.effort

@@ -125,7 +125,7 @@ def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = F
     observation, _ = env.reset(options=scene.as_options())
     task: Any = env.unwrapped.task  # type: ignore[attr-defined]
     batch = {name: part[None] for name, part in observation.items()}
-    action = np.zeros(task.action.size) if straight else agent.method(80).decide(batch, scene)[0]
+    action = np.zeros(task.action.size) if straight else agent.method(16).decide(batch, scene)[0]
     info = env.step(action.astype(np.float32))[-1]
     if info["is_success"] is straight:
         raise RuntimeError(f"scene {row} shows nothing: is_success is {info['is_success']}")

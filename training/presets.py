@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
 
-Algorithm = Literal["viaq", "viatd3", "sac", "td3", "ppo", "tqc"]
+Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +86,6 @@ PRESETS: dict[str, Preset] = {
         checkpoint_every=20_000,
         learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
     ),
-    "viatd3": _preset(
-        64,
-        6_400,
-        "ViaPolicy",  # its defaults are its settings
-        learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
-    ),
     "sac": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
     "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
     "tqc": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
@@ -131,29 +125,11 @@ STEP_PRESETS: dict[str, Preset] = {
 
 REACH_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000),
-    "viatd3": dataclasses.replace(PRESETS["viatd3"], n_timesteps=1_280),
 }
 """Where nothing is in the way, less will do."""
 
-SPACE_PRESETS: dict[str, Preset] = {
-    "viatd3": dataclasses.replace(
-        PRESETS["viatd3"],
-        eval_every=800,
-        checkpoint_every=1_600,
-        hyperparameters=(*PRESETS["viatd3"].hyperparameters, ("fresh_scenes", 32)),
-    ),
-}
-"""Where every link of an arm in space must clear: looking takes longer, so fewer scenes are looked at."""
-
 ONLINE_PRESETS: dict[str, Preset] = {
     name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
-} | {
-    "viatd3": dataclasses.replace(
-        PRESETS["viatd3"],
-        discount_unit=0.1,
-        eval_every=800,
-        hyperparameters=(*PRESETS["viatd3"].hyperparameters, ("gamma", 0.99)),
-    )
 }
 """Where plans are revised on the way: episodes are several decisions, and discounts follow time."""
 
@@ -165,6 +141,5 @@ def preset_of(env_id: str, algo: Algorithm) -> Preset:
     if env_id in ONLINE_TASKS:
         return ONLINE_PRESETS[algo]
     task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
-    in_space = SPACE_PRESETS if "arm" in task else PRESETS
-    presets = REACH_PRESETS if task.get("n_obstacles") == 0 else in_space
+    presets = REACH_PRESETS if task.get("n_obstacles") == 0 else PRESETS
     return presets.get(algo, PRESETS[algo])

@@ -219,7 +219,7 @@ class ViaQ(OffPolicyAlgorithm):
         if critic is None or not self.gamma:
             return None
         every = spread_actions(policy.candidates, policy.task.action.size)
-        chosen = np.random.randint(1, len(every), size=(len(batch.ended), self.next_candidates))  # noqa: NPY002
+        chosen = np.random.randint(min(1, len(every) - 1), len(every), size=(len(batch.ended), self.next_candidates))  # noqa: NPY002
         chosen[:, 0] = 0
         values = critic(policy.inputs(batch.next_observations, every[chosen]))
         best = critic.value(values).argmax(dim=1, keepdim=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -431,15 +431,6 @@ def spread_steps(count: int, size: int, seed: int) -> NDArray[np.float32]:
     uniform = torch.from_numpy(_sobol(count, size, seed=seed + 2)).clamp(1e-4, 1.0 - 1e-4)
     steps: NDArray[np.float32] = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
     return steps
-
-
-def check_choices(form: Any, pooling: Any) -> None:
-    """Refuse forms and poolings that there are not, by name."""
-    for name, value, allowed in (("form", form, get_args(Form)), ("pooling", pooling, get_args(Pooling))):
-        if value not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
-    if form == "places" and pooling != "minimum":
-        raise ValueError("pooling must be minimum where the form is places")
 
 
 def _sobol(count: int, size: int, seed: int) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ import pytest
 from viapoint.training import failures as module
 from viapoint.training.config import TrainConfig
 from viapoint.training.evaluate import evaluate
-from viapoint.training.failures import KINDS, kinds, markdown, sort_out, write
+from viapoint.training.failures import KINDS, kinds, markdown, proposals, sort_out, write
 from viapoint.training.train import new_model, resolved
 from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
@@ -49,22 +49,18 @@ class Chosen:
     def __init__(self, model, trial):
         self.model, self.trial = model, trial
 
-    def proposals(self, scenes):
-        observation, _ = self.model.policy.obs_to_tensor(self.trial.observe(scenes))
-        return self.model.policy.actor.propose(observation)[0].detach().numpy().astype(np.float64)
-
     def decide(self, observation, scenes):
-        proposals = self.proposals(scenes)
-        number, count, size = proposals.shape
+        actions = proposals(self.model.policy, self.trial.observe(scenes))
+        number, count, size = actions.shape
         every = scenes.take(np.repeat(np.arange(number), count))
-        reward = self.trial(every, proposals.reshape(-1, size)).reward.reshape(number, count)
-        return proposals[np.arange(number), reward.argmin(axis=-1)]
+        reward = self.trial(every, actions.reshape(-1, size)).reward.reshape(number, count)
+        return actions[np.arange(number), reward.argmin(axis=-1)]
 
 
 @pytest.fixture(scope="module")
 def sorted_out(small_scenes):
     env = ViaVecEnv(ENV, 1, threads=1)
-    model = new_model(resolved(TrainConfig(env=ENV)), env)  # untrained: it proposes its anchors
+    model = new_model(resolved(TrainConfig(env=ENV)), env)  # untrained
     trial = Trial(ENV, 64, threads=1)
     result = evaluate(
         [Chosen(model, trial)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
