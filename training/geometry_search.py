@@ -31,6 +31,8 @@ KEEP = 0.1
 """Reward by which another plan must be better than the one under way, as each change of plan costs jerk."""
 HORIZONS = (1.2, 0.9, 0.6, 0.3)
 """Times for which a plan shall at least be clear where none is clear to its end, [s]: obstacles may change course."""
+SHORTER = 1e3
+"""Merit lost with each of these horizons, more than any reward."""
 SPREAD = 0.25
 """Half the side of the cube around each of them, in the action space; each round halves it."""
 
@@ -104,14 +106,12 @@ class GeometrySearch:
         number = len(observation["hand"])
         actions = self._candidates(observation)
         tried = np.broadcast_to(actions, (number, *actions.shape))
-        worth = self._worth(observation, tried)
-        best, value = _top(tried, worth, CENTRES if self.refinements else 1)
+        bonus = KEEP if is_replanning(observation) else 0.0
+        best, value = _top(tried, self._worth(observation, tried, bonus))
         for each in range(self.refinements):
             near = self._around(best, SPREAD * 0.5**each)
-            worth = self._worth(observation, near)
-            best, value = _top(
-                np.concatenate((best, near), axis=1), np.concatenate((value, worth), axis=1), CENTRES
-            )
+            every = np.concatenate((best, near), axis=1)
+            best, value = _top(every, np.concatenate((value, self._worth(observation, near)), axis=1))
         return best[:, 0].astype(np.float64)
 
     def predict(
@@ -146,13 +146,15 @@ class GeometrySearch:
         """
         d = self.task.arm.dimension
         first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
-        rows = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
-        scene = Scenes(first, last, _numbers("obstacles", rows, (None, 2 * d + 1))[None])
+        given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
+        scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
         for wrong, reason in problems(scene, self.task.arm, whole_arm=self.task.whole_arm):
             if wrong.any():
                 raise ValueError(reason(0))
-        seen = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1).reshape(1, -1)
-        observation: Observation = {"hand": first, "goal": last, **({"obstacles": seen} if seen.size else {})}
+        rows: Float = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1)
+        observation: dict[str, Float] = {"hand": first, "goal": last}
+        if rows.size:
+            observation["obstacles"] = rows.reshape(1, -1)
         return self.task.action.decode(self.decide(observation), first, last).take(0)
 
     def _candidates(self, observation: Observation) -> Single:
@@ -171,24 +173,22 @@ class GeometrySearch:
         relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
         return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
 
-    def _worth(self, observation: Observation, actions: Numbers) -> Float:
+    def _worth(self, observation: Observation, actions: Numbers, bonus: float = 0.0) -> Float:
         """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse."""
-        replanning = is_replanning(observation)
-        worth = np.full(actions.shape[:2], -np.inf)
-        blocked = np.arange(len(actions))
-        for horizon in (np.inf, *HORIZONS) if replanning else (np.inf,):
-            some, bonus = part(observation, blocked), KEEP if replanning else 0.0
-            worth[blocked] = worth_of_best(some, actions[blocked], self.task, self._margins, horizon, bonus)
-            blocked = np.flatnonzero(np.isneginf(worth).all(axis=-1))
-            if not blocked.size:
-                return worth
-        checks = check_plans(part(observation, blocked), actions[blocked], self.task)
-        worth[blocked] = merit(checks, *self._margins)
+        worth = worth_of_best(observation, actions, self.task, self._margins, bonus=bonus)
+        for rank, horizon in enumerate(HORIZONS if is_replanning(observation) else (), start=1):
+            if (rows := _unsolved(worth)).size:
+                some = part(observation, rows)
+                shorter = worth_of_best(some, actions[rows], self.task, self._margins, horizon, bonus)
+                worth[rows] = shorter - rank * SHORTER
+        if (rows := _unsolved(worth)).size:
+            checks = check_plans(part(observation, rows), actions[rows], self.task)
+            worth[rows] = merit(checks, *self._margins)
         return worth
 
     def _around(self, best: Single, spread: float) -> Single:
         """Return `per_round` actions around the best ones, shape (B, per_round, m)."""
-        steps = spread * _sobol(self.per_round, self.task.action.size)
+        steps = spread * _sobol(self.per_round + 1, self.task.action.size)[1:]
         centre = best[:, np.arange(self.per_round) % best.shape[1]]
         return np.clip(centre + steps, -1.0, 1.0)
 
@@ -214,10 +214,19 @@ def _sobol(number: int, size: int) -> Single:
     return actions
 
 
-def _top(actions: Numbers, worth: Float, count: int) -> tuple[Single, Float]:
-    """Return the `count` best of H actions in each of B scenes, shape (B, count, m), and their merit (B, count)."""
-    order = np.argsort(-worth, axis=-1, kind="stable")[:, :count]
+def _unsolved(worth: Float) -> NDArray[np.intp]:
+    """Return the scenes of which no action is known to be worth anything."""
+    return np.flatnonzero(np.isneginf(worth).all(axis=-1))
+
+
+def _top(actions: Numbers, worth: Float) -> tuple[Single, Float]:
+    """Return the CENTRES best of H actions in each of B scenes, shape (B, CENTRES, m), and their merit.
+
+    The best one stands in for those of which nothing is known.
+    """
     each = np.arange(len(worth))[:, None]
+    order = np.argsort(-worth, axis=-1, kind="stable")[:, :CENTRES]
+    order = np.where(np.isneginf(worth[each, order]), order[:, :1], order)
     return np.asarray(actions[each, order], np.float32), worth[each, order]
 
 
