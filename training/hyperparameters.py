@@ -125,7 +125,12 @@ HYPERPARAMETERS: dict[str, Allowed] = {
 
 PARTICULAR: dict[str, dict[str, Allowed]] = {
     "ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)},
-    "viaq": {"action_noise": Allowed("null, as it explores by itself", NONE.fits)},
+    "viaq": {
+        "action_noise": Allowed("null, as it explores by itself", NONE.fits),
+        "n_steps": Allowed("1", lambda value: value == 1 and not isinstance(value, bool)),
+        "optimize_memory_usage": Allowed("false", lambda value: value is False),
+        "use_sde": Allowed("false", lambda value: value is False),
+    },
 }
 """What is narrower for one algorithm."""
 
@@ -173,7 +178,8 @@ def check_via_policy(values: Mapping[str, Any]) -> None:
     _check("in policy_kwargs of viaq", VIA_POLICY, values)
     if values.get("form", "places") == "places" and values.get("pooling", "minimum") != "minimum":
         raise ValueError(
-            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is places"
+            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is places, got "
+            f"{values['pooling']!r}"
         )
 
 

@@ -61,6 +61,7 @@ NOT_STORED = frozenset(
         "_init_setup_model",
         "stats_window_size",
     }
+    | {"monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
 """Arguments of an algorithm that belong to one process, or that are not used here."""

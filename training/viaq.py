@@ -24,7 +24,7 @@ from torch.nn import functional
 from viapoint.envs.arms import ARMS
 from viapoint.envs.step_episodes import StepRewardWeights
 from viapoint.envs.task import Task
-from viapoint.training.hyperparameters import check_hyperparameters, check_via_policy
+from viapoint.training.hyperparameters import PARTICULAR, check_hyperparameters, check_via_policy
 from viapoint.training.outcome_buffer import OutcomeReplayBuffer, OutcomeSamples
 from viapoint.training.viaq_policy import Values, ViaQPolicy, spread_actions
 
@@ -88,7 +88,8 @@ class ViaQ(OffPolicyAlgorithm):
     ) -> None:
         self.explore_uniformly, self.temperature = explore_uniformly, temperature
         self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
-        check_hyperparameters("viaq", _plain({name: getattr(self, name) for name in OWN}))
+        narrower = {name: kwargs[name] for name in PARTICULAR["viaq"] if name in kwargs}
+        check_hyperparameters("viaq", _plain({**narrower, **{name: getattr(self, name) for name in OWN}}))
         check_via_policy(_plain(policy_kwargs or {}))
         super().__init__(
             policy,
@@ -168,7 +169,9 @@ class ViaQ(OffPolicyAlgorithm):
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the critic's predictions, by name."""
         policy, critic = self.policy, self.policy.critic
-        values = Values(*(each[:, 0] for each in critic(policy.inputs(batch.observations, batch.actions[:, None]))))
+        values = Values(
+            *(each[:, 0] for each in critic(policy.inputs(batch.observations, batch.actions[:, None])))
+        )
         following = self._following(batch)
         ended, discount = torch.from_numpy(batch.ended), torch.from_numpy(batch.discount)
         goes_on = (1.0 - ended) * discount if following is not None else torch.zeros_like(ended)
@@ -197,7 +200,8 @@ class ViaQ(OffPolicyAlgorithm):
             ),
             "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.clear, clear), carried_out),
             "arrival": _mean(_cross_entropy(values.arrives, arrives), known & (contact < 0.5)),
-            "rest": 10.0 * _mean(functional.smooth_l1_loss(values.rest, rest, beta=0.1, reduction="none"), known),
+            "rest": 10.0
+            * _mean(functional.smooth_l1_loss(values.rest, rest, beta=0.1, reduction="none"), known),
         }
         if not bool(known.all()):
             target = torch.from_numpy(batch.reward)
@@ -219,7 +223,9 @@ class ViaQ(OffPolicyAlgorithm):
         if critic is None or not self.gamma:
             return None
         every = spread_actions(policy.candidates, policy.task.action.size)
-        chosen = np.random.randint(min(1, len(every) - 1), len(every), size=(len(batch.ended), self.next_candidates))  # noqa: NPY002
+        chosen = np.random.randint(
+            min(1, len(every) - 1), len(every), size=(len(batch.ended), self.next_candidates)
+        )  # noqa: NPY002
         chosen[:, 0] = 0
         values = critic(policy.inputs(batch.next_observations, every[chosen]))
         best = critic.value(values).argmax(dim=1, keepdim=True)

@@ -12,8 +12,8 @@ from viapoint.training.hyperparameters import (
     check_hyperparameters,
 )
 from viapoint.training.model_files import ALGORITHMS, _argument_names, _encode
-from viapoint.training.policies import ViaPolicy
-from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, SPACE_PRESETS, STEP_PRESETS
+from viapoint.training.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, STEP_PRESETS
+from viapoint.training.viaq_policy import ViaQPolicy
 
 
 def test_every_hyperparameter_is_in_the_table():
@@ -25,7 +25,7 @@ def test_every_hyperparameter_is_in_the_table():
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_what_the_algorithms_and_the_presets_use_is_allowed(algo):
-    for table in (PRESETS, STEP_PRESETS, REACH_PRESETS, SPACE_PRESETS, ONLINE_PRESETS):
+    for table in (PRESETS, STEP_PRESETS, REACH_PRESETS, ONLINE_PRESETS):
         if algo in table:
             check_hyperparameters(algo, table[algo].arguments())
     defaults = {
@@ -50,14 +50,18 @@ def test_what_makes_no_sense_is_refused_with_what_is_allowed(value):
     [
         ("sac", "gamma", 7),
         ("sac", "gamma", True),
-        ("viatd3", "gradient_steps", -9),
-        ("viatd3", "buffer_size", 0),
-        ("viatd3", "batch_size", 1.5),
-        ("viatd3", "batch_size", True),
-        ("viatd3", "learning_rate", 0.0),
-        ("viatd3", "learning_rate", {"kind": "linear", "start": 1.0}),
-        ("viatd3", "policy_kwargs", 3),
-        ("viatd3", "augment", 1),
+        ("viaq", "gradient_steps", -9),
+        ("viaq", "buffer_size", 0),
+        ("viaq", "batch_size", 1.5),
+        ("viaq", "batch_size", True),
+        ("viaq", "learning_rate", 0.0),
+        ("viaq", "learning_rate", {"kind": "linear", "start": 1.0}),
+        ("viaq", "policy_kwargs", 3),
+        ("viaq", "explore_uniformly", 1.5),
+        ("viaq", "temperature", 0),
+        ("viaq", "explore_candidates", 1),
+        ("viaq", "next_candidates", 0),
+        ("viaq", "action_noise", {"kind": "normal", "sigma": 0.1}),
         ("ppo", "batch_size", 1),
         ("ppo", "ent_coef", "auto"),
         ("sac", "train_freq", [1, "episode"]),
@@ -73,32 +77,37 @@ def test_ranges_and_types(algo, name, value):
     ("name", "value"),
     [
         ("width", 0),
-        ("width", 3),
         ("width", 128.0),
         ("width", True),
-        ("rounds", -1),
-        ("kept", 0),
-        ("candidates", -1),
-        ("candidates", 2.5),
+        ("form", "features"),
+        ("pooling", "mean"),
+        ("pooling", "sum"),  # with the form "places"
         ("heads", 0),
-        ("trajectory_features", 1),
+        ("heads", None),
+        ("instants", 1),
+        ("candidates", 0),
+        ("candidates", 2.5),
+        ("refinements", -1),
+        ("per_refinement", 0),
+        ("checks", -1),
         ("optimizer_kwargs", 3),
     ],
 )
 def test_what_makes_no_sense_of_a_policy_of_via_points_is_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} in policy_kwargs of viatd3 must be .+, got"):
-        check_hyperparameters("viatd3", {"policy_kwargs": {name: value}})
+    with pytest.raises(ValueError, match=f"{name} in policy_kwargs of viaq must be .+, got"):
+        check_hyperparameters("viaq", {"policy_kwargs": {name: value}})
 
 
 @pytest.mark.parametrize("name", ["net_arch", "task", "foo"])
 def test_names_that_a_policy_of_via_points_has_not_are_refused_with_those_it_has(name):
-    with pytest.raises(ValueError, match=f"no '{name}'; they have width, rounds, kept"):
-        check_hyperparameters("viatd3", {"policy_kwargs": {name: [3]}})
+    with pytest.raises(ValueError, match=f"no '{name}'; they have form, pooling, heads"):
+        check_hyperparameters("viaq", {"policy_kwargs": {name: [3]}})
     check_hyperparameters("sac", {"policy_kwargs": {name: [3]}})
 
 
 def test_the_table_of_a_policy_of_via_points_is_whole():
-    arguments = inspect.signature(ViaPolicy).parameters.values()
+    arguments = inspect.signature(ViaQPolicy).parameters.values()
     own = {each.name: each.default for each in arguments if each.default is not each.empty}
-    assert set(VIA_POLICY) == {*own, "optimizer_kwargs"}
-    check_hyperparameters("viatd3", {"policy_kwargs": own})
+    del own["optimizer_class"]
+    assert set(VIA_POLICY) == set(own)
+    check_hyperparameters("viaq", {"policy_kwargs": own})
