@@ -74,6 +74,10 @@ NOTES = (
 )
 
 
+HEADINGS, COLUMN = 21, 11
+"""Widths in the terminal: of the column of headings, and the least of a method's column, [characters]."""
+
+
 def rows(record: Record) -> list[list[str]]:
     """Headings, then the cells of each method; columns in which no method has a value are left out."""
     columns = _columns(record)
@@ -109,16 +113,20 @@ def markdown(record: Record) -> str:
 
 
 def show(record: Record, console: Console | None = None) -> None:
-    """Print the table, turned on its side: one column for each method."""
-    lines = rows(record)
-    table = Table(title=title(record), title_justify="left")
-    for i, line in enumerate(lines):
-        table.add_column(
-            escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i, overflow="fold"
-        )
-    for i in range(1, len(lines[0])):
-        table.add_row(*(escape(line[i]) for line in lines))
-    (console or Console()).print(table)
+    """Print the table, turned on its side: one column for each method, in several tables where they are too many."""
+    console = console or Console()
+    heads, *body = rows(record)
+    fitting = max((console.width - HEADINGS) // COLUMN, 1)
+    for first in range(0, len(body), fitting):
+        lines = [heads, *body[first : first + fitting]]
+        table = Table(title=title(record) if not first else None, title_justify="left")
+        for i, line in enumerate(lines):
+            table.add_column(
+                escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i, overflow="fold"
+            )
+        for i in range(1, len(heads)):
+            table.add_row(*(escape(line[i]) for line in lines))
+        console.print(table)
 
 
 def write(record: Record, folder: Path, stem: str = "table") -> tuple[Path, Path]:

@@ -69,11 +69,11 @@ def test_help_is_short_and_has_an_example(words, capsys):
         ("train --env-kwargs n_via=2 n_via=3", "n_via is there twice, as 2 and as 3"),
         ("train --env-kwargs whole_arm=True", "whole_arm=True is no JSON"),
         ("train --env-kwargs num_envs=4", "--n-envs"),
-        ("train --hyperparameters gamma=7", "gamma of viatd3 must be a number from 0 to 1, got 7"),
+        ("train --hyperparameters gamma=7", "gamma of viaq must be a number from 0 to 1, got 7"),
         ("evaluate", "name a run folder"),
         ("evaluate nowhere", "no run folder"),
         ("evaluate /etc/passwd", "it is a file"),
-        ("evaluate --methods magic", "unrevised, got 'magic'"),
+        ("evaluate --methods magic", "search4096, got 'magic'"),
         (f"evaluate --pretrained {REACH} --env {ENV}", f"env must be {REACH}"),
         (f"evaluate --pretrained {REACH} --methods agent unrevised", "got 'unrevised'"),
         (f"evaluate --env {ENV} --methods straight --failures there", "failures concerns the agent"),
@@ -86,8 +86,8 @@ def test_help_is_short_and_has_an_example(words, capsys):
             for name in ("PlanarReach", "PandaReach", "PlanarMovingObstacles")
         ),
         (
-            'train --hyperparameters policy_kwargs={"kept":0}',
-            "kept in policy_kwargs of viatd3 must be a whole",
+            'train --hyperparameters policy_kwargs={"heads":0}',
+            "heads in policy_kwargs of viaq must be a whole",
         ),
         (f"evaluate --env {ENV} --methods straight random straight", "straight is there twice"),
         ("evaluate --pretrained viapoint/Nothing-v0", "no pretrained agent for 'viapoint/Nothing-v0'"),
@@ -134,7 +134,7 @@ def trained(tmp_path_factory):
     run(
         "train", "--env", ENV, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
         "--out", folder, "--no-progress", "--env-kwargs", "threads=1",
-        "--hyperparameters", "learning_starts=32", "gradient_steps=1", "fresh_scenes=4",
+        "--hyperparameters", "learning_starts=32", "gradient_steps=1",
     )  # fmt: skip
     return folder
 
@@ -149,11 +149,11 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     record = json.loads(results.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == ENV
-    run(*words[:3], "agent", "--candidates", 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
+    run(*words[:3], "agent", "--checks", 0, 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
     counts = json.loads((tmp_path / "failures" / "failures.json").read_text())
-    assert counts["method"] == "agent, ranks 8"
+    assert counts["method"] == "agent, 8 checks"
     kept = json.loads((trained / "evaluations" / "test.first-4.json").read_text())
-    assert list(kept["methods"]) == ["agent", "agent, ranks 8"]
+    assert list(kept["methods"]) == ["agent", "agent, 8 checks"]
 
 
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path):

@@ -70,7 +70,7 @@ def test_nothing_is_shared_between_two_configurations():
     ("kind", "values", "named"),
     [
         (TrainConfig, {"env": "viapoint/Nothing-v0"}, "env must be one of viapoint/"),
-        (TrainConfig, {"algo": "dqn"}, "algo must be one of viatd3"),
+        (TrainConfig, {"algo": "dqn"}, "algo must be one of viaq"),
         (TrainConfig, {"seed": -1}, "seed"),
         (TrainConfig, {"seed": 1.5}, "seed"),
         (TrainConfig, {"n_timesteps": 0}, "n_timesteps"),
@@ -81,16 +81,16 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"n_envs": 10**9}, "n_envs must be a whole number, from 1 to 65536"),
         (TrainConfig, {"seed": 2**32}, "seed must be a whole number, from 0 to 4294967295"),
         (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
-        (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viatd3 decides on whole movements"),
+        (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viaq decides on whole movements"),
         (
             TrainConfig,
             {"env": "CartPole-v1"},
             "viapoint/Reach-v0, viapoint/Obstacles-v0, .*got 'CartPole-v1'",
         ),
-        (TrainConfig, {"hyperparameters": {"batch_size": -3}}, "batch_size of viatd3 must be a whole number"),
+        (TrainConfig, {"hyperparameters": {"batch_size": -3}}, "batch_size of viaq must be a whole number"),
         *[(TrainConfig, {"env_kwargs": {name: 1}}, f"{name} cannot be among") for name in ELSEWHERE],
         (EvaluateConfig, {}, "name a run folder"),
-        (EvaluateConfig, {"methods": ("magic",)}, "agent, straight, .* got 'magic'"),
+        (EvaluateConfig, {"methods": ("magic",)}, "agent, untrained, straight, .* got 'magic'"),
         (EvaluateConfig, {"methods": ("straight",)}, "--env must say"),
         *[
             (
@@ -98,7 +98,7 @@ def test_nothing_is_shared_between_two_configurations():
                 {"run": Path("a"), "methods": ("straight",), name: value},
                 f"{name} concerns the agent",
             )
-            for name, value in (("candidates", 8), ("compiled", True), ("failures", Path("b")))
+            for name, value in (("checks", (8,)), ("failures", Path("b")))
         ],
         (EvaluateConfig, {"run": Path("a"), "pretrained": "b"}, "not both"),
         (EvaluateConfig, {"run": Path("a"), "methods": ()}, "methods"),
@@ -108,7 +108,7 @@ def test_nothing_is_shared_between_two_configurations():
         (BenchConfig, {"num_envs": 0}, "num_envs"),
         (BenchConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "an action is a whole movement"),
         (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}, "viapoint/PlanarWholeArm-v0 for one"),
-        (DemoConfig, {"candidates": 0}, "candidates"),
+        (DemoConfig, {"checks": 0}, "checks"),
         (DemoConfig, {"env": "viapoint/Reach-v0"}, "viapoint/PandaReach-v0 for one"),
     ],
 )
@@ -161,7 +161,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(kind, name, needed, tmp_p
 
 
 def test_every_method_can_be_named():
-    assert set(MEASURABLE) == {"agent", *METHODS, *ONLINE_METHODS}
+    assert set(MEASURABLE) == {"agent", "untrained", *METHODS, *ONLINE_METHODS}
 
 
 def test_unknown_names_in_a_file_are_refused():

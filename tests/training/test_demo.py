@@ -23,7 +23,7 @@ FILES = (
 def quick(monkeypatch, shipped, tmp_path):
     monkeypatch.setattr(demo, "PICTURES", 2)
     monkeypatch.setattr(demo, "MOVEMENTS", 1)
-    return DemoConfig(out=tmp_path / "demo", n_timesteps=64, n_scenes=8, candidates=8)
+    return DemoConfig(out=tmp_path / "demo", n_timesteps=64, n_scenes=8, checks=8)
 
 
 def test_everything_is_there_and_a_second_call_only_shows_it(quick, capsys, monkeypatch):
@@ -35,7 +35,10 @@ def test_everything_is_there_and_a_second_call_only_shows_it(quick, capsys, monk
     record = json.loads((quick.out / "table.json").read_text())
     assert list(record["methods"]) == [
         "agent",
-        "agent, ranks 8",
+        "agent, 8 checks",
+        "untrained",
+        "search, 16 checks",
+        "search, 512 checks",
         "straight line",
         "random via-point",
         "planner (stored)",

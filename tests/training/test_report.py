@@ -67,7 +67,7 @@ def test_the_printed_table_loses_nothing_to_markup(record):
 
 def test_the_usual_five_methods_fit_a_terminal_of_80_columns(record):
     summary = {**record["methods"]["planner (stored)"], "decision_time": 0.863, "decision_time_98": 0.904}
-    names = ("agent", "agent, ranks 80", "straight line", "random via-point", "planner")
+    names = ("agent", "agent, 16 checks", "straight line", "random via-point", "planner")
     many = {**record, "methods": dict.fromkeys(names, summary)}
     console = Console(width=80, record=True, file=io.StringIO())
     report.show(many, console)

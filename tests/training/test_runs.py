@@ -305,8 +305,8 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
     own = dataclasses.replace(PANDA, name="mine")
     monkeypatch.setitem(ARMS, "mine", own)
     env = ViaVecEnv("viapoint/Reach-v0", 1, arm=own, threads=1)
-    preset = PRESETS["viatd3"]
-    model = build("viatd3", preset.policy, env, preset.arguments(), seed=0)
+    preset = PRESETS["viaq"]
+    model = build("viaq", preset.policy, env, preset.arguments(), seed=0)
     save_model(model, tmp_path)
     assert load_model(tmp_path).get_env().env_kwargs["arm"] == "mine"
     monkeypatch.delitem(ARMS, "mine")

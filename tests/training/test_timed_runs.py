@@ -123,7 +123,7 @@ def test_models_and_checkpoints_know_their_unit(uneven, tmp_path):
     ("changes", "words"),
     [
         ({"discount_unit": 0.0}, "discount_unit must be a positive number of seconds, got 0.0"),
-        ({"env": "viapoint/PlanarObstacles-v0", "algo": "viatd3"}, "must be None for viatd3"),
+        ({"env": "viapoint/PlanarObstacles-v0", "algo": "viaq"}, "must be None for viaq"),
     ],
 )
 def test_the_configuration_refuses_what_cannot_be_meant(changes, words, tmp_path):

@@ -18,7 +18,12 @@ from viapoint.training.train import TrainingStoppedError, train
 from viapoint.training.vec_env import ViaVecEnv
 
 TINY = {
-    "viatd3": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "fresh_scenes": 4},
+    "viaq": {
+        "learning_starts": 32,
+        "gradient_steps": 2,
+        "batch_size": 16,
+        "policy_kwargs": {"candidates": 32, "refinements": 1, "per_refinement": 16},
+    },
     "sac": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "buffer_size": 96},
     "td3": {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "buffer_size": 400},
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
@@ -27,7 +32,7 @@ TINY = {
 STEPS = 192
 
 
-def config(folder, algo="viatd3", **changes):
+def config(folder, algo="viaq", **changes):
     values = {
         "out": folder,
         "algo": algo,
@@ -153,8 +158,8 @@ def test_a_finished_run_can_be_extended(tmp_path):
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
     run = train(config(tmp_path / "run", n_timesteps=64))
-    preset = dataclasses.replace(PRESETS["viatd3"], n_envs=3, hyperparameters=(("learning_rate", 0.5),))
-    monkeypatch.setitem(PRESETS, "viatd3", preset)
+    preset = dataclasses.replace(PRESETS["viaq"], n_envs=3, hyperparameters=(("learning_rate", 0.5),))
+    monkeypatch.setitem(PRESETS, "viaq", preset)
     assert train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False)).decisions == 128
 
 
@@ -167,10 +172,10 @@ def test_what_cannot_be_trained_is_refused(tmp_path):
             {"algo": "sac", "hyperparameters": {"policy_kwargs": {"speed": 1}}},
             'cannot be made with policy_kwargs={"speed": 1}: ',
         ),
-        ({"hyperparameters": {"policy_kwargs": {"speed": 1}}}, "have no 'speed'; they have width"),
+        ({"hyperparameters": {"policy_kwargs": {"speed": 1}}}, "have no 'speed'; they have form"),
         (
             {"hyperparameters": {"policy_kwargs": {"heads": -1}}},
-            "heads in policy_kwargs of viatd3 must be a whole number, 1 or more, or null, got -1",
+            "heads in policy_kwargs of viaq must be a whole number, 1 or more, got -1",
         ),
         (
             {"algo": "sac", "hyperparameters": {"policy_kwargs": {"net_arch": [-3]}}},
