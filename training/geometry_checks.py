@@ -35,6 +35,8 @@ CLOSE = 0.1
 """Clearance above which no instant is looked at closely, [m]."""
 FINER = 12
 """Close looks in each interval between two instants."""
+REACHED = 0.8
+"""Share of a step between instants within which the nearest approach lies; half of it on a straight line."""
 STENCIL = 4
 """Instants from which places between them are interpolated."""
 OUTSIDE = -1e6
@@ -89,7 +91,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
         some = part(observation, rows)
         moves = planned(some, actions[rows], task, SHARES)
         clearance = _least_clearance(moves, obstacles.take(rows), task, until, (DEEP, CLOSE))
-        reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
+        reach = _least_reach(task.arm, moves.path)
         for mine, theirs in zip(
             found, (clearance, reach, _reward(some, moves, clearance, reach, task)), strict=True
         ):
@@ -153,7 +155,7 @@ def worth_of_best(
     for rows in _blocks(obstacles.number, max(1, PLANNED // (actions.shape[1] * NODES))):
         some = part(observation, rows)
         moves = planned(some, actions[rows], task, SHARES)
-        reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
+        reach = _least_reach(task.arm, moves.path)
         bound = _reward(some, moves, np.full_like(reach, FAR), reach, task)
         bound = np.where(reach > margins[1], bound, -np.inf)
         bound[:, 0] += bonus
@@ -226,6 +228,17 @@ def _blocks(number: Index, size: int) -> Iterator[Any]:
         return
     order = np.argsort(number, kind="stable")
     yield from (order[first : first + size] for first in range(0, len(order), size))
+
+
+def _least_reach(arm: Arm, path: Numbers) -> Numbers:
+    """Return the least reach margin over movements, shape (B, H), [m], between instants by parabolas."""
+    margin = np.asarray(arm.reach_margin(path))
+    before, middle, after = margin[..., :-2], margin[..., 1:-1], margin[..., 2:]
+    slope, curvature = 0.5 * (after - before), before + after - 2.0 * middle
+    between = REACHED * curvature > np.abs(slope)
+    drop = 0.5 * slope * slope / np.where(between, curvature, 1.0)
+    lowest = np.where(between, middle - drop, middle).min(axis=-1)
+    return np.asarray(np.minimum(lowest, np.minimum(margin[..., 0], margin[..., -1])))
 
 
 class _Bodies(NamedTuple):
@@ -325,13 +338,14 @@ class _Profile:
     def near(self, limit: Numbers) -> tuple[Index, Index, Index, Index]:
         """Return the scenes, obstacles, instants and movements of nearest approaches, shape (M,) each.
 
-        These are local minima in time, from which a straight movement of half an interval may lead below the limit.
+        These are local minima in time, from which a movement of REACHED of a step to the next instant may lead below
+        the limit.
 
         Args:
             limit: Clearance of interest, shape (B, H), [m].
         """
         reach = np.maximum(limit[:, None] + self.radii, 0.0)
-        bound, steps = np.where(reach > 0.0, reach * reach, -np.inf), self._half_steps()
+        bound, steps = np.where(reach > 0.0, reach * reach, -np.inf), self._steps_squared()
         scene, obstacle, movement = np.nonzero(self.lowest <= bound + steps.max(axis=1)[:, None])
         some = self.squared[scene, obstacle, :, movement]
         near = some <= bound[scene, obstacle, movement, None] + steps[scene, :, movement]
@@ -340,11 +354,11 @@ class _Profile:
         each, instant = np.nonzero(near)
         return scene[each], obstacle[each], instant, movement[each]
 
-    def _half_steps(self) -> Numbers:
-        """Return the square of half of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
+    def _steps_squared(self) -> Numbers:
+        """Return the square of REACHED of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
         ends = [each for each in (self.body.first, self.body.second) if each is not None]
         squares = [squared_length(each[:, 1:] - each[:, :-1]) for each in ends]
-        square: Numbers = np.float32(0.25) * functools.reduce(np.maximum, squares)
+        square: Numbers = np.float32(REACHED**2) * functools.reduce(np.maximum, squares)
         longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
         longer[:, :-1], longer[:, -1] = square, square[:, -1]
         np.maximum(longer[:, 1:-1], square[:, :-1], out=longer[:, 1:-1])

@@ -109,7 +109,9 @@ class GeometrySearch:
         bonus = KEEP if is_replanning(observation) else 0.0
         best, value = _top(tried, self._worth(observation, tried, bonus))
         for each in range(self.refinements):
-            near = self._around(best, SPREAD * 0.5**each)
+            steps = SPREAD * 0.5**each * self._points(self.per_round + 1, observation, 0.0)[1:]
+            centres = best[:, np.arange(self.per_round) % best.shape[1]]
+            near = np.clip(centres + steps, -1.0, 1.0)
             every = np.concatenate((best, near), axis=1)
             best, value = _top(every, np.concatenate((value, self._worth(observation, near)), axis=1))
         return best[:, 0].astype(np.float64)
@@ -159,13 +161,16 @@ class GeometrySearch:
 
     def _candidates(self, observation: Observation) -> Single:
         """Return the actions that are checked first, shape (n_checks, m)."""
-        size, d = self.task.action.size, self.task.action.n_via * self.task.action.dimension
-        if is_replanning(observation) or not d:
-            return _sobol(self.n_checks, size)
-        others = _sobol(self.n_checks, size - 1)
-        timed = np.insert(others, d, self._best_duration(), axis=1)
-        timed[0] = 0.0
-        return timed
+        actions = self._points(self.n_checks, observation, self._best_duration())
+        actions[0] = 0.0
+        return actions
+
+    def _points(self, number: int, observation: Observation, duration: float) -> Single:
+        """Return zero and points of the action space, shape (number, m), of one duration where nothing moves."""
+        size, at = self.task.action.size, self.task.action.n_via * self.task.action.dimension
+        if is_replanning(observation) or not at:
+            return _sobol(number, size).copy()
+        return np.insert(_sobol(number, size - 1), at, np.float32(duration), axis=1)
 
     def _best_duration(self) -> float:
         """Return the duration component of the greatest reward: 5 w_smoothness log(T) - w_duration T is greatest."""
@@ -185,12 +190,6 @@ class GeometrySearch:
             checks = check_plans(part(observation, rows), actions[rows], self.task)
             worth[rows] = merit(checks, *self._margins)
         return worth
-
-    def _around(self, best: Single, spread: float) -> Single:
-        """Return `per_round` actions around the best ones, shape (B, per_round, m)."""
-        steps = spread * _sobol(self.per_round + 1, self.task.action.size)[1:]
-        centre = best[:, np.arange(self.per_round) % best.shape[1]]
-        return np.clip(centre + steps, -1.0, 1.0)
 
 
 def task_of(env_id: str, **kwargs: Any) -> Task:
