@@ -260,7 +260,7 @@ class ViaQPolicy(BasePolicy):
             **super()._get_constructor_parameters(),
             **self.settings,
             "task": self.task.as_dict(),
-            "lr_schedule": lambda _: 0.0,
+            "lr_schedule": self._dummy_schedule,
             "instants": self.instants,
             "candidates": self.candidates,
             "refinements": self.refinements,
