@@ -1,0 +1,222 @@
+"""ViaQ is used as any algorithm of Stable-Baselines3 is, and says what it cannot do."""
+
+import copy
+import io
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
+
+from viapoint.training.baselines import agent_method
+from viapoint.training.outcome_buffer import outcome_of
+from viapoint.training.vec_env import TERMS, ViaVecEnv
+from viapoint.training.viaq import ViaQ
+from viapoint.training.viaq_policy import ViaQPolicy
+
+ENV, ONLINE = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
+FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
+SMALL = {
+    "learning_starts": 16,
+    "batch_size": 8,
+    "gradient_steps": 1,
+    "explore_candidates": 16,
+    "policy_kwargs": FEW,
+}
+
+
+@pytest.fixture
+def made():
+    """Environments that are closed at the end."""
+    open_ = []
+
+    def make(env_id=ENV, number=8, **kwargs):
+        open_.append(ViaVecEnv(env_id, number, seed=0, threads=1, **kwargs))
+        return open_[-1]
+
+    yield make
+    for env in open_:
+        env.close()
+
+
+def model_on(env, **kwargs):
+    return ViaQ("ViaQPolicy", env, seed=0, **{**SMALL, **kwargs})
+
+
+def weights(model):
+    return torch.cat([part.detach().flatten() for part in model.policy.parameters()])
+
+
+@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+def test_it_learns_in_pieces_is_saved_and_goes_on(made, tmp_path, env_id):
+    env = made(env_id)
+    model = model_on(env).learn(24)
+    model.learn(16, reset_num_timesteps=False)
+    assert model.num_timesteps == 40
+    model.save(tmp_path / "model")
+    buffer = io.BytesIO()
+    model.save(buffer)
+    buffer.seek(0)
+    observation = env.reset()
+    one = {name: part[0] for name, part in observation.items()}
+    for again in (ViaQ.load(tmp_path / "model"), ViaQ.load(buffer, env=env)):
+        decided = again.predict(observation, deterministic=True)[0]
+        np.testing.assert_array_equal(decided, model.predict(observation)[0])
+        np.testing.assert_allclose(again.predict(one)[0], decided[0], atol=1e-5)
+        again.set_env(env)
+        assert again.learn(8, reset_num_timesteps=False).num_timesteps == 48
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        ENV,
+        lambda: gym.make(ENV, threads=1),
+        lambda: make_vec_env(ENV, 2, env_kwargs={"threads": 1}),
+        lambda: VecNormalize(make_vec_env(ENV, 2, env_kwargs={"threads": 1}), norm_obs=False),
+    ],
+)
+def test_any_environment_of_sb3_will_do(env):
+    model = model_on(env() if callable(env) else env).learn(20)
+    assert model._n_updates > 0
+    assert torch.isfinite(weights(model)).all()
+    model.get_env().close()
+
+
+@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+def test_equal_seeds_give_equal_agents(made, env_id):
+    one, other = (weights(model_on(made(env_id)).learn(32)) for _ in range(2))
+    assert torch.equal(one, other)
+
+
+def test_it_goes_on_in_other_scenes_of_its_task_only(made):
+    model = model_on(made()).learn(24)
+    model.set_env(made(n_obstacles=5))
+    model.learn(8, reset_num_timesteps=False)
+    for other, part in (
+        ({"env_id": "viapoint/PlanarWholeArm-v0"}, "whole_arm"),
+        ({"duration_range": (0.5, 2.0)}, "action"),
+    ):
+        env = model.get_env()
+        with pytest.raises(ValueError, match=f"must have the {part} that the agent was made for"):
+            model.set_env(made(**other))
+        assert model.get_env() is env
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(made("viapoint/PandaObstacles-v0"))
+
+
+def test_environments_without_plans_are_refused(made):
+    for env in (made("viapoint/PlanarObstaclesStep-v0"), "Pendulum-v1"):
+        with pytest.raises(ValueError, match="an action is a whole movement, such as viapoint/"):
+            model_on(env)
+    with pytest.raises(ValueError, match="norm_obs=False"):
+        model_on(VecNormalize(made()))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("explore_uniformly", 1.5),
+        ("temperature", 0.0),
+        ("explore_candidates", 1),
+        ("next_candidates", 0),
+        ("action_noise", NormalActionNoise(np.zeros(3), np.ones(3))),
+        ("optimize_memory_usage", True),
+        ("n_steps", 3),
+        ("policy_kwargs", {"heads": 0}),
+        ("policy_kwargs", {"pooling": "sum"}),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(made, name, value):
+    with pytest.raises(ValueError, match=r"hyperparameter .+ of viaq must be"):
+        model_on(made(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"policy_kwargs": {"candidates": 1, "refinements": 0, "width": 1, "instants": 2}},
+        {"policy_kwargs": {**FEW, "per_refinement": 1, "checks": 1}},
+        {"policy_kwargs": {**FEW, "checks": 10_000}},
+        {"policy_kwargs": {**FEW, "form": "action", "heads": 2}},
+        {"policy_kwargs": {**FEW, "form": "action", "pooling": "sum"}},
+        {"explore_uniformly": 0.0, "explore_candidates": 2, "next_candidates": 1},
+        {"explore_uniformly": np.int64(1), "next_candidates": 500},
+        {"gamma": 0.0},
+    ],
+)
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", ENV, ONLINE])
+def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id, settings):
+    env = made(env_id)
+    model = model_on(env, **settings).learn(32)
+    assert model._n_updates > 0
+    assert torch.isfinite(weights(model)).all()
+    actions = model.predict(env.reset())[0]
+    assert (np.abs(actions) <= 1.0).all()
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A model after a few updates, and what it decides on."""
+    torch.set_num_threads(1)
+    env = ViaVecEnv(ENV, 8, seed=0, threads=1)
+    model = model_on(env, policy_kwargs={**FEW, "checks": 4}).learn(64)
+    yield model, env.reset()
+    env.close()
+
+
+@pytest.mark.parametrize("checks", [0, 8])
+def test_a_policy_that_is_saved_alone_decides_the_same(learned, checks):
+    model, observation = learned
+    policy, file = copy.deepcopy(model.policy), io.BytesIO()
+    policy.checks = checks
+    policy.save(file)
+    file.seek(0)
+    for other in (ViaQPolicy.load(file), copy.deepcopy(policy)):
+        assert other.checks == checks
+        np.testing.assert_array_equal(other.predict(observation)[0], policy.predict(observation)[0])
+
+
+def test_a_critic_can_be_pickled(learned):
+    model, _ = learned
+    state = pickle.loads(pickle.dumps(model.policy.critic)).state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in model.policy.critic.state_dict().items())
+
+
+def test_what_cannot_be_decided_on_is_named(learned):
+    model, observation = learned
+    policy = model.policy
+    with pytest.raises(ValueError, match="must be a dict of goal, hand, joints, obstacles; got ndarray"):
+        policy.predict(observation["hand"])
+    for parts in ({"hand": observation["hand"]}, {**observation, "wind": observation["hand"]}):
+        with pytest.raises(
+            ValueError, match=r"must have the parts goal, hand, joints, obstacles; got .*hand"
+        ):
+            policy.predict(parts)
+    for value in (np.nan, np.inf):
+        goal = observation["goal"].copy()
+        goal[1, 0] = value
+        with pytest.raises(ValueError, match="observation must be finite; goal is"):
+            policy.predict({**observation, "goal": goal})
+    with pytest.raises(ValueError, match="hand and goal must be apart"):
+        policy.predict({**observation, "goal": observation["hand"]})
+
+
+def test_as_many_proposals_are_checked_as_one_says(learned):
+    model, observation = learned
+    alone, checked = (agent_method("agent", model, n).decide(observation, None) for n in (0, 48))
+    assert not np.array_equal(alone, checked)
+    assert model.policy.checks == 4
+    own = agent_method("agent", model).decide(observation, None)
+    np.testing.assert_array_equal(own, model.predict(observation)[0].astype(np.float64))
+
+
+def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
+    info = dict(zip(TERMS, (1.0, 0.0, 0.1, 0.0, -0.2, -0.3), strict=True))
+    np.testing.assert_allclose(outcome_of(info, 0.6), (1.0, 0.0, 0.1, 0.0, -0.5))
+    assert np.isnan(outcome_of(info, 0.7)).all()
+    assert np.isnan(outcome_of({}, 0.6)).all()
