@@ -1,6 +1,6 @@
 """Everything in docs/results.md, by one command: trainings, evaluations, baselines, the page and its figures.
 
-    python benchmarks/learning.py --jobs 2 --compiled
+    python benchmarks/learning.py --jobs 2
     python benchmarks/learning.py --help
 
 Each training is a run folder and each evaluation a file below --out; whatever is there already is kept, so a second

@@ -37,7 +37,7 @@ OFF_POLICY: dict[str, Any] = {
     "buffer_size": 400,
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
-    "viatd3": {**OFF_POLICY, "fresh_scenes": 4},
+    "viaq": OFF_POLICY,
     "sac": OFF_POLICY,
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
 }

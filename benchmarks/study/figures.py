@@ -16,7 +16,7 @@ from PIL import Image
 
 from study.page import figure_name
 from study.plan import short
-from study.work import ALONE, RANKED
+from study.work import ALONE, CHECKED, UNTRAINED, WAYS
 from viapoint.training.files import write_bytes
 from viapoint.training.frozen_scenes import BANDS
 from viapoint.training.plots import AXES
@@ -24,7 +24,7 @@ from viapoint.training.statistics import interquartile_mean
 
 Numbers = Mapping[str, Any]
 COLOURS = {
-    "viatd3": "#1f5fa8",
+    "viaq": "#1f5fa8",
     "sac": "#d1495b",
     "td3": "#8a6fb3",
     "ppo": "#d98e04",
@@ -34,7 +34,13 @@ COLOURS = {
     "ppo-step": "#7a5002",
     "tqc-step": "#1d4a37",
 }
-SHOWN_BASELINES = {"random80": ("0.55", "D"), "constant": ("0.55", "s"), "stored": ("0.2", "_")}
+SHOWN_BASELINES = {
+    "random80": ("0.55", "D"),
+    "constant": ("0.55", "s"),
+    "search16": ("0.35", "v"),
+    "search512": ("0.35", "<"),
+    "stored": ("0.2", "_"),
+}
 DOTS_PER_INCH, SHADES = 100, 96
 
 
@@ -90,7 +96,12 @@ def _abilities(ax: Axes, numbers: Numbers, name: str) -> None:
     """Success by band with intervals, on one set."""
     bands = [band for band in BANDS if numbers["sets"][name]["bands"][band]]
     rows = [
-        (f"{entry['label']}{', ranked' if way == RANKED else ''}", found, COLOURS[entry["name"]], way)
+        (
+            entry["label"] if way == ALONE else f"{entry['label']}, {WAYS[way]}",
+            found,
+            COLOURS[entry["name"]],
+            way,
+        )
         for entry in numbers["methods"]
         for way, found in entry["sets"].get(name, {}).items()
     ]
@@ -103,7 +114,7 @@ def _abilities(ax: Axes, numbers: Numbers, name: str) -> None:
         x = np.arange(len(bands)) + 0.8 * ((i + 0.5) / len(rows) - 0.5)
         rate, low, high = 100.0 * np.array([found["by_band"][band] for band in bands]).T
         error = np.maximum([rate - low, high - rate], 0.0)
-        marker = {ALONE: "o", RANKED: "^"}.get(kind, kind)
+        marker = {ALONE: "o", CHECKED: "^", UNTRAINED: "x"}.get(kind, kind)
         ax.errorbar(
             x, rate, yerr=error, color=colour, fmt=marker, markersize=4.5, elinewidth=1.0, label=label
         )

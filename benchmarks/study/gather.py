@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from study import work
 from study.plan import ABLATIONS, FREEDOM, FREEDOM_LABELS, WHOLE, Cell, Study, Variant, sets_of
-from study.work import ALONE, RANKED
+from study.work import ALONE, CHECKED, WAYS
 from viapoint.training.baselines import METHODS as BASELINE_METHODS
 from viapoint.training.failures import KINDS
 from viapoint.training.files import read_json
@@ -40,7 +40,7 @@ def gather(study: Study) -> Numbers:
 def conditions(study: Study) -> Numbers:
     """What must be the same for numbers to stand side by side."""
     trial = {"n_timesteps": study.n_timesteps, "n_scenes": study.n_scenes}
-    return {"trial": trial, "candidates": study.candidates}
+    return {"trial": trial, "checks": study.checks}
 
 
 def _environment(env: str, study: Study) -> Numbers:
@@ -117,12 +117,12 @@ def _training(cells: Sequence[Cell], study: Study) -> Numbers:
 
 
 def _agent(cells: Sequence[Cell], name: str, study: Study) -> Numbers:
-    """An agent's two ways to decide on one set; empty unless every seed was measured."""
+    """An agent's ways to decide on one set; empty unless every seed was measured."""
     records = _records(cells, name, study)
     if len(records) < len(cells):
         return {}
     frozen = work.scenes(name, cells[0].env, study)
-    ways = [way for way in (ALONE, RANKED) if way in records[0]["methods"]]
+    ways = [way for way in WAYS if way in records[0]["methods"]]
     return {way: _numbers(records, way, frozen, study) for way in ways}
 
 
@@ -222,7 +222,7 @@ def _failures(env: str, name: str, study: Study) -> Numbers:
     """How often each kind occurs, mean over seeds as a share of all scenes; for each way to decide."""
     records = _records(finished(env, WHOLE, study), name, study)
     number = len(work.scenes(name, env, study).share)
-    ways = [way for way in (ALONE, RANKED) if records and way in records[0]["failures"]]
+    ways = [way for way in (ALONE, CHECKED) if records and way in records[0]["failures"]]
 
     def share(way: str, kind: str, what: str) -> float:
         counts = [record["failures"][way][kind][what] for record in records]
@@ -257,14 +257,16 @@ def improvement(methods: Sequence[Numbers]) -> Numbers:
 
 
 def _compared(env: str, name: str, study: Study) -> Numbers:
-    """The ranked agent against the best of as many random actions tried in simulation, scene by scene."""
+    """Compare the agent with a search that checks as many plans, scene by scene; empty without such a search."""
     frozen = work.scenes(name, env, study)
-    other = work.kept(work.baseline_path(env, name, "random80", study), {"scenes": frozen.sha256})
+    other = work.kept(
+        work.baseline_path(env, name, f"search{study.checks}", study), {"scenes": frozen.sha256}
+    )
     records = _records(finished(env, WHOLE, study), name, study)
     if other is None or not records:
         return {}
     second = work.rate_table([other], next(iter(other["methods"])), "is_success")[0] > 0.5
-    first = work.rate_table(records, RANKED, "is_success") > 0.5
+    first = work.rate_table(records, CHECKED, "is_success") > 0.5
     tests = [mcnemar(row, second) for row in first]
     differences = [test.difference for test in tests]
     return {

@@ -22,13 +22,13 @@ def check_conditions(study: Study, old: Numbers) -> None:
     """Refuse to put numbers beside others that were measured under other conditions.
 
     Raises:
-        ValueError: The old record is of other numbers of decisions, scenes or candidates.
+        ValueError: The old record is of other numbers of decisions, scenes or checks.
     """
     for name, mine in conditions(study).items():
-        if mine != old[name]:
+        if mine != old.get(name):
             raise ValueError(
-                f"{study.docs / 'results.json'} holds results with {name} = {old[name]}, these would be with {mine}: "
-                "name another folder with --docs, or replace them with --alone"
+                f"{study.docs / 'results.json'} holds results with {name} = {old.get(name)}, these would be with "
+                f"{mine}: name another folder with --docs, or replace them with --alone"
             )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from study.plan import FREEDOM_LABELS, WHOLE, short
 from study.prose import FAILURES, FREEDOM, INTRODUCTION, KNOWLEDGE, TAGS
-from study.work import ALONE, PLANNED, RANKED
+from study.work import ALONE, CHECKED, PLANNED, WAYS
 from viapoint.training import monitor
 from viapoint.training.frozen_scenes import BANDS
 
@@ -83,23 +83,18 @@ def _rows(numbers: Numbers, name: str, about: Numbers) -> Rows:
     rows = []
     for entry in numbers["methods"]:
         for way, found in entry["sets"].get(name, {}).items():
-            label = f"{entry['label']}, {'policy alone' if way == ALONE else 'ranked candidates'}"
-            time = _times(numbers, f"{entry['name']} {way}")
+            label = f"{entry['label']}, {WAYS[way]}"
+            time = _ms(numbers["decision_time"].get(f"{entry['name']} {way}"))
             seeds = str(len(entry["seeds"]))
             rows.append([label, seeds, *_success(found, bands), *_beside(found), time, *_effort(entry)])
     for entry in numbers["baselines"]:
         if name in entry["sets"]:
             found = entry["sets"][name]
-            time = _times(numbers, "planner" if entry["name"] == "stored" else entry["name"])
+            time = _ms(
+                numbers["decision_time"].get("planner" if entry["name"] == "stored" else entry["name"])
+            )
             rows.append([entry["label"], "-", *_success(found, bands), *_beside(found), time, *["-"] * 3])
     return [head, *rows] if rows else []
-
-
-def _times(numbers: Numbers, name: str) -> str:
-    """Of one decision, and as machine code where that was timed."""
-    times = numbers["decision_time"]
-    code = f" ({_ms(times[name + ' compiled'])})" if f"{name} compiled" in times else ""
-    return _ms(times.get(name)) + code
 
 
 def _success(found: Numbers, bands: Sequence[str]) -> list[str]:
@@ -131,7 +126,7 @@ def _families(numbers: Numbers, name: str, about: Numbers) -> str:
     rows = [["method", *(f"{family} ({count})" for family, count in families.items())]]
     for entry in numbers["methods"]:
         for way, found in entry["sets"].get(name, {}).items():
-            label = f"{entry['label']}, {'policy alone' if way == ALONE else 'ranked candidates'}"
+            label = f"{entry['label']}, {WAYS[way]}"
             rows.append([label, *(_interval(found["by_family"][family]) for family in families)])
     for entry in numbers["baselines"]:
         if name in entry["sets"]:
@@ -141,7 +136,7 @@ def _families(numbers: Numbers, name: str, about: Numbers) -> str:
 
 
 def _comparison(numbers: Numbers, name: str) -> str:
-    """The critic's ranking against trying as many random actions out."""
+    """Compare checked proposals with a search that checks as many plans."""
     found = numbers["compared"].get(name)
     if not found:
         return ""
@@ -149,14 +144,10 @@ def _comparison(numbers: Numbers, name: str) -> str:
     p = found["p_value"]
     shown = "p < 0.0001" if p < 1e-4 else f"p <= {p:.2g}"
     if not (least or most):
-        return (
-            "The agent with ranked candidates, which simulates none, solves as many scenes as the best of 80 random "
-            "actions that were simulated."
-        )
+        return "The agent with checked proposals solves as many scenes as the search with as many checks."
     return (
-        "Against the best of 80 random actions that were simulated, the agent with ranked candidates, which "
-        f"simulates none, solves {middle:+.1f} points more scenes (median seed; {least:+.1f} to {most:+.1f}); exact "
-        f"McNemar test scene by scene, {shown} in every seed."
+        f"Success of {WHOLE.label} with checked proposals minus that of the search with as many checks: {middle:+.1f} "
+        f"points (median seed; {least:+.1f} to {most:+.1f}); exact McNemar test scene by scene, {shown} in every seed."
     )
 
 
@@ -165,10 +156,9 @@ def _failure_table(found: Numbers, name: str) -> str:
     if not found:
         return ""
     kinds = next(iter(found.values()))
-    ways = {ALONE: "policy alone", RANKED: "ranked candidates"}
     head = ["how it fails"]
     for way in found:
-        head += [ways[way], "another proposal succeeds"]
+        head += [WAYS[way], "another proposal succeeds"]
     rows = [head]
     for kind, about in kinds.items():
         line = [about["words"]]
@@ -199,15 +189,15 @@ def _ablations(env: str, entries: Sequence[Numbers]) -> str:
     lines = [f"## What each part contributes: {short(env)}"]
     whole = entries[0]
     for name in whole["sets"]:
-        rows = [["agent", "seeds", "policy alone", "< 1 %", "ranked candidates", "< 1 %", "jerk / planner"]]
+        rows = [["agent", "seeds", "policy alone", "< 1 %", "checked proposals", "< 1 %", "jerk / planner"]]
         for entry in entries:
             found = entry["sets"].get(name)
             if found:
                 label = "the whole agent" if entry["name"] == WHOLE.name else entry["label"]
-                ways = [found[ALONE], found.get(RANKED)]
+                ways = [found[ALONE], found.get(CHECKED)]
                 cells = [cell for way in ways for cell in _with_rarest(way)]
                 rows.append([label, str(len(entry["seeds"])), *cells, _beside(found[ALONE])[0]])
-        lines += [f"**{name}**; *no candidates* is the column of the policy alone.", _table(rows)]
+        lines += [f"**{name}**:", _table(rows)]
     return "\n\n".join(lines)
 
 
@@ -223,13 +213,13 @@ def _freedom(env: str, found: Numbers, record: Numbers) -> str:
     lines = [FREEDOM.format(planned=PLANNED).replace("pay?", f"pay? {short(env)}", 1).strip()]
     sets = list(dict.fromkeys(name for entry in found["agents"] for name in entry["sets"]))
     for name in sets:
-        rows = [["agent", "seeds", "success (95 %)", *BANDS, "ranked candidates", "jerk / planner"]]
+        rows = [["agent", "seeds", "success (95 %)", *BANDS, "checked proposals", "jerk / planner"]]
         for entry in (each for each in found["agents"] if name in each["sets"]):
             one = entry["sets"][name]
             bands = [
                 _percent(one[ALONE]["by_band"][b][0]) if b in one[ALONE]["by_band"] else "-" for b in BANDS
             ]
-            cells = [_interval(one[ALONE]["success"]), *bands, _with_rarest(one.get(RANKED))[0]]
+            cells = [_interval(one[ALONE]["success"]), *bands, _with_rarest(one.get(CHECKED))[0]]
             rows.append([entry["label"], str(len(entry["seeds"])), *cells, _beside(one[ALONE])[0]])
         lines += [f"**{name}**, policy alone:", _table(rows), _answer(found["agents"], name)]
     if found["planner"]:

@@ -14,15 +14,18 @@ from viapoint.training.baselines import METHODS as BASELINE_METHODS
 from viapoint.training.config import TrainConfig
 from viapoint.training.config_checks import DEFAULT_ENV
 from viapoint.training.frozen_scenes import SETS, shipped_path
-from viapoint.training.policies import ViaPolicy
 from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm
-from viapoint.training.via_td3 import ViaTD3
+from viapoint.training.viaq import ViaQ
+from viapoint.training.viaq_policy import ViaQPolicy
 
 Table = Literal["results", "ablations", "freedom"]
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
 MEASURED = tuple(name for name in SETS if name != "validation")
 """Sets that are measured once training is over; models are chosen on `validation` alone."""
-BASELINES = ("stored", "straight", "constant", "random", "random16", "random80", "ompl")
+BASELINES = (
+    "stored", "straight", "constant", "random", "random16", "random80", "search16", "search64", "search512",
+    "search4096", "ompl",
+)  # fmt: skip
 """Of the results: names of viapoint.training.baselines, and the planner's solutions that are stored with the scenes."""
 VALIDATIONS, CHECKPOINTS = 16, 8
 """Of each training, however long it is."""
@@ -36,9 +39,9 @@ class Variant:
     """Of its folder."""
     label: str
     """In the tables."""
-    algo: Algorithm = "viatd3"
+    algo: Algorithm = "viaq"
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of ViaTD3 or of its policy, instead of the preset's."""
+    """Of ViaQ or of its policy, instead of the preset's."""
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Of the environment."""
     step_wise: bool = False
@@ -61,29 +64,26 @@ TWINS = {whole: step for step, whole in STEP_TASKS.items()}
 ABLATIONS = (
     WHOLE,
     Variant(
-        name="viatd3-no-features",
-        label="no features of the planned movement in the critic",
-        settings={"trajectory_features": False},
-    ),
-    Variant(name="viatd3-one-head", label="one proposal instead of many", settings={"heads": 1}),
-    Variant(
-        name="viatd3-no-augmentation", label="no mirrored and exchanged scenes", settings={"augment": False}
+        name="viaq-action",
+        label="critic of action and obstacle instead of planned poses",
+        settings={"form": "action"},
     ),
     Variant(
-        name="viatd3-no-smoothness", label="no smoothness in the objective", settings={"smoothness": False}
+        name="viaq-sum",
+        label="sum over obstacles (Deep Sets) instead of the minimum",
+        settings={"form": "action", "pooling": "sum"},
     ),
+    Variant(name="viaq-no-refinement", label="no refined candidates", settings={"refinements": 0}),
     Variant(
-        name="viatd3-log-success",
-        label="log-probability of success as the objective",
-        settings={"objective": "log_success"},
+        name="viaq-random", label="random actions only during training", settings={"explore_uniformly": 1.0}
     ),
 )
-"""The whole agent, and what becomes of it without each of its parts; without candidates it is measured anyway."""
+"""The whole agent, and the agent without each of its parts; the column without checks is measured for all of them."""
 FREEDOM = tuple(
     WHOLE
     if (n_via, timing) == (1, "optimal")
     else Variant(
-        name=f"viatd3-k{n_via}-{timing}",
+        name=f"viaq-k{n_via}-{timing}",
         label=f"K = {n_via}, {timing} timing",
         env_kwargs={"n_via": n_via, "timing": timing},
     )
@@ -98,7 +98,7 @@ FREEDOM_LABELS = {each.name: each.label for each in FREEDOM} | {WHOLE.name: "K =
 class Study:
     """Train, evaluate, and write docs/results.md with its figures; a second call goes on where the first stopped.
 
-    Example: python benchmarks/learning.py --jobs 2 --compiled
+    Example: python benchmarks/learning.py --jobs 2
     """
 
     out: Path = Path("runs/study")
@@ -121,10 +121,8 @@ class Study:
     """Processes that train and measure at once, each on its share of the cores; 0 works in this process."""
     baselines: tuple[str, ...] = BASELINES
     """Of the results; `stored` is the planner's solutions from the files of scenes, `planner` searches anew."""
-    candidates: int = 80
-    """Actions that the critic ranks in the second row of an agent."""
-    compiled: bool = False
-    """Time the decisions of viatd3 as machine code, too: a minute or two for each, and a C++ compiler."""
+    checks: int = 16
+    """How many of an agent's proposals are checked by exact geometry in its second row."""
     alone: bool = False
     """Leave out what the page holds and these files do not, such as what was measured on another machine."""
     n_timesteps: int | None = None
@@ -143,7 +141,7 @@ class Study:
             unknown = [each for each in getattr(self, name) if each not in known]
             if unknown:
                 raise ValueError(f"{name} must be among {', '.join(known)}, got {unknown[0]!r}")
-        for name, least in (("jobs", 0), ("candidates", 1)):
+        for name, least in (("jobs", 0), ("checks", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
         if not self.seeds or min(self.seeds) < 0:
@@ -214,19 +212,19 @@ class Cell:
 
 
 def placed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as hyperparameters: ViaTD3's own ones, and those of its policy in `policy_kwargs`.
+    """Settings as hyperparameters: ViaQ's own ones, and those of its policy in `policy_kwargs`.
 
     Raises:
         ValueError: Neither knows one of them.
     """
-    own, policy = (set(inspect.signature(kind.__init__).parameters) for kind in (ViaTD3, ViaPolicy))
+    own, policy = (set(inspect.signature(kind.__init__).parameters) for kind in (ViaQ, ViaQPolicy))
     unknown = sorted(set(settings) - own - policy)
     if unknown:
-        raise ValueError(f"cannot be trained: neither ViaTD3 nor its policy has a setting {unknown[0]!r}")
+        raise ValueError(f"cannot be trained: neither ViaQ nor its policy has a setting {unknown[0]!r}")
     result = {name: value for name, value in settings.items() if name in own}
     others = {name: value for name, value in settings.items() if name not in own}
     if others:
-        result["policy_kwargs"] = {**PRESETS["viatd3"].arguments().get("policy_kwargs", {}), **others}
+        result["policy_kwargs"] = {**PRESETS["viaq"].arguments().get("policy_kwargs", {}), **others}
     return result
 
 

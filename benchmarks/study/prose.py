@@ -4,7 +4,7 @@ INTRODUCTION = """# Results
 
 This page is made by one command from files that the trainings left; no number in it is typed by hand.
 
-    python benchmarks/learning.py --jobs 2 --compiled
+    python benchmarks/learning.py --jobs 2
 
 It trains every method with every seed, measures each agent on the frozen `test` and `hard` scenes, measures the
 baselines on the same scenes, and writes this page, its figures and [results.json](results.json), which holds every
@@ -20,31 +20,28 @@ kept. Of several seeds the number is the interquartile mean (of five seeds: the 
 bands). A method without seeds has the interval over scenes. The bands are those of the *solution share*, the
 fraction of uniformly random actions that solve a scene: easy scenes prove little. Jerk and duration are those of
 successes as multiples of the planner's in the same scene: the median over scenes, then over seeds. Jerk is taken at
-equal duration. Decision: the median time of one decision on one thread, in brackets as machine code
-(`compile_decisions`); of the planner, of a search; of an agent that acts in every control step, of one step. Minutes:
-wall time of a training without validation, median over seeds, with the cores it could use; what else ran on the
-machine makes it longer, never shorter.
+equal duration. Decision: the median time of one decision on one thread; of the planner, of one scene; of an agent that
+acts in every control step, of one step. Minutes: wall time of a training without validation, median over seeds, with
+the cores it could use; other programs on the machine make it longer.
 """
 
-KNOWLEDGE = """## What the critic knows, and what it must learn
+KNOWLEDGE = """## What is computed, and what is learned
 
-By construction it knows the *plan*. An action expands into a minimum-jerk movement by formulas, so the features it
-is given are computed: how near the planned path comes to each obstacle in each stretch (near contact, to a fraction
-of a millimetre), whether it stays within reach, how jerky it is. The terms of the reward that the plan alone decides
-(smoothness, duration, clearance of the plan) are added as formulas and never learnt.
+Computed: the plan of each candidate (an action is a minimum-jerk movement by a formula), its jerk, its duration, and
+the planned poses of the arm. Learned: clearance, contact and success. The critic of `viaq` never computes a distance to
+an obstacle; it is a minimum over obstacles, bodies of the arm and instants, and learns from the terms of the reward.
 
-It must learn what no formula says: what the physics makes of the plan (the arm lags and overshoots, torque is
-limited, a contact anywhere ends all hope of success), so how much clearance is enough; and the actor must learn
-which way round pays, and to find a good movement at once instead of searching for it. Ranking candidates with such
-a critic is close to planning with a model. What was learnt shows in the policy alone, in the rare bands, and in the
-distance to the best of equally many random actions that were tried out in the simulation itself.
+*Policy alone* takes the candidate of the greatest value. *Checked proposals* computes clearance and reach of the most
+promising candidates and takes the best of them; no movement is simulated. *Untrained, checked proposals* does so with
+the same network before training. *Search* checks as many or more plans without a network: it uses the same geometry,
+so the difference between the two is what was learned.
 """
 
 FAILURES = """## Failures, drawn
 
 The shipped agent's in the `hard` scenes of PlanarObstacles-v0, policy alone, from the deepest of a kind to its mildest
 (`viapoint evaluate --pretrained viapoint/PlanarObstacles-v0 --methods agent --scenes hard --failures
-docs/images/failures`). Most are mouths of rings that are entered a few millimetres off; ranking mends most of them.
+docs/images/failures`).
 
 ![The plan enters an obstacle by 5 mm or less](images/failures/graze.png)
 

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from study.plan import FREEDOM, WHOLE, Cell, Study, Variant, sets_of, short
-from viapoint.training.baselines import Method, agent_method, make_method
-from viapoint.training.compiled import CannotCompileError
+from study.plan import FREEDOM, Cell, Study, Variant, sets_of, short
+from viapoint.training.baselines import SEARCHES, Method, agent_method, make_method
 from viapoint.training.config import TrainConfig
 from viapoint.training.config_json import as_json
 from viapoint.training.demo import Certified
@@ -21,6 +20,7 @@ from viapoint.training.evaluate import MethodResult, evaluate
 from viapoint.training.failures import sort_out
 from viapoint.training.files import read_json, write_json
 from viapoint.training.frozen_scenes import FrozenScenes, load
+from viapoint.training.model_files import untrained
 from viapoint.training.runs import Run, load_model
 from viapoint.training.train import one_thread, resolved, train
 
@@ -32,8 +32,14 @@ PLANNED = 200
 """Scenes that the planner solves anew for each degree of freedom."""
 TIMED = 100
 """Scenes of the timing."""
-ALONE, RANKED = "alone", "ranked"
-"""How an agent decides: by one forward pass, or by the critic's ranking."""
+ALONE, CHECKED, UNTRAINED = "alone", "checked", "untrained"
+"""Ways to decide: by the network alone, by checks of its proposals, and by checks of those of the untrained network."""
+WAYS = {
+    ALONE: "policy alone",
+    CHECKED: "checked proposals",
+    UNTRAINED: "untrained, checked proposals",
+}
+"""Names of these in tables."""
 
 
 class Job(NamedTuple):
@@ -141,20 +147,26 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     if found is not None:
         return found
     model: Any = load_model(run.model_folder)
-    methods = [agent_method(ALONE, model)]
-    if hasattr(model.policy, "ranked"):
-        methods.append(agent_method(RANKED, model, study.candidates))
+    methods = [agent_method(way, agent, checks) for way, (agent, checks) in agents(model, study).items()]
     kwargs = dict(cell.variant.env_kwargs)
     results = _results(methods, frozen, cell.env, kwargs)
     with one_thread():
         failures = {
             each.name: sort_out(each, frozen, model, cell.env, **kwargs).counts()
             for each in results
-            if hasattr(model.policy, "ranked")
+            if each.name != UNTRAINED and hasattr(model.policy, "checks")
         }
     record = {**identity, "methods": {each.name: compact(each) for each in results}, "failures": failures}
     run.write_evaluation(path.stem, record)
     return record
+
+
+def agents(model: Any, study: Study) -> dict[str, tuple[Any, int]]:
+    """Return the ways in which an agent is measured: model and number of checks."""
+    found = {ALONE: (model, 0)}
+    if hasattr(model.policy, "checks"):
+        found |= {CHECKED: (model, study.checks), UNTRAINED: (untrained(model), study.checks)}
+    return found
 
 
 def identity_of(frozen: FrozenScenes, model: Path, study: Study) -> dict[str, Any]:
@@ -162,7 +174,7 @@ def identity_of(frozen: FrozenScenes, model: Path, study: Study) -> dict[str, An
     return {
         "scenes": frozen.sha256,
         "weights": hashlib.sha256((model / "weights.safetensors").read_bytes()).hexdigest(),
-        "candidates": study.candidates,
+        "checks": study.checks,
     }
 
 
@@ -223,11 +235,7 @@ def time_decisions(study: Study) -> str:
         for name, source, method in _to_time(env, study):
             if times.get(name, {}).get("source") == source:
                 continue
-            try:
-                (result,) = _results([method()], frozen, env, {"threads": 1}, timed=True)
-            except CannotCompileError as error:
-                print(f"{short(env)}: {error}", flush=True)
-                continue
+            (result,) = _results([method()], frozen, env, {"threads": 1}, timed=True)
             times[name] = {"source": source, "median": float(np.median(result.decision_times))}
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, times)
@@ -238,7 +246,7 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
     """Name, what it depends on, and the method."""
     found: list[tuple[str, str, Callable[[], Method]]] = [
         (name, name, lambda name=name: make_method(name, env, threads=1))  # type: ignore[misc]
-        for name in ("random16", "random80", "planner", "ompl")
+        for name in ("random16", "random80", *SEARCHES, "planner", "ompl")
         if name in study.baselines or (name == "planner" and "stored" in study.baselines)
     ]
     for variant in study.variants("results", env):
@@ -249,21 +257,10 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
         folder = Run(first.folder(study)).model_folder
         model: Any = load_model(folder)
         source = identity_of(scenes("test", env, study), folder, study)["weights"]
-        ways = {ALONE: 0} | ({RANKED: study.candidates} if hasattr(model.policy, "ranked") else {})
-        for way, count in ways.items():
-            method = lambda way=way, model=model, count=count: agent_method(way, model, count)  # noqa: E731
-            found.append((f"{variant.name} {way}", f"{source} {count}", method))
-            if study.compiled and variant == WHOLE:
-                code = lambda way=way, folder=folder, count=count: _compiled(way, folder, count, study)  # noqa: E731
-                found.append((f"{variant.name} {way} compiled", f"{source} {count}", code))
+        for way, (agent, checks) in agents(model, study).items():
+            method = lambda way=way, agent=agent, checks=checks: agent_method(way, agent, checks)  # noqa: E731
+            found.append((f"{variant.name} {way}", f"{source} {checks}", method))
     return found
-
-
-def _compiled(way: str, folder: Path, count: int, study: Study) -> Method:
-    """An agent whose single decisions are machine code, which is kept beside the runs."""
-    model: Any = load_model(folder)
-    model.policy.compile_decisions(count, keep=study.out / "machine_code")
-    return agent_method(way, model, count)
 
 
 def scenes(name: str, env: str, study: Study) -> FrozenScenes:

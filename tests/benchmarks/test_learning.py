@@ -14,9 +14,7 @@ from PIL import Image
 from study import gather, page, work
 from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, placed
 
-from viapoint.training.compiled import CannotCompileError
 from viapoint.training.files import read_json
-from viapoint.training.policies import ViaPolicy
 from viapoint.training.runs import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -24,14 +22,14 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def words(folder, *more):
-    fixed = f"--out {folder}/runs --docs {folder}/docs --envs {ENV} --methods viatd3 --jobs 0"
-    tiny = "--n-timesteps 64 --n-scenes 8 --candidates 8 --tables results --baselines stored random16"
+    fixed = f"--out {folder}/runs --docs {folder}/docs --envs {ENV} --methods viaq --jobs 0"
+    tiny = "--n-timesteps 64 --n-scenes 8 --checks 16 --tables results --baselines stored random16 search16"
     return [*f"{fixed} {tiny}".split(), *more]
 
 
 def study_of(folder, **changes):
-    fixed = {"out": folder / "runs", "docs": folder / "docs", "envs": (ENV,), "methods": ("viatd3",)}
-    tiny = {"n_timesteps": 64, "n_scenes": 8, "candidates": 8, "tables": ("results",)}
+    fixed = {"out": folder / "runs", "docs": folder / "docs", "envs": (ENV,), "methods": ("viaq",)}
+    tiny = {"n_timesteps": 64, "n_scenes": 8, "checks": 16, "tables": ("results",)}
     return Study(**{**fixed, **tiny, "seeds": (0, 1), **changes})
 
 
@@ -55,10 +53,10 @@ def test_the_page_is_made_of_the_files(done):
     assert page.page(record) == text
     success = []
     for seed in (0, 1):
-        run = Run(done / "runs" / "PlanarObstacles-v0" / "viatd3" / f"seed-{seed}")
-        outcomes = read_json(run.folder / "evaluations" / "study-test.json")["methods"]["ranked"]["outcomes"]
+        run = Run(done / "runs" / "PlanarObstacles-v0" / "viaq" / f"seed-{seed}")
+        outcomes = read_json(run.folder / "evaluations" / "study-test.json")["methods"]["checked"]["outcomes"]
         success.append(outcomes["is_success"])
-    cells = cells_of(text, "viatd3, ranked candidates")
+    cells = cells_of(text, "viaq, checked proposals")
     assert cells[1] == "2"
     assert cells[2].startswith(f"{100 * np.mean(success):.1f} % (")
     assert "64" in cells  # decisions
@@ -76,7 +74,7 @@ def test_the_figure_is_small(done):
 
 
 def test_a_second_call_does_nothing_again(done, monkeypatch):
-    assert all(job.done() for job in work.jobs(study_of(done, baselines=("stored", "random16"))))
+    assert all(job.done() for job in work.jobs(study_of(done, baselines=("stored", "random16", "search16"))))
 
     def never(*args, **kwargs):
         pytest.fail("did again what was done")
@@ -96,14 +94,14 @@ def test_what_is_lost_is_measured_again(done, monkeypatch):
         return evaluate(methods, *rest, **kwargs)
 
     monkeypatch.setattr(work, "evaluate", counted)
-    lost = done / "runs" / "PlanarObstacles-v0" / "viatd3" / "seed-1" / "evaluations" / "study-test.json"
+    lost = done / "runs" / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "study-test.json"
     before = lost.read_bytes()
     lost.unlink()
     assert (
         "test" not in gather.gather(study_of(done))["environments"][ENV]["methods"][0]["sets"]
     )  # half is nothing
     assert learning.main(words(done, *STEPS)) == 0
-    assert measured == [["alone", "ranked"]]
+    assert measured == [["alone", "checked", "untrained"]]
     assert lost.read_bytes() == before
     record = json.loads(before)
     lost.write_text(json.dumps({**record, "weights": "of another agent"}))
@@ -125,7 +123,7 @@ def test_a_partial_study_says_which_seeds_are_in(done):
     record = gather.gather(study_of(done, seeds=(0, 1, 2)))
     text = page.page(record)
     assert "Seeds asked for: 0, 1, 2." in text
-    assert "**Not all of them are in**; what there is: PlanarObstacles-v0, viatd3: 0, 1." in text
+    assert "**Not all of them are in**; what there is: PlanarObstacles-v0, viaq: 0, 1." in text
 
 
 def test_a_run_with_other_settings_is_refused_and_left_out(done, capsys):
@@ -140,7 +138,7 @@ def test_decisions_are_timed_once(done):
     study = study_of(done, baselines=("random16",))
     work.time_decisions(study)
     times = read_json(work.timings_path(ENV, study))
-    assert set(times) == {"random16", "viatd3 alone", "viatd3 ranked"}
+    assert set(times) == {"random16", "viaq alone", "viaq checked", "viaq untrained"}
     assert all(0.0 < each["median"] < 10.0 for each in times.values())
     work.time_decisions(study)
     assert read_json(work.timings_path(ENV, study)) == times
@@ -149,29 +147,13 @@ def test_decisions_are_timed_once(done):
     )
 
 
-def test_what_cannot_be_compiled_is_passed_over(done, monkeypatch, capsys):
-    def refused(*_, keep):
-        assert keep.parent == done / "runs"
-        raise CannotCompileError("no compiler here")
-
-    monkeypatch.setattr(ViaPolicy, "compile_decisions", refused)
-    study = study_of(done, baselines=("random16",), compiled=True)
-    work.time_decisions(study)
-    assert "no compiler here" in capsys.readouterr().out
-    assert set(read_json(work.timings_path(ENV, study))) == {"random16", "viatd3 alone", "viatd3 ranked"}
-
-
-def test_times_as_machine_code_stand_in_brackets():
-    times = {"agent": 0.004, "agent compiled": 0.0007, "other": 0.2}
-    shown = [page._times({"decision_time": times}, name) for name in ("agent", "other", "none")]
-    assert shown == ["4 ms (0.7 ms)", "200 ms", "-"]
-
-
 def test_failures_add_up(done):
     record = read_json(done / "docs" / "results.json")["environments"][ENV]
-    for way, found in record["methods"][0]["sets"]["test"].items():
-        share = sum(kind["share"] for kind in record["failures"]["test"][way].values())
-        assert share == pytest.approx(1.0 - np.mean(found["each"]), abs=1e-5)
+    success = record["methods"][0]["sets"]["test"]
+    assert set(record["failures"]["test"]) == {"alone", "checked"}
+    for way, kinds in record["failures"]["test"].items():
+        share = sum(kind["share"] for kind in kinds.values())
+        assert share == pytest.approx(1.0 - np.mean(success[way]["each"]), abs=1e-5)
 
 
 def synthetic(record, names, gains):
@@ -188,7 +170,9 @@ def synthetic(record, names, gains):
 
 def test_ablations_and_freedom_are_told_by_band(done):
     record = read_json(done / "docs" / "results.json")
-    record["ablations"] = {ENV: synthetic(record, [each.name for each in ABLATIONS], np.linspace(0, -0.4, 6))}
+    record["ablations"] = {
+        ENV: synthetic(record, [each.name for each in ABLATIONS], np.linspace(0, -0.4, len(ABLATIONS)))
+    }
     record["freedom"] = {
         ENV: {
             "agents": synthetic(record, [each.name for each in FREEDOM], (0, 0.02, -0.1, 0, 0, 0.2)),
@@ -197,20 +181,20 @@ def test_ablations_and_freedom_are_told_by_band(done):
     }
     text = page.page(record)
     assert "What each part contributes: PlanarObstacles-v0" in text
-    assert cells_of(text, "viatd3-one-head")
+    assert cells_of(text, "viaq-no-refinement")
     answer = next(line for line in text.splitlines() if line.startswith("Best in each band"))
-    assert answer.count("viatd3-k3-learned, +20.0 points, the intervals are apart") == len(
+    assert answer.count("viaq-k3-learned, +20.0 points, the intervals are apart") == len(
         record["environments"][ENV]["sets"]["test"]["bands"]
     )
     record["freedom"][ENV]["agents"].pop()
     answer = next(line for line in page.page(record).splitlines() if line.startswith("Best in each band"))
-    assert "viatd3, " not in answer
+    assert "viaq, " not in answer
     assert "+2.0 points, the intervals overlap" in answer
 
 
 def test_settings_go_where_they_are_taken():
-    assert placed({"augment": False, "width": 8}) == {"augment": False, "policy_kwargs": {"width": 8}}
-    with pytest.raises(ValueError, match="neither ViaTD3 nor its policy has a setting 'colour'"):
+    assert placed({"temperature": 0.2, "width": 8}) == {"temperature": 0.2, "policy_kwargs": {"width": 8}}
+    with pytest.raises(ValueError, match="neither ViaQ nor its policy has a setting 'colour'"):
         placed({"colour": 1})
 
 
@@ -220,7 +204,7 @@ def test_trainings_are_ordered_by_seed_and_shared_between_tables(tmp_path):
     assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
     folders = {cell.folder(Study(out=tmp_path)) for cell in cells}
     assert len(folders) == len(cells)
-    two = next(cell for cell in cells if cell.variant.name == "viatd3-k2-learned")
+    two = next(cell for cell in cells if cell.variant.name == "viaq-k2-learned")
     assert two.training(Study(out=tmp_path)).env_kwargs == {"n_via": 2, "timing": "learned"}
 
 
