@@ -136,7 +136,7 @@ def worth_of_best(
     """Return what :func:`merit` of :func:`check_plans` returns for the best plan of each scene, faster.
 
     Jerk, duration and reach bound the reward of a plan. So clearance is looked at in the order of this bound, until no
-    other plan can be better (branch and bound).
+    other plan can be better (branch and bound). A few plans are all looked at.
 
     Args:
         observation: Parts of B observations, shape (B, .) each.
@@ -147,9 +147,13 @@ def worth_of_best(
         bonus: Reward that the first action gets besides.
 
     Returns:
-        Shape (B, H). Minus infinity where another plan is better or no worse; all of it where no plan is within the
-        margins.
+        Shape (B, H). Where another plan is no worse it may be minus infinity; for all plans of a scene it is only so
+        where none is within the margins.
     """
+    if actions.shape[1] <= FIRST:
+        few = merit(check_plans(observation, actions, task, until), *margins)
+        few[:, 0] += bonus
+        return few
     worth = np.full(actions.shape[:2], -np.inf)
     obstacles = _Obstacles.seen(observation, task)
     for rows in _blocks(obstacles.number, max(1, PLANNED // (actions.shape[1] * NODES))):

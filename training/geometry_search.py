@@ -15,6 +15,7 @@ from viapoint.envs.scenes import Scenes, problems
 from viapoint.envs.task import Task
 from viapoint.training.geometry_checks import (
     CLEARANCE_MARGIN,
+    OUTSIDE,
     REACH_MARGIN,
     check_plans,
     merit,
@@ -182,11 +183,14 @@ class GeometrySearch:
         """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse."""
         worth = worth_of_best(observation, actions, self.task, self._margins, bonus=bonus)
         for rank, horizon in enumerate(HORIZONS if is_replanning(observation) else (), start=1):
-            if (rows := _unsolved(worth)).size:
+            rows = np.flatnonzero(worth.max(axis=-1) < 0.5 * OUTSIDE)
+            if rows.size:
                 some = part(observation, rows)
                 shorter = worth_of_best(some, actions[rows], self.task, self._margins, horizon, bonus)
-                worth[rows] = shorter - rank * SHORTER
-        if (rows := _unsolved(worth)).size:
+                solved = shorter.max(axis=-1) > 0.5 * OUTSIDE
+                worth[rows[solved]] = shorter[solved] - rank * SHORTER
+        rows = np.flatnonzero(np.isneginf(worth).all(axis=-1))
+        if rows.size:
             checks = check_plans(part(observation, rows), actions[rows], self.task)
             worth[rows] = merit(checks, *self._margins)
         return worth
@@ -211,11 +215,6 @@ def _sobol(number: int, size: int) -> Single:
     actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
     actions.flags.writeable = False
     return actions
-
-
-def _unsolved(worth: Float) -> NDArray[np.intp]:
-    """Return the scenes of which no action is known to be worth anything."""
-    return np.flatnonzero(np.isneginf(worth).all(axis=-1))
 
 
 def _top(actions: Numbers, worth: Float) -> tuple[Single, Float]:

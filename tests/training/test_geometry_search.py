@@ -11,7 +11,15 @@ from viapoint.envs.scenes import SHORTEST
 from viapoint.training import geometry_search
 from viapoint.training.baselines import METHODS, ONLINE_METHODS, make_method
 from viapoint.training.frozen_scenes import load
-from viapoint.training.geometry_checks import CLOSE, DEEP, best_plan, check_plans, merit, worth_of_best
+from viapoint.training.geometry_checks import (
+    CLOSE,
+    DEEP,
+    NODES,
+    best_plan,
+    check_plans,
+    merit,
+    worth_of_best,
+)
 from viapoint.training.geometry_search import GeometrySearch
 from viapoint.training.online_trial import new_trial
 from viapoint.training.planned import planned
@@ -130,9 +138,29 @@ def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
     some &= (exact > -0.05) & (exact < CLOSE)
     assert some.sum() > 8
     np.testing.assert_allclose(found[some], exact[some], atol=1e-3)
-    soon = check_plans(observation, actions[:, None], env.task, until=0.2).clearance[:, 0]
-    assert (soon >= found - 1e-4).all()
-    assert (soon > found + 1e-3).any()
+
+
+def test_clearance_after_a_time_does_not_matter():
+    until, number = 0.3, 64
+    env, observation = made("viapoint/PlanarMovingObstacles-v0", number)
+    actions = random_actions(env.task, number)
+    plan = decoded(env, actions[:, None])
+    duration = plan.durations.sum(axis=-1)[:, 0]
+    step = duration / (NODES - 1)
+    every = check_plans(observation, actions[:, None], env.task).clearance[:, 0]
+    found = check_plans(observation, actions[:, None], env.task, until=until).clearance[:, 0]
+    least = []
+    for last in (until - step, until + step):  # no time between two instants is asked for
+        time = last[:, None] * np.linspace(0.0, 1.0, 200)
+        hand = plan.trajectory()(time[:, None])[:, 0]
+        rows = env.scenes.places(time, unturned=np.zeros(number))
+        clearance = clearance_over_time(env.arm, hand, rows, env.scenes.present, whole_arm=False)
+        least.append(clearance.min(axis=(1, 2)))
+    some = (found > -0.05) & (found < CLOSE)
+    assert (found >= every - 1e-4).all()
+    assert (found > every + 1e-3).any()
+    assert (found <= least[0] + 1e-3)[some].all()
+    assert (found >= least[1] - 1e-3)[some].all()
 
 
 @pytest.mark.parametrize(
@@ -179,7 +207,8 @@ def test_looking_at_the_most_promising_plans_first_finds_the_same(env_id):
     np.testing.assert_array_equal(solved, checked.max(axis=-1) > -1e3)
     np.testing.assert_array_equal(worth.argmax(axis=-1)[solved], checked.argmax(axis=-1)[solved])
     assert solved.any()
-    assert not known.all()
+    clear = checked > -1e3
+    assert (clear & ~known).sum() > 0.2 * clear.sum()  # most plans are not looked at
 
 
 @pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
@@ -261,6 +290,22 @@ def test_any_number_of_via_points_is_searched(n_via, timing):
     worth = merit(check_plans(observation, actions[:, None], env.task), *MARGINS)[:, 0]
     straight = np.zeros_like(actions[:, None])
     assert (worth >= merit(check_plans(observation, straight, env.task), *MARGINS)[:, 0] - 1e-4).all()
+
+
+@pytest.mark.parametrize(("duration", "component"), [(0.1, 1.0), (0.5, 0.0), (2.0, -1.0)])
+def test_movements_take_the_time_of_the_greatest_reward(duration, component):
+    env, observation = made("viapoint/PlanarReach-v0", 4, reward_weights={"duration": duration})
+    actions = GeometrySearch(env.task, 16).decide(observation)
+    np.testing.assert_allclose(actions[:, 2], component, atol=1e-6)
+    assert (GeometrySearch(env.task, 1).decide(observation) == 0.0).all()
+
+
+def test_a_refinement_is_around_plans_that_are_worth_something():
+    actions, worth = np.arange(12.0).reshape(2, 3, 2), np.array([[-np.inf, 1.0, -np.inf], [1.0, 2.0, 3.0]])
+    best, value = geometry_search._top(actions, worth)
+    np.testing.assert_array_equal(best[0], np.repeat(actions[0, 1:2], 3, axis=0))
+    np.testing.assert_array_equal(best[1], actions[1, ::-1])
+    np.testing.assert_array_equal(value[1], [3.0, 2.0, 1.0])
 
 
 def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
