@@ -82,7 +82,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
         >>> env = gymnasium.make_vec("viapoint/PlanarReach-v0", num_envs=2).unwrapped
         >>> observation, _ = env.reset(seed=0)
         >>> checks = check_plans(observation, numpy.zeros((2, 1, 3)), env.task)
-        >>> checks.clearance.tolist(), checks.reward.round(3).tolist()
+        >>> checks.clearance.tolist(), checks.reward.astype(float).round(3).tolist()
         ([[1.0], [1.0]], [[1.1], [1.1]])
     """
     found = PlanChecks(*(np.empty(actions.shape[:2], np.float32) for _ in PlanChecks._fields))
@@ -152,7 +152,7 @@ def worth_of_best(
     """
     if actions.shape[1] <= FIRST:
         few = merit(check_plans(observation, actions, task, until), *margins)
-        few[:, 0] += bonus
+        few[:, 0] += np.where(few[:, 0] > 0.5 * OUTSIDE, bonus, 0.0)
         return few
     worth = np.full(actions.shape[:2], -np.inf)
     obstacles = _Obstacles.seen(observation, task)
