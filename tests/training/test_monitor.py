@@ -24,7 +24,7 @@ def run(tmp_path_factory):
             eval_every=64,
             eval_scenes=40,
             env_kwargs={"threads": 1},
-            hyperparameters={"learning_starts": 64, "gradient_steps": 1, "fresh_scenes": 4},
+            hyperparameters={"learning_starts": 64, "gradient_steps": 1},
             progress=False,
         )
     )
@@ -40,7 +40,7 @@ def log(run):
 def test_every_tag_is_in_the_event_file(log):
     tags = (*STANDARD, *monitor.OUTCOMES, *monitor.VALIDATED, *monitor.BAND_TAGS.values())
     assert [tag for tag in tags if tag not in log] == []
-    assert {"train/critic_loss", "time/simulated_seconds"} <= set(log)
+    assert {"train/clearance_loss", "train/arrival_loss", "time/simulated_seconds"} <= set(log)
 
 
 def test_the_log_says_what_the_learning_curve_says(run, log):
