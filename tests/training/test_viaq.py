@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.training.baselines import agent_method
-from viapoint.training.outcome_buffer import outcome_of
+from viapoint.training.outcome_buffer import Outcomes, outcome_of
 from viapoint.training.vec_env import TERMS, ViaVecEnv
 from viapoint.training.viaq import ViaQ
 from viapoint.training.viaq_policy import ViaQPolicy
@@ -217,6 +217,8 @@ def test_as_many_proposals_are_checked_as_one_says(learned):
 
 def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
     info = dict(zip(TERMS, (1.0, 0.0, 0.1, 0.0, -0.2, -0.3), strict=True))
-    np.testing.assert_allclose(outcome_of(info, 0.6), (1.0, 0.0, 0.1, 0.0, -0.5))
+    found = Outcomes(*outcome_of(info, 0.6))
+    told = (found.success, found.contact, found.clearance, found.goal_error, found.rest)
+    np.testing.assert_allclose(told, (1.0, 0.0, 0.1, 0.0, -0.5))
     assert np.isnan(outcome_of(info, 0.7)).all()
     assert np.isnan(outcome_of({}, 0.6)).all()
