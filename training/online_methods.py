@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.courses import clearance_over_time
+from viapoint.training.candidates import sobol_actions
 from viapoint.training.online_trial import OnlineTrial
 from viapoint.training.planned import planned
 from viapoint.training.trial import Trials
-from viapoint.training.viaq_policy import spread_actions
 
 Float = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -76,7 +76,7 @@ class OnlinePlanner:
 
     def _search(self, observation: Observation, scenes: Any) -> Float:
         number, size = len(scenes.start), self._task.action.size
-        actions = np.broadcast_to(spread_actions(FIRST, size), (number, FIRST, size))
+        actions = np.broadcast_to(sobol_actions(FIRST, size), (number, FIRST, size))
         merit = self._merit(observation, actions, scenes)
         best, rows = merit.argmax(axis=1), np.arange(number)
         chosen, worth = actions[rows, best], merit[rows, best]

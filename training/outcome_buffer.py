@@ -15,6 +15,8 @@ from viapoint.training.vec_env import TERMS
 
 Single = NDArray[np.float32]
 
+LOWER = 1e-6
+"""Least change of the clearance term that counts as one."""
 ROUNDING = 1e-4
 """Greatest difference between the reward and the sum of its terms."""
 
@@ -27,7 +29,9 @@ class Outcomes(NamedTuple):
     contact: Single
     """1 where something was touched."""
     clearance: Single
-    """Term of the reward."""
+    """Term of the reward, summed over the episode so far."""
+    lower: Single
+    """1 where that sum is lower than before, so that this decision and none before it is responsible."""
     goal_error: Single
     """Term of the reward."""
     rest: Single
@@ -44,6 +48,8 @@ class OutcomeSamples(NamedTuple):
     reward: Single
     discount: Single
     """Discount of what follows, by the algorithm's gamma or by the time that the decision took."""
+    elapsed: Single
+    """Time that the decision took, [s]; infinite where it is not told, as the whole plan is carried out then."""
     outcomes: Outcomes
 
 
@@ -67,6 +73,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         self.gamma = gamma
         self.time_discount = None if unit is None else TimeDiscount(gamma=gamma, unit=unit, key=key)  # type: ignore[assignment]
         self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
+        self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
             (self.buffer_size, self.n_envs, len(Outcomes._fields)), np.nan, dtype=np.float32
         )
@@ -77,9 +84,19 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         """Keep a transition of every environment."""
         if self.time_discount is not None:
             self.discounts[self.pos] = self.time_discount.of(infos)
+        before = self._clearance_before()
         for i, info in enumerate(infos):
-            self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]))
+            self.elapsed[self.pos, i] = info.get(ELAPSED, np.inf)
+            self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
         DictReplayBuffer.add(self, obs, next_obs, action, reward, done, infos)
+
+    def _clearance_before(self) -> Single:
+        """Return the sums of the clearance terms of the running episodes, shape (N,); NaN where one begins."""
+        if not self.pos and not self.full:
+            return np.full(self.n_envs, np.nan, dtype=np.float32)
+        last = self.pos - 1
+        over = self.dones[last] > 0.5
+        return np.where(over, np.nan, self.outcomes[last, :, Outcomes._fields.index("clearance")])
 
     def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
         """Return `batch_size` decisions drawn with replacement."""
@@ -92,18 +109,29 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
             self.dones[at] * (1.0 - self.timeouts[at]),
             self.rewards[at],
             self.discounts[at],
+            self.elapsed[at],
             Outcomes(*self.outcomes[at].T),
         )
 
 
-def outcome_of(info: Mapping[str, Any], reward: float) -> tuple[float, ...]:
-    """Return the outcome that `info` tells, or NaN where its terms do not sum to the reward."""
+def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
+    """Return the outcome that `info` tells, or NaN where its terms do not sum to the reward.
+
+    Args:
+        info: Of the decision.
+        reward: Of the decision.
+        before: Sum of the clearance terms of the episode's earlier decisions; NaN where there are none.
+    """
+    unknown = (np.nan,) * len(Outcomes._fields)
     if not all(name in info for name in TERMS):
-        return (np.nan,) * len(Outcomes._fields)
+        return unknown
     success, collision, clearance, goal_error, smoothness, duration = (float(info[name]) for name in TERMS)
     total = success + collision + clearance + goal_error + smoothness + duration
     if abs(total - reward) > ROUNDING:
-        return (np.nan,) * len(Outcomes._fields)
+        return unknown
     succeeded = bool(info.get("is_success", success > 0.0))
     contact = bool(info.get("collision", collision < 0.0))
-    return float(succeeded), float(contact), clearance, goal_error, smoothness + duration
+    first = bool(np.isnan(before))
+    lower = first or clearance < -LOWER
+    so_far = clearance if first else before + clearance
+    return float(succeeded), float(contact), so_far, float(lower), goal_error, smoothness + duration

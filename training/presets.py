@@ -130,6 +130,17 @@ REACH_PRESETS: dict[str, Preset] = {
 
 ONLINE_PRESETS: dict[str, Preset] = {
     name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
+} | {
+    "viaq": dataclasses.replace(
+        PRESETS["viaq"],
+        discount_unit=0.1,
+        hyperparameters=(
+            *PRESETS["viaq"].hyperparameters,
+            ("gradient_steps", 6),
+            ("explore_candidates", 32),
+            ("next_candidates", 4),
+        ),
+    ),
 }
 """Where plans are revised on the way: episodes are several decisions, and discounts follow time."""
 

@@ -24,9 +24,10 @@ from torch.nn import functional
 from viapoint.envs.arms import ARMS
 from viapoint.envs.step_episodes import StepRewardWeights
 from viapoint.envs.task import Task
+from viapoint.training.candidates import candidate_actions
 from viapoint.training.hyperparameters import PARTICULAR, check_hyperparameters, check_via_policy
-from viapoint.training.outcome_buffer import OutcomeReplayBuffer, OutcomeSamples
-from viapoint.training.viaq_policy import Values, ViaQPolicy, spread_actions
+from viapoint.training.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
+from viapoint.training.viaq_policy import KEEP, Values, ViaQPolicy
 
 OWN = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
 """Settings that other off-policy algorithms do not have."""
@@ -34,6 +35,8 @@ BOUND = ("arm", "whole_arm", "action")
 """Parts of a task that an agent cannot do without: it plans with them."""
 CLEARANCE_SCALE = 0.4
 """Error of the clearance term that counts one, as a share of the term's weight: 2 cm."""
+KEPT = 0.5
+"""Share of random decisions on the way that keep the plan."""
 CONTACT_WEIGHT = 0.1
 """Weight of the loss for contact beside that for clearance, which tells the same more finely."""
 
@@ -169,36 +172,23 @@ class ViaQ(OffPolicyAlgorithm):
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the critic's predictions, by name."""
         policy, critic = self.policy, self.policy.critic
-        values = Values(
-            *(each[:, 0] for each in critic(policy.inputs(batch.observations, batch.actions[:, None])))
-        )
+        inputs = policy.inputs(batch.observations, batch.actions[:, None])
+        if policy.replanning:
+            inputs = inputs._replace(until=torch.from_numpy(batch.elapsed)[:, None])
+        values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
         ended, discount = torch.from_numpy(batch.ended), torch.from_numpy(batch.discount)
         goes_on = (1.0 - ended) * discount if following is not None else torch.zeros_like(ended)
-        success, contact, clearance, goal_error, rest = (torch.from_numpy(each) for each in batch.outcomes)
-        known = torch.isfinite(success)
-        success, contact, clearance, goal_error, rest = (
-            torch.nan_to_num(each) for each in (success, contact, clearance, goal_error, rest)
-        )
-        clear, arrives = 1.0 - contact, success
+        known = torch.from_numpy(np.isfinite(batch.outcomes.success))
+        outcomes = Outcomes(*(torch.nan_to_num(torch.from_numpy(each)) for each in batch.outcomes))
+        contact, arrives, rest = outcomes.contact, outcomes.success, outcomes.rest
         if following is not None:
-            on = (1.0 - ended) * (1.0 - contact)
-            clear = torch.where(on > 0.0, 1.0 - discount * (1.0 - torch.sigmoid(following.clear)), clear)
-            arrives = torch.where(on > 0.0, discount * torch.sigmoid(following.arrives), arrives)
-            clearance = clearance + goes_on * following.clearance
+            arrives = torch.where(ended > 0.5, arrives, discount * torch.sigmoid(following.arrives))
             rest = rest + goes_on * following.rest
-        carried_out = known & ((contact + success > 0.0) | (ended < 0.5))
+        carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
         losses = {
-            "clearance": _mean(
-                functional.smooth_l1_loss(
-                    values.clearance / self._clearance_scale,
-                    clearance / self._clearance_scale,
-                    beta=0.2,
-                    reduction="none",
-                ),
-                known,
-            ),
-            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.clear, clear), carried_out),
+            "clearance": self._clearance_loss(values.clearance, outcomes, known),
+            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.clear, 1.0 - contact), carried_out),
             "arrival": _mean(_cross_entropy(values.arrives, arrives), known & (contact < 0.5)),
             "rest": 10.0
             * _mean(functional.smooth_l1_loss(values.rest, rest, beta=0.1, reduction="none"), known),
@@ -212,9 +202,18 @@ class ViaQ(OffPolicyAlgorithm):
             )
         return losses
 
-    @property
-    def _clearance_scale(self) -> float:
-        return CLEARANCE_SCALE * max(float(self.policy.task.weights.clearance), 1e-3)
+    def _clearance_loss(self, predicted: Tensor, outcomes: Outcomes, known: Tensor) -> Tensor:
+        """Return the loss of the clearance of what was carried out.
+
+        Where an earlier decision of the episode came nearer to an obstacle, this one was no nearer: then only a
+        prediction below that counts.
+        """
+        scale = CLEARANCE_SCALE * max(float(self.policy.task.weights.clearance), 1e-3)
+        apart = (predicted - outcomes.clearance) / scale
+        apart = torch.where(outcomes.lower > 0.5, apart, apart.clamp(max=0.0))
+        return _mean(
+            functional.smooth_l1_loss(apart, torch.zeros_like(apart), beta=0.2, reduction="none"), known
+        )
 
     @torch.no_grad()
     def _following(self, batch: OutcomeSamples) -> Values | None:
@@ -222,13 +221,15 @@ class ViaQ(OffPolicyAlgorithm):
         policy, critic = self.policy, self.policy.critic_target
         if critic is None or not self.gamma:
             return None
-        every = spread_actions(policy.candidates, policy.task.action.size)
+        every = candidate_actions(policy.task, policy.candidates, replanning=True)
         chosen = np.random.randint(
             min(1, len(every) - 1), len(every), size=(len(batch.ended), self.next_candidates)
         )  # noqa: NPY002
         chosen[:, 0] = 0
         values = critic(policy.inputs(batch.next_observations, every[chosen]))
-        best = critic.value(values).argmax(dim=1, keepdim=True)
+        worth = critic.value(values)
+        worth[:, 0] += KEEP
+        best = worth.argmax(dim=1, keepdim=True)
         return Values(*(each.gather(1, best)[:, 0] for each in values))
 
     def _sample_action(
@@ -237,6 +238,8 @@ class ViaQ(OffPolicyAlgorithm):
         """Return random actions at first and for some environments always, for the others one of the candidates."""
         size = self.policy.task.action.size
         uniform = np.random.uniform(-1.0, 1.0, (n_envs, size)).astype(np.float32)  # noqa: NPY002 - seeded by SB3
+        if self.policy.replanning:  # a plan that is revised at random in every decision hardly ever arrives
+            uniform[np.random.uniform(size=n_envs) < KEPT] = 0.0  # noqa: NPY002
         if self.num_timesteps < learning_starts:
             return uniform, uniform
         observation: Any = self._last_obs

@@ -4,7 +4,6 @@ A collision is a minimum: a movement touches something if it does so anywhere, a
 this structure learns from the outcome of single movements which pair of obstacle and body was responsible:
 
     m(s, a) = min over obstacle parts i, bodies h, instants t of q_h(i seen from h at t)
-    r(s, a) = min over instants t of r(place of the hand at t)
 
 No distance is computed. Each q_h is a small network whose input is the position and orientation of an obstacle in the
 frame of a body, and the body's own planned pose follows from the plan alone. Long obstacles are cut into parts, as an
@@ -22,12 +21,14 @@ from torch import Tensor, nn
 
 from viapoint.envs.task import Task
 
-PART = {2: 0.0625, 3: 0.1}
+PART = {2: 0.0625, 3: 0.15}
 """Greatest half-length of an obstacle part in plane and space, [m]."""
 SCALE = 8.0
 """Lengths are multiplied by this before they enter a network, [1/m]."""
 UNIT = 0.05
 """Length that one unit of a pair network's output stands for, [m]."""
+NOTHING = 1.0
+"""Margin where there is no obstacle, [m]."""
 ROWS = 65_536
 """Pairs that are evaluated together: few enough for the processor's cache."""
 
@@ -170,12 +171,21 @@ class PairMinimum(nn.Module):
         inputs = 4 if not bodies else 2 * dimension + (1 if dimension == 2 else 0)
         self.networks = PairNetworks(max(bodies, 1), inputs, width)
 
-    def forward(self, poses: Poses, parts: Parts, nothing: float = 1.0) -> Tensor:
-        """Return the minimum for each plan, shape (B, H), [m]; `nothing` where a scene has no obstacle.
+    def forward(self, poses: Poses, parts: Parts, until: Tensor | None = None) -> Tensor:
+        """Return the minimum for each plan, shape (B, H), [m]; NOTHING where a scene has no obstacle.
 
         The responsible pair is searched for without gradients; gradients flow through this pair alone.
+
+        Args:
+            poses: Of the plans.
+            parts: Of the obstacles.
+            until: Time after which instants do not count, shape (B, H), [s]; the first one always does.
         """
-        least, where = self._search(poses, parts)
+        late = None
+        if until is not None:
+            late = poses.time > until[..., None]
+            late[..., 0] = False
+        least, where = self._search(poses, parts, late)
         if torch.is_grad_enabled():
             scene, plan = (each.reshape(-1) for each in torch.meshgrid(
                 *(torch.arange(n) for n in least.shape), indexing="ij"))  # fmt: skip
@@ -183,10 +193,12 @@ class PairMinimum(nn.Module):
             picked = self._picked(poses, parts, scene, plan, body, part, instant)
             values = picked.reshape(least.shape)
             least = torch.where(parts.present.any(dim=1)[:, None], values, least)
-        return torch.where(parts.present.any(dim=1)[:, None], least * UNIT, torch.full_like(least, nothing))
+        return torch.where(parts.present.any(dim=1)[:, None], least * UNIT, torch.full_like(least, NOTHING))
 
     @torch.no_grad()
-    def _search(self, poses: Poses, parts: Parts) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    def _search(
+        self, poses: Poses, parts: Parts, late: Tensor | None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Find the least value of each plan, shape (B, H), and its body, part and instant."""
         bodies, _, scenes, plans, instants = poses.centre.shape
         least = torch.full((scenes, plans), torch.inf)
@@ -196,13 +208,21 @@ class PairMinimum(nn.Module):
         for first in range(0, len(scene), several):
             b, k = scene[first : first + several], part[first : first + several]
             values = self._values(poses, parts, b, k)
+            if late is not None:
+                values = values.masked_fill(late[b][:, :, None], torch.inf)
             lowest, at = values.reshape(len(b), plans, -1).min(dim=-1)
             self._reduce(least, where, lowest, at, b, k, instants)
         return least, where  # type: ignore[return-value]
 
     @staticmethod
     def _reduce(
-        least: Tensor, where: tuple[Tensor, ...], lowest: Tensor, at: Tensor, b: Tensor, k: Tensor, instants: int
+        least: Tensor,
+        where: tuple[Tensor, ...],
+        lowest: Tensor,
+        at: Tensor,
+        b: Tensor,
+        k: Tensor,
+        instants: int,
     ) -> None:
         """Take over the values of some pairs of scene and part where they are the least so far."""
         rank = torch.arange(len(b)) - torch.searchsorted(b, b)
@@ -242,7 +262,14 @@ class PairMinimum(nn.Module):
         return values.reshape(bodies, len(b), plans, instants).permute(1, 2, 0, 3)
 
     def _picked(
-        self, poses: Poses, parts: Parts, scene: Tensor, plan: Tensor, body: Tensor, part: Tensor, instant: Tensor
+        self,
+        poses: Poses,
+        parts: Parts,
+        scene: Tensor,
+        plan: Tensor,
+        body: Tensor,
+        part: Tensor,
+        instant: Tensor,
     ) -> Tensor:
         """Values of single pairs, with gradients, shape (N,)."""
         dimension = poses.centre.shape[1]
@@ -255,7 +282,10 @@ class PairMinimum(nn.Module):
             axis = [pointing[:, i] for i in range(dimension)]
         half = parts.half_axis[scene, part]
         features = pair_features(
-            [apart[:, i] for i in range(dimension)], axis, [half[:, i] for i in range(dimension)], parts.radius[scene, part]
+            [apart[:, i] for i in range(dimension)],
+            axis,
+            [half[:, i] for i in range(dimension)],
+            parts.radius[scene, part],
         )
         every = self._evaluate([each.expand(len(self.networks.nearness), -1) for each in features])
         return every.gather(0, body[None])[0]
@@ -267,25 +297,6 @@ class PairMinimum(nn.Module):
         distance = stacked[:, 0] if len(features) == 4 else torch.hypot(stacked[:, 0], stacked[:, 1])
         values: Tensor = self.networks(stacked * SCALE, distance)
         return values
-
-
-class ReachMinimum(nn.Module):
-    """Minimum over instants of a network of the hand's planned place: whether the arm gets there.
-
-    Args:
-        dimension: Spatial dimension D.
-        width: Of the hidden layers.
-    """
-
-    def __init__(self, dimension: int, width: int) -> None:
-        super().__init__()
-        self.network = dense(dimension + 2, width, width, 1)
-
-    def forward(self, hand: Tensor) -> Tensor:
-        """Return the minimum over instants, shape (B, H), for places of shape (B, H, T, D), [m]."""
-        away = hand.norm(dim=-1, keepdim=True), hand[..., :2].norm(dim=-1, keepdim=True)
-        values: Tensor = self.network(torch.cat((hand, *away), dim=-1) * 3.0)
-        return values.squeeze(-1).amin(dim=-1)
 
 
 def dense(*sizes: int) -> nn.Sequential:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -15,15 +14,16 @@ from torch import Tensor, nn
 
 from viapoint.envs.action import frame
 from viapoint.envs.arms import ARMS
+from viapoint.envs.execution import SETTLING
 from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.task import Task
+from viapoint.training.candidates import candidate_actions, normal_steps
 from viapoint.training.geometry_checks import best_plan, check_plans
 from viapoint.training.planned import Observation, direction, is_replanning, planned
 from viapoint.training.viaq_critic import (
     PairMinimum,
     Parts,
     Poses,
-    ReachMinimum,
     bodies_of,
     cut_obstacles,
     dense,
@@ -33,8 +33,12 @@ Form = Literal["places", "action"]
 Pooling = Literal["minimum", "sum"]
 Numbers = NDArray[np.floating[Any]]
 
-EFFORT = 3
-"""Numbers that tell the effort of a plan: log jerk, log duration, relative duration."""
+EFFORT = 4
+"""Numbers that tell the effort of a plan: log jerk, duration, log duration, and time to spare where that is limited."""
+IN_TIME = 20.0
+"""Logits of success for each second to spare, where time is limited, at the beginning."""
+KEEP = 0.1
+"""Difference of Q for which a plan under way is revised."""
 BEST = 8
 """How many of the best candidates are refined in each round."""
 SPREAD = 0.15
@@ -67,8 +71,8 @@ class PlanInputs(NamedTuple):
     """Start, goal and, on the way, the present motion, shape (B, E)."""
     effort: Tensor
     """Shape (B, H, EFFORT)."""
-    hand: Tensor
-    """Planned places of the hand, shape (B, H, T, D), [m]."""
+    reach: Tensor
+    """Least distance of the hand inside the arm's reach, shape (B, H), [m]; negative where the plan leaves it."""
     poses: Poses | None
     """Planned poses of the arm's bodies; None where the critic takes the action itself."""
     parts: Parts | None
@@ -77,6 +81,8 @@ class PlanInputs(NamedTuple):
     """Obstacles in the frame of start and goal, shape (B, n, F)."""
     present: Tensor
     """Shape (B, n), bool."""
+    until: Tensor | None = None
+    """Time after which contact does not count, shape (B, H), [s]: a plan may have been carried out in part."""
 
 
 class _Saturated(torch.autograd.Function):
@@ -98,9 +104,10 @@ class _Saturated(torch.autograd.Function):
 class ViaQCritic(nn.Module):
     """Value of plans: effort, and success as it follows from the least margin of all pairs.
 
-    With the margin m(s, a) and the reach r(s, a), both minima (see :mod:`viapoint.training.viaq_critic`),
+    The margin m(s, a) is learned (see :mod:`viapoint.training.viaq_critic`); the reach r(a), the least distance of the
+    planned hand inside the arm's reach, belongs to the plan and is computed:
 
-        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(r + c(s, a)),
+        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(l r + d + c(s, a)),
         Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(m) + e(s, a)
 
     Args:
@@ -123,14 +130,17 @@ class ViaQCritic(nn.Module):
         self.pairs: Any = None
         if form == "places":
             self.pairs = PairMinimum(d, bodies_of(task), width)
-            self.reach: Any = ReachMinimum(d, 48)
         else:
             outputs = heads if pooling == "minimum" else width
             self.pairs = dense(ends + row + size, width, width, outputs)
             self.pooled = dense(width + ends + size, width, 1) if pooling == "sum" else None
-            self.reach = dense(ends + size, 64, 64, 1)
-        self.rest = dense(ends + size + EFFORT, 64, 64, 3)
-        self.linear = nn.Linear(EFFORT, 1)
+        self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
+        """Logarithm of l in 1/m, and d."""
+        self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
+        nn.init.zeros_(self.rest[-1].weight)
+        nn.init.zeros_(self.rest[-1].bias)
+        self.linear = nn.Parameter(torch.tensor([-task.weights.smoothness, -task.weights.duration, 0.0, 0.0]))
+        """Weights of the numbers of effort: at the beginning those of the task."""
         self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
         """Logarithm of k in 1/m, and b."""
         weights = task.weights
@@ -145,18 +155,20 @@ class ViaQCritic(nn.Module):
         plan = torch.cat((ends, inputs.actions), dim=-1)
         if self.form == "places":
             assert inputs.poses is not None and inputs.parts is not None
-            margin, reach = self.pairs(inputs.poses, inputs.parts), self.reach(inputs.hand)
+            margin = self.pairs(inputs.poses, inputs.parts, inputs.until)
         else:
-            margin, reach = self._of_actions(plan, inputs), self.reach(plan)[..., 0]
-        rest = self.rest(torch.cat((plan, inputs.effort), dim=-1))
+            margin = self._of_actions(plan, inputs)
+        reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
+        # On the way, keeping a plan and making the same plan anew are worth the same: the action itself is not seen.
+        rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
         low, high = CLEARANCE_RANGE
         clearance = _Saturated.apply(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
         return Values(
             margin,
             margin * torch.exp(self.slope[0]) + self.slope[1],
-            reach + rest[..., 1],
-            clearance + rest[..., 2] if self.replanning else clearance,
-            rest[..., 0] + self.linear(inputs.effort)[..., 0],
+            reach + rest[..., 1] + IN_TIME * inputs.effort[..., 3],
+            clearance,
+            rest[..., 0] + inputs.effort @ self.linear,
         )
 
     def value(self, values: Values) -> Tensor:
@@ -216,7 +228,7 @@ class ViaQPolicy(BasePolicy):
         form: Form = "places",
         pooling: Pooling = "minimum",
         heads: int = 1,
-        width: int = 32,
+        width: int = 24,
         instants: int = 16,
         candidates: int = 256,
         refinements: int = 2,
@@ -273,7 +285,11 @@ class ViaQPolicy(BasePolicy):
         places = self.settings["form"] == "places"
         moves = planned(observation, actions, self.task, self.shares)
         relative = moves.duration / self.task.action.centre_duration
-        effort = np.stack((moves.effort, np.log(relative), relative - 1.0), axis=-1)
+        spare = np.zeros_like(relative)
+        if self.replanning:
+            spare = np.clip(observation["time_left"] - moves.duration - SETTLING, -0.2, 0.2)
+        effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
+        reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
         ends, rows, present = seen_from_line(observation, self.task)
         poses = parts = None
         if places and "obstacles" in observation:
@@ -288,25 +304,31 @@ class ViaQPolicy(BasePolicy):
         elif places:
             poses, parts = _nothing(self.task, moves.path)
         return PlanInputs(
-            _tensor(actions), _tensor(ends), _tensor(effort), _tensor(moves.path), poses, parts,
+            _tensor(actions), _tensor(ends), _tensor(effort), _tensor(reach), poses, parts,
             _tensor(rows), torch.from_numpy(present),
         )  # fmt: skip
 
     @torch.no_grad()
     def values(self, observation: Observation, actions: Numbers) -> Numbers:
-        """Return the critic's Q of H actions in each of B scenes, shape (B, H)."""
+        """Return the critic's Q of H actions in each of B scenes, shape (B, H).
+
+        On the way the first action, which keeps the plan, is worth KEEP more: a plan is not revised for less.
+        """
         several = max(ROWS // (actions.shape[1] * self.instants), 1)
         pieces = []
         for first in range(0, len(actions), several):
             some = slice(first, first + several)
             inputs = self.inputs({name: part[some] for name, part in observation.items()}, actions[some])
             pieces.append(self.critic.value(self.critic(inputs)).numpy())
-        return np.concatenate(pieces)
+        values = np.concatenate(pieces)
+        if self.replanning:
+            values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
+        return values
 
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
         """Return candidates, shape (B, N, m), and the critic's Q of each, shape (B, N); the first is the zero action."""
-        number, size = len(observation["hand"]), self.task.action.size
-        actions = np.broadcast_to(spread_actions(self.candidates, size), (number, self.candidates, size))
+        spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
+        actions = np.broadcast_to(spread, (len(observation["hand"]), *spread.shape))
         values = self.values(observation, actions)
         for each in range(self.refinements):
             near = self._near(actions, values, each)
@@ -319,7 +341,7 @@ class ViaQPolicy(BasePolicy):
         best = min(BEST, actions.shape[1])
         top = np.argpartition(-values, best - 1, axis=1)[:, :best]
         chosen = np.take_along_axis(actions, top[..., None], axis=1)
-        steps = spread_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
+        steps = normal_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
         around = chosen[:, np.arange(self.per_refinement) % best]
         return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
@@ -329,12 +351,24 @@ class ViaQPolicy(BasePolicy):
         rows = np.arange(len(actions))
         if not self.checks:
             return actions[rows, values.argmax(axis=1)]
-        count = min(self.checks, actions.shape[1])
-        if self.replanning:  # keeping the plan is always among the checked
-            values[:, 0] = np.inf
-        top = np.argpartition(-values, count - 1, axis=1)[:, :count]
-        checked = np.take_along_axis(actions, top[..., None], axis=1)
+        checked = np.take_along_axis(actions, self._promising(values)[..., None], axis=1)
         return checked[rows, best_plan(check_plans(observation, checked, self.task))]
+
+    def _promising(self, values: Numbers) -> NDArray[np.intp]:
+        """Return indices of the candidates to check, shape (B, checks), from their Q, shape (B, N).
+
+        Refined candidates resemble each other, so at least half are the best of those that are spread evenly.
+        """
+        if self.replanning:  # keeping the plan is always among them
+            values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
+        count = min(self.checks, values.shape[1])
+        refined = min(count // 2, values.shape[1] - self.candidates)
+        spread = min(count - refined, self.candidates)
+        first = np.argpartition(-values[:, : self.candidates], spread - 1, axis=1)[:, :spread]
+        if not refined:
+            return first
+        last = np.argpartition(-values[:, self.candidates :], refined - 1, axis=1)[:, :refined]
+        return np.concatenate((first, last + self.candidates), axis=1)
 
     def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
         """Return the chosen actions, shape (B, m)."""
@@ -416,27 +450,6 @@ def instants_of(number: int) -> NDArray[np.float32]:
     share = np.linspace(0.0, 1.0, 2001)
     gone = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     return np.interp((np.arange(number) + 0.5) / number, 0.7 * gone + 0.3 * share, share).astype(np.float32)
-
-
-@functools.cache
-def spread_actions(count: int, size: int) -> NDArray[np.float32]:
-    """Return the zero action and points spread evenly over the action space (Sobol), shape (count, size)."""
-    points = 2.0 * _sobol(max(count - 1, 1), size, seed=1) - 1.0
-    return np.concatenate((np.zeros((1, size), np.float32), points))[:count]
-
-
-@functools.cache
-def spread_steps(count: int, size: int, seed: int) -> NDArray[np.float32]:
-    """Return steps of a standard normal distribution, evenly spread, shape (count, size)."""
-    uniform = torch.from_numpy(_sobol(count, size, seed=seed + 2)).clamp(1e-4, 1.0 - 1e-4)
-    steps: NDArray[np.float32] = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
-    return steps
-
-
-def _sobol(count: int, size: int, seed: int) -> NDArray[np.float32]:
-    engine: Any = torch.quasirandom.SobolEngine
-    points: NDArray[np.float32] = engine(size, scramble=True, seed=seed).draw(count).numpy()
-    return points
 
 
 def _nothing(task: Task, path: Numbers) -> tuple[Poses, Parts]:

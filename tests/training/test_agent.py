@@ -10,11 +10,12 @@ from viapoint.envs.arms import ARMS
 from viapoint.envs.scenes import Scenes
 from viapoint.envs.task import Task
 from viapoint.training import viaq_policy
+from viapoint.training.candidates import sobol_actions
 from viapoint.training.geometry_checks import best_plan, check_plans
 from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
 from viapoint.training.viaq import ViaQ
-from viapoint.training.viaq_policy import ViaQPolicy, seen_from_line, spread_actions
+from viapoint.training.viaq_policy import ViaQPolicy, seen_from_line
 
 IDS = (
     "viapoint/PlanarReach-v0",
@@ -56,7 +57,7 @@ def policy_for(trial, **kwargs):
 def margins(policy, observation):
     """Margin of 8 actions in each scene, [m]."""
     size = policy.task.action.size
-    actions = np.broadcast_to(spread_actions(8, size), (len(observation["hand"]), 8, size))
+    actions = np.broadcast_to(sobol_actions(8, size), (len(observation["hand"]), 8, size))
     with torch.no_grad():
         return policy.critic(policy.inputs(observation, actions)).margin.numpy()
 
@@ -89,7 +90,7 @@ def test_the_margin_among_obstacles_is_the_least_of_those_from_each(trial, form)
 
 def test_gradients_reach_the_pair_networks(trial):
     policy, observation = policy_for(trial), trial.observe(scenes_of(trial))
-    actions = np.broadcast_to(spread_actions(8, policy.task.action.size), (16, 8, policy.task.action.size))
+    actions = np.broadcast_to(sobol_actions(8, policy.task.action.size), (16, 8, policy.task.action.size))
     policy.critic(policy.inputs(observation, actions)).margin.sum().backward()
     weights = policy.critic.pairs.networks.weights
     if trial.task.scenes.n_obstacles == (0, 0):
