@@ -55,8 +55,8 @@ class PlanChecks(NamedTuple):
     clearance: Single
     """Least clearance over the movement, [m], at most FAR.
 
-    Between DEEP and CLOSE it is right to half a millimetre. Beyond them it is the least of NODES instants, and a
-    little too large.
+    Between DEEP and CLOSE it is right to half a millimetre, if the movement stays within reach. Beyond them it is the
+    least of NODES instants, and a little too large.
     """
     reach_margin: Single
     """Least distance inside the arm's reach, [m]; negative where the movement leaves it."""
@@ -68,8 +68,10 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
     """Compute clearance, reach margin and reward of the plans of H actions in each of B scenes.
 
     Obstacles with velocities go on as they move now. The reward has all terms of
-    :func:`~viapoint.envs.reward.reward_terms`; where an episode is several decisions, success counts if the time that
-    is left suffices. A collision's goal error is not known and counts as none.
+    :func:`~viapoint.envs.reward.reward_terms`. A collision's goal error is not known and counts as none, and movements
+    are not slowed down for the arm's limits. Where an episode is several decisions, the reward is that of the rest of
+    it if nothing changes: success counts if the time that is left suffices, and smoothness is that of
+    :attr:`~viapoint.training.planned.PlannedMovements.effort`.
 
     Args:
         observation: Parts of B observations, shape (B, .) each.

@@ -43,7 +43,11 @@ class GeometrySearch:
 
     The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. Their plans
     are ordered by :func:`~viapoint.training.geometry_checks.best_plan`. Where nothing moves, clearance does not depend
-    on the duration; then all candidates but the first have the duration of the greatest reward.
+    on the duration; then all candidates but the first have the duration of the greatest reward. Candidates that jerk,
+    duration or reach rule out count as checked, though their clearance is not computed.
+
+    Where plans are revised, the plan under way is kept as long as it is clear and no other one is better by KEEP. Where
+    none is clear to its end, one that is clear for the next HORIZONS seconds is taken.
 
     Args:
         task: The task of an environment, or the id of a registered one.
