@@ -137,7 +137,6 @@ ONLINE_PRESETS: dict[str, Preset] = {
         hyperparameters=(
             *PRESETS["viaq"].hyperparameters,
             ("gradient_steps", 6),
-            ("explore_candidates", 32),
             ("next_candidates", 4),
         ),
     ),

@@ -37,6 +37,8 @@ EFFORT = 4
 """Numbers that tell the effort of a plan: log jerk, duration, log duration, and time to spare where that is limited."""
 IN_TIME = 20.0
 """Logits of success for each second to spare, where time is limited, at the beginning."""
+UNLIKELY = 10.0
+"""Merit that is taken off where success is unlikely: more than the range of Q."""
 KEEP = 0.1
 """Difference of Q for which a plan under way is revised."""
 BEST = 8
@@ -179,6 +181,15 @@ class ViaQCritic(nn.Module):
         total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
         return total + values.clearance + values.rest
 
+    def merit(self, values: Values) -> Tensor:
+        """Return Q where success is more likely than not, elsewhere less than any such Q, shape (B, H).
+
+        Where nothing is likely to succeed, Q prefers plans out of reach, which touch nothing as they are not carried
+        out. The probability of success counts there instead.
+        """
+        success = torch.sigmoid(values.clear) * torch.sigmoid(values.arrives)
+        return torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+
     def _of_actions(self, plan: Tensor, inputs: PlanInputs) -> Tensor:
         """Return the margin from actions and obstacles, shape (B, H), [m]."""
         plans, rows = plan.shape[1], inputs.rows.shape[1]
@@ -228,11 +239,11 @@ class ViaQPolicy(BasePolicy):
         form: Form = "places",
         pooling: Pooling = "minimum",
         heads: int = 1,
-        width: int = 24,
+        width: int = 32,
         instants: int = 16,
-        candidates: int = 256,
+        candidates: int = 128,
         refinements: int = 2,
-        per_refinement: int = 64,
+        per_refinement: int = 32,
         checks: int = 0,
         optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
@@ -310,7 +321,7 @@ class ViaQPolicy(BasePolicy):
 
     @torch.no_grad()
     def values(self, observation: Observation, actions: Numbers) -> Numbers:
-        """Return the critic's Q of H actions in each of B scenes, shape (B, H).
+        """Return the critic's merit of H actions in each of B scenes, shape (B, H): Q, but where success is unlikely.
 
         On the way the first action, which keeps the plan, is worth KEEP more: a plan is not revised for less.
         """
@@ -319,14 +330,14 @@ class ViaQPolicy(BasePolicy):
         for first in range(0, len(actions), several):
             some = slice(first, first + several)
             inputs = self.inputs({name: part[some] for name, part in observation.items()}, actions[some])
-            pieces.append(self.critic.value(self.critic(inputs)).numpy())
+            pieces.append(self.critic.merit(self.critic(inputs)).numpy())
         values = np.concatenate(pieces)
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
 
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
-        """Return candidates, shape (B, N, m), and the critic's Q of each, shape (B, N); the first is the zero action."""
+        """Return candidates, shape (B, N, m), the first of them the zero action, and their merits, shape (B, N)."""
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
         actions = np.broadcast_to(spread, (len(observation["hand"]), *spread.shape))
         values = self.values(observation, actions)
@@ -461,4 +472,4 @@ def _nothing(task: Task, path: Numbers) -> tuple[Poses, Parts]:
 
 def _tensor(values: Any) -> Tensor:
     """Return a tensor of single precision; constants that many calls share are copied."""
-    return torch.from_numpy(np.require(values, dtype=np.float32, requirements="CW"))
+    return torch.from_numpy(np.require(values, dtype=np.float32, requirements=["C", "W"]))
