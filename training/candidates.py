@@ -56,7 +56,8 @@ def normal_steps(number: int, size: int, seed: int) -> Single:
     """Return evenly spread steps of the standard normal distribution, shape (number, size)."""
     import torch
 
-    engine: Any = torch.quasirandom.SobolEngine(size, scramble=True, seed=seed)
+    kind: Any = torch.quasirandom.SobolEngine
+    engine = kind(size, scramble=True, seed=seed)
     uniform = engine.draw(number).clamp(1e-4, 1.0 - 1e-4)
     steps: Single = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
     steps.flags.writeable = False
@@ -67,7 +68,8 @@ def sobol_points(number: int, size: int) -> Single:
     """Return points of the Sobol sequence in the unit cube, shape (number, size), without its corner and its middle."""
     import torch
 
-    engine: Any = torch.quasirandom.SobolEngine(size)
+    kind: Any = torch.quasirandom.SobolEngine
+    engine = kind(size)
     engine.fast_forward(2)
     points: Single = engine.draw(number).numpy()
     return points

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from viapoint.envs.action import Plan
 from viapoint.envs.scenes import Scenes, problems
 from viapoint.envs.task import Task
+from viapoint.training.candidates import candidate_actions, sobol_actions
 from viapoint.training.geometry_checks import (
     CLEARANCE_MARGIN,
     OUTSIDE,
@@ -109,16 +109,19 @@ class GeometrySearch:
             scenes: Not looked at; part of the protocol :class:`~viapoint.training.baselines.Method`.
         """
         number = len(observation["hand"])
-        actions = self._candidates(observation)
+        replanning = is_replanning(observation)
+        actions = candidate_actions(self.task, self.n_checks, replanning=replanning)
         tried = np.broadcast_to(actions, (number, *actions.shape))
-        bonus = KEEP if is_replanning(observation) else 0.0
-        best, value = _top(tried, self._worth(observation, tried, bonus))
+        best, value = _top(tried, worth_of_plans(observation, tried, self.task, self._margins))
         for each in range(self.refinements):
-            steps = SPREAD * 0.5**each * self._points(self.per_round + 1, observation, 0.0)[1:]
+            steps = SPREAD * 0.5**each * self._steps(replanning)
             centres = best[:, np.arange(self.per_round) % best.shape[1]]
             near = np.clip(centres + steps, -1.0, 1.0)
             every = np.concatenate((best, near), axis=1)
-            best, value = _top(every, np.concatenate((value, self._worth(observation, near)), axis=1))
+            best, value = _top(
+                every,
+                np.concatenate((value, worth_of_plans(observation, near, self.task, self._margins)), axis=1),
+            )
         return best[:, 0].astype(np.float64)
 
     def predict(
@@ -164,40 +167,43 @@ class GeometrySearch:
             observation["obstacles"] = rows.reshape(1, -1)
         return self.task.action.decode(self.decide(observation), first, last).take(0)
 
-    def _candidates(self, observation: Observation) -> Single:
-        """Return the actions that are checked first, shape (n_checks, m)."""
-        actions = self._points(self.n_checks, observation, self._best_duration())
-        actions[0] = 0.0
-        return actions
+    def _steps(self, replanning: bool) -> Single:
+        """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""
+        task, at = self.task, self.task.action.n_via * self.task.action.dimension
+        if replanning or not at:
+            return sobol_actions(self.per_round + 1, task.action.size)[1:]
+        return np.insert(sobol_actions(self.per_round + 1, task.action.size - 1)[1:], at, 0.0, axis=1)
 
-    def _points(self, number: int, observation: Observation, duration: float) -> Single:
-        """Return zero and points of the action space, shape (number, m), of one duration where nothing moves."""
-        size, at = self.task.action.size, self.task.action.n_via * self.task.action.dimension
-        if is_replanning(observation) or not at:
-            return _sobol(number, size).copy()
-        return np.insert(_sobol(number, size - 1), at, np.float32(duration), axis=1)
 
-    def _best_duration(self) -> float:
-        """Return the duration component of the greatest reward: 5 w_smoothness log(T) - w_duration T is greatest."""
-        weights, (low, high) = self.task.weights, self.task.action.duration_range
-        relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
-        return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
+def worth_of_plans(
+    observation: Observation, actions: Numbers, task: Task, margins: tuple[float, float]
+) -> Float:
+    """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse.
 
-    def _worth(self, observation: Observation, actions: Numbers, bonus: float = 0.0) -> Float:
-        """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse."""
-        worth = worth_of_best(observation, actions, self.task, self._margins, bonus=bonus)
-        for rank, horizon in enumerate(HORIZONS if is_replanning(observation) else (), start=1):
-            rows = np.flatnonzero(worth.max(axis=-1) < 0.5 * OUTSIDE)
-            if rows.size:
-                some = part(observation, rows)
-                shorter = worth_of_best(some, actions[rows], self.task, self._margins, horizon, bonus)
-                solved = shorter.max(axis=-1) > 0.5 * OUTSIDE
-                worth[rows[solved]] = shorter[solved] - rank * SHORTER
-        rows = np.flatnonzero(np.isneginf(worth).all(axis=-1))
+    On the way a first action of zero, which keeps the plan, is worth KEEP more, and where no plan is clear to its end,
+    plans are compared by how long they stay clear.
+
+    Args:
+        observation: Parts of B observations, shape (B, .) each.
+        actions: Shape (B, H, m), in [-1, 1].
+        task: The environment's.
+        margins: Of clearance and reach, [m].
+    """
+    replanning = is_replanning(observation)
+    bonus = KEEP if replanning and not actions[:, 0].any() else 0.0
+    worth = worth_of_best(observation, actions, task, margins, bonus=bonus)
+    for rank, horizon in enumerate(HORIZONS if replanning else (), start=1):
+        rows = np.flatnonzero(worth.max(axis=-1) < 0.5 * OUTSIDE)
         if rows.size:
-            checks = check_plans(part(observation, rows), actions[rows], self.task)
-            worth[rows] = merit(checks, *self._margins)
-        return worth
+            some = part(observation, rows)
+            shorter = worth_of_best(some, actions[rows], task, margins, horizon, bonus)
+            solved = shorter.max(axis=-1) > 0.5 * OUTSIDE
+            worth[rows[solved]] = shorter[solved] - rank * SHORTER
+    rows = np.flatnonzero(np.isneginf(worth).all(axis=-1))
+    if rows.size:
+        checks = check_plans(part(observation, rows), actions[rows], task)
+        worth[rows] = merit(checks, *margins)
+    return worth
 
 
 def task_of(env_id: str, **kwargs: Any) -> Task:
@@ -206,19 +212,6 @@ def task_of(env_id: str, **kwargs: Any) -> Task:
     task: Task = env.unwrapped.task
     env.close()
     return task
-
-
-@functools.cache
-def _sobol(number: int, size: int) -> Single:
-    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
-    from torch.quasirandom import SobolEngine
-
-    engine: Any = SobolEngine(size)  # type: ignore[no-untyped-call]
-    engine.fast_forward(2)  # a corner and the middle
-    points = 2.0 * engine.draw(max(number - 1, 1)).numpy()[: number - 1] - 1.0
-    actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
-    actions.flags.writeable = False
-    return actions
 
 
 def _top(actions: Numbers, worth: Float) -> tuple[Single, Float]:

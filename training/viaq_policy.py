@@ -18,7 +18,8 @@ from viapoint.envs.execution import SETTLING
 from viapoint.envs.reward import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.task import Task
 from viapoint.training.candidates import candidate_actions, normal_steps
-from viapoint.training.geometry_checks import best_plan, check_plans
+from viapoint.training.geometry_checks import CLEARANCE_MARGIN, REACH_MARGIN
+from viapoint.training.geometry_search import worth_of_plans
 from viapoint.training.planned import Observation, direction, is_replanning, planned
 from viapoint.training.viaq_critic import (
     PairMinimum,
@@ -156,7 +157,8 @@ class ViaQCritic(nn.Module):
         ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         plan = torch.cat((ends, inputs.actions), dim=-1)
         if self.form == "places":
-            assert inputs.poses is not None and inputs.parts is not None
+            assert inputs.poses is not None
+            assert inputs.parts is not None
             margin = self.pairs(inputs.poses, inputs.parts, inputs.until)
         else:
             margin = self._of_actions(plan, inputs)
@@ -363,22 +365,21 @@ class ViaQPolicy(BasePolicy):
         if not self.checks:
             return actions[rows, values.argmax(axis=1)]
         checked = np.take_along_axis(actions, self._promising(values)[..., None], axis=1)
-        return checked[rows, best_plan(check_plans(observation, checked, self.task))]
+        worth = worth_of_plans(observation, checked, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
+        return checked[rows, worth.argmax(axis=1)]
 
     def _promising(self, values: Numbers) -> NDArray[np.intp]:
         """Return indices of the candidates to check, shape (B, checks), from their Q, shape (B, N).
 
         Refined candidates resemble each other, so at least half are the best of those that are spread evenly.
         """
-        if self.replanning:  # keeping the plan is always among them
+        if self.replanning:  # keeping the plan is always the first of them
             values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
         count = min(self.checks, values.shape[1])
         refined = min(count // 2, values.shape[1] - self.candidates)
         spread = min(count - refined, self.candidates)
-        first = np.argpartition(-values[:, : self.candidates], spread - 1, axis=1)[:, :spread]
-        if not refined:
-            return first
-        last = np.argpartition(-values[:, self.candidates :], refined - 1, axis=1)[:, :refined]
+        first = np.argsort(-values[:, : self.candidates], axis=1)[:, :spread]
+        last = np.argsort(-values[:, self.candidates :], axis=1)[:, :refined]
         return np.concatenate((first, last + self.candidates), axis=1)
 
     def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
