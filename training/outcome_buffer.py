@@ -106,7 +106,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
             {name: part[at] for name, part in self.observations.items()},
             self.actions[at],
             {name: part[at] for name, part in self.next_observations.items()},
-            self.dones[at] * (1.0 - self.timeouts[at]),
+            np.asarray(self.dones[at] * (1.0 - self.timeouts[at]), dtype=np.float32),
             self.rewards[at],
             self.discounts[at],
             self.elapsed[at],

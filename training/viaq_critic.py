@@ -12,6 +12,7 @@ obstacle is the union of its parts.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -138,7 +139,7 @@ class PairNetworks(nn.Module):
         sizes = (inputs, width, width, 1)
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in itertools.pairwise(sizes):
             scale = (2.0 / fan_in) ** 0.5 if fan_out > 1 else 0.3 / fan_in**0.5
             self.weights.append(nn.Parameter(scale * torch.randn(bodies, fan_out, fan_in)))
             self.biases.append(nn.Parameter(torch.zeros(bodies, fan_out, 1)))
@@ -302,7 +303,7 @@ class PairMinimum(nn.Module):
 def dense(*sizes: int) -> nn.Sequential:
     """Return linear layers with rectifiers between them."""
     layers: list[nn.Module] = []
-    for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for fan_in, fan_out in itertools.pairwise(sizes):
         layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
