@@ -133,13 +133,13 @@ def test_it_takes_the_candidate_of_the_greatest_value(trial):
 def test_of_the_candidates_that_are_checked_it_takes_the_best(trial, checks, monkeypatch):
     policy, observation = policy_for(trial, checks=checks), trial.observe(scenes_of(trial))
     every, values = policy.propose(observation)
-    seen = []
+    seen, worth_of_plans = [], viaq_policy.worth_of_plans
 
-    def observed(observation, actions, task):
+    def observed(observation, actions, *rest, **kwargs):
         seen.append(actions)
-        return check_plans(observation, actions, task)
+        return worth_of_plans(observation, actions, *rest, **kwargs)
 
-    monkeypatch.setattr(viaq_policy, "check_plans", observed)
+    monkeypatch.setattr(viaq_policy, "worth_of_plans", observed)
     decided = policy.decide(observation)
     (checked,) = seen
     assert checked.shape[1] == min(checks, every.shape[1])
