@@ -45,7 +45,19 @@ class SceneExtractor(BaseFeaturesExtractor):
         )
 
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
-        """Shape (B, features_dim)."""
+        """Return features, shape (B, features_dim)."""
+        ends, axes, middle, parts = self._ends(observation)
+        if "obstacles" in observation:
+            parts += self._encoded(*self._obstacles(observation["obstacles"], axes, middle), ends)
+        return torch.cat(parts, dim=-1)
+
+    def rows(self, observation: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what is no obstacle, shape (B, E), obstacles (B, n, F), and their presence (B, n, 1)."""
+        _, axes, middle, parts = self._ends(observation)
+        return torch.cat(parts, dim=-1), *self._obstacles(observation["obstacles"], axes, middle)
+
+    def _ends(self, observation: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+        """Return ends, axes and middle of the line, and all features that are no obstacles."""
         hand, goal = observation["hand"], observation["goal"]
         start = observation.get("start", hand)
         axes = torch.stack(
@@ -60,20 +72,21 @@ class SceneExtractor(BaseFeaturesExtractor):
         parts = [ends]
         parts += [_turned(axes, observation[name]) * self._scale[name] for name in self.turned]
         parts += [observation[name] * self._scale[name] for name in self.plain]
-        if "obstacles" in observation:
-            parts += self._obstacles(observation["obstacles"], axes, middle, ends)
-        return torch.cat(parts, dim=-1)
+        return ends, axes, middle, parts
 
-    def _obstacles(self, flat: Tensor, axes: Tensor, middle: Tensor, ends: Tensor) -> list[Tensor]:
-        """Sum and maximum over the obstacles that are there, shape (B, width) each."""
+    def _obstacles(self, flat: Tensor, axes: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+        """Return obstacles in the frame of the line, shape (B, n, F), and their presence, shape (B, n, 1)."""
         d = self.dimension
         rows = flat.reshape(len(flat), -1, 2 * d + 2)
         centre = _turned(axes.unsqueeze(1), rows[..., :d] - middle.unsqueeze(1))
         half = _turned(axes.unsqueeze(1), rows[..., d : 2 * d])
         half = torch.where(half[..., 1:2] < 0.0, -half, half)  # a bar has no sense of direction
         seen = PLACES * torch.cat((centre, half, rows[..., 2 * d : 2 * d + 1]), dim=-1)
-        about = ends.unsqueeze(1).expand(-1, rows.shape[1], -1)
-        present = (rows[..., -1:] > 0.5).to(flat.dtype)
+        return seen, (rows[..., -1:] > 0.5).to(flat.dtype)
+
+    def _encoded(self, seen: Tensor, present: Tensor, ends: Tensor) -> list[Tensor]:
+        """Return sum and maximum over the obstacles that are there, shape (B, width) each."""
+        about = ends.unsqueeze(1).expand(-1, seen.shape[1], -1)
         encoded = self.each(torch.cat((seen, about), dim=-1)) * present
         return [0.5 * encoded.sum(dim=1), encoded.amax(dim=1)]
 

@@ -21,6 +21,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from viapoint.training.discount import check_discount_unit
@@ -32,6 +33,7 @@ from viapoint.training.limits import (
     check_env_arguments,
     parameter_budget,
 )
+from viapoint.training.minimum_critic import POLICIES as MINIMUM
 from viapoint.training.timed_buffers import timed, unit_of
 from viapoint.training.vec_env import ViaVecEnv
 from viapoint.training.viaq import ViaQ
@@ -47,6 +49,8 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 }
+MINIMUM_CRITIC = "MinimumCriticPolicy"
+"""Name of the policies with a minimum critic."""
 FORMAT = 1
 """Version of the two files."""
 NOT_STORED = frozenset(
@@ -146,11 +150,9 @@ def build(
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
-    kind = ALGORITHMS[algorithm]
-    if policy not in kind.policy_aliases:
-        raise ValueError(
-            f"policy of {algorithm} must be one of {', '.join(kind.policy_aliases)}, got {policy!r}"
-        )
+    kind, policies = ALGORITHMS[algorithm], _policies(algorithm)
+    if policy not in policies:
+        raise ValueError(f"policy of {algorithm} must be one of {', '.join(policies)}, got {policy!r}")
     allowed = _argument_names(kind)
     unknown = sorted(set(hyperparameters) - allowed)
     if unknown:
@@ -161,7 +163,31 @@ def build(
     arguments = {name: _decode(value, size) for name, value in hyperparameters.items()}
     if discount_unit is not None:
         arguments |= _by_time(algorithm, env, arguments, discount_unit)
-    return kind(policy, env, seed=seed, device="cpu", **arguments)
+    network = dict(arguments.get("policy_kwargs") or {})
+    if "critic" in network:
+        policy = _policy_with(network.pop("critic"), algorithm)
+        arguments["policy_kwargs"] = network
+    return kind(policies[policy], env, seed=seed, device="cpu", **arguments)
+
+
+def _policies(algorithm: str) -> dict[str, type[BasePolicy]]:
+    """Return the policies of an algorithm by name."""
+    policies = dict(ALGORITHMS[algorithm].policy_aliases)
+    return policies | ({MINIMUM_CRITIC: MINIMUM[algorithm]} if algorithm in MINIMUM else {})
+
+
+def _policy_with(critic: Any, algorithm: str) -> str:
+    """Return the name of the policy with a critic of this name.
+
+    Raises:
+        ValueError: There is no such critic, or none for the algorithm.
+    """
+    if critic != "minimum" or algorithm not in MINIMUM:
+        raise ValueError(
+            f"critic in policy_kwargs must be minimum, with algo one of {', '.join(MINIMUM)}, "
+            f"got {critic!r} with {algorithm}"
+        )
+    return MINIMUM_CRITIC
 
 
 def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
@@ -189,7 +215,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
             f"only {', '.join(kind.__name__ for kind in names)} on a ViaVecEnv can be saved, "
             f"not {type(model).__name__} on {type(env).__name__}"
         )
-    policies = {kind: name for name, kind in type(model).policy_aliases.items()}
+    policies = {kind: name for name, kind in _policies(names[type(model)]).items()}
     stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
     return {
         "format": FORMAT,

@@ -14,6 +14,8 @@ from viapoint.training.timed_buffers import TimedDictReplayBuffer
 from viapoint.training.vec_env import TERMS
 
 Single = NDArray[np.float32]
+Array = Any
+"""A NumPy array or a torch tensor."""
 
 LOWER = 1e-6
 """Least change of the clearance term that counts as one."""
@@ -24,17 +26,17 @@ ROUNDING = 1e-4
 class Outcomes(NamedTuple):
     """Outcomes of N decisions, shape (N,) each; NaN where the environment tells the sum of the terms only."""
 
-    success: Single
+    success: Array
     """1 for success, 0 for none."""
-    contact: Single
+    contact: Array
     """1 where something was touched."""
-    clearance: Single
+    clearance: Array
     """Term of the reward, summed over the episode so far."""
-    lower: Single
+    lower: Array
     """1 where that sum is lower than before, so that this decision and none before it is responsible."""
-    goal_error: Single
+    goal_error: Array
     """Term of the reward."""
-    rest: Single
+    rest: Array
     """Sum of the terms for smoothness and duration."""
 
 
@@ -73,6 +75,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         self.gamma = gamma
         self.time_discount = None if unit is None else TimeDiscount(gamma=gamma, unit=unit, key=key)  # type: ignore[assignment]
         self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
+        self._begins = False
         self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
             (self.buffer_size, self.n_envs, len(Outcomes._fields)), np.nan, dtype=np.float32
@@ -90,9 +93,14 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
             self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
         DictReplayBuffer.add(self, obs, next_obs, action, reward, done, infos)
 
+    def begin(self) -> None:
+        """Note that all environments begin new episodes, whether or not the last ones had come to an end."""
+        self._begins = True
+
     def _clearance_before(self) -> Single:
         """Return the sums of the clearance terms of the running episodes, shape (N,); NaN where one begins."""
-        if not self.pos and not self.full:
+        begins, self._begins = self._begins, False
+        if begins or (not self.pos and not self.full):
             return np.full(self.n_envs, np.nan, dtype=np.float32)
         last = self.pos - 1
         over = self.dones[last] > 0.5

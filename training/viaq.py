@@ -132,6 +132,13 @@ class ViaQ(OffPolicyAlgorithm):
         self._check_env(wrapped)
         super().set_env(wrapped, force_reset)
 
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        before = self._last_obs
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self._last_obs is not before and self.replay_buffer is not None:  # the environment was reset
+            self.replay_buffer.begin()
+        return prepared
+
     def _check_env(self, env: VecEnv) -> None:
         mine, theirs = (
             task.as_dict() for task in (Task.from_dict(self.policy_kwargs["task"], ARMS), task_of(env))
@@ -222,9 +229,8 @@ class ViaQ(OffPolicyAlgorithm):
         if critic is None or not self.gamma:
             return None
         every = candidate_actions(policy.task, policy.candidates, replanning=True)
-        chosen = np.random.randint(
-            min(1, len(every) - 1), len(every), size=(len(batch.ended), self.next_candidates)
-        )  # noqa: NPY002
+        shape = len(batch.ended), self.next_candidates
+        chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
         chosen[:, 0] = 0
         values = critic(policy.inputs(batch.next_observations, every[chosen]))
         worth = critic.value(values)

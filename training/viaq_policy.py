@@ -98,7 +98,7 @@ class _Saturated(torch.autograd.Function):
         return values.clamp(low, high)
 
     @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (values,), (low, high) = context.saved_tensors, context.bounds
         outwards = ((values > high) & (gradient < 0.0)) | ((values < low) & (gradient > 0.0))
         return torch.where(outwards, 0.0, gradient), None, None
@@ -140,8 +140,8 @@ class ViaQCritic(nn.Module):
         self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
         """Logarithm of l in 1/m, and d."""
         self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
-        nn.init.zeros_(self.rest[-1].weight)
-        nn.init.zeros_(self.rest[-1].bias)
+        for parameter in self.rest[-1].parameters():
+            nn.init.zeros_(parameter)
         self.linear = nn.Parameter(torch.tensor([-task.weights.smoothness, -task.weights.duration, 0.0, 0.0]))
         """Weights of the numbers of effort: at the beginning those of the task."""
         self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
@@ -166,7 +166,8 @@ class ViaQCritic(nn.Module):
         # On the way, keeping a plan and making the same plan anew are worth the same: the action itself is not seen.
         rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
         low, high = CLEARANCE_RANGE
-        clearance = _Saturated.apply(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        clip: Any = _Saturated.apply
+        clearance = clip(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
         return Values(
             margin,
             margin * torch.exp(self.slope[0]) + self.slope[1],
@@ -190,7 +191,8 @@ class ViaQCritic(nn.Module):
         out. The probability of success counts there instead.
         """
         success = torch.sigmoid(values.clear) * torch.sigmoid(values.arrives)
-        return torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+        merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+        return merit
 
     def _of_actions(self, plan: Tensor, inputs: PlanInputs) -> Tensor:
         """Return the margin from actions and obstacles, shape (B, H), [m]."""
@@ -206,7 +208,8 @@ class ViaQCritic(nn.Module):
         present = inputs.present[:, None, :, None]
         if self.pooled is not None:
             summed = (values.relu() * present).sum(dim=2)
-            return 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
+            pooled: Tensor = 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
+            return pooled
         far = torch.where(present, values, torch.full_like(values, 20.0))
         margin: Tensor = 0.05 * far.amin(dim=(2, 3)) if rows else torch.ones_like(plan[..., 0])
         return margin
@@ -224,7 +227,8 @@ class ViaQPolicy(BasePolicy):
         pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
         heads: Networks for the action form, of which the minimum is taken.
         width: Of the hidden layers of the pair networks.
-        instants: Instants of a plan at which the arm's planned places are taken.
+        instants: Instants of a plan at which the arm's planned places are taken; if not given, 16 where every link
+            must clear, and 32 where the hand alone must.
         candidates: Actions that are spread evenly over the action space (Sobol points).
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
@@ -242,7 +246,7 @@ class ViaQPolicy(BasePolicy):
         pooling: Pooling = "minimum",
         heads: int = 1,
         width: int = 32,
-        instants: int = 16,
+        instants: int | None = None,
         candidates: int = 128,
         refinements: int = 2,
         per_refinement: int = 32,
@@ -262,8 +266,8 @@ class ViaQPolicy(BasePolicy):
         self.replanning = is_replanning(observation_space.spaces)
         self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
         self.checks = checks
-        self.instants = instants
-        self.shares = instants_of(instants)
+        self.instants = instants or (16 if self.task.whole_arm else 32)
+        self.shares = instants_of(self.instants)
         self.settings: dict[str, Any] = {"form": form, "pooling": pooling, "heads": heads, "width": width}
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
@@ -363,10 +367,10 @@ class ViaQPolicy(BasePolicy):
         actions, values = self.propose(observation)
         rows = np.arange(len(actions))
         if not self.checks:
-            return actions[rows, values.argmax(axis=1)]
+            return np.asarray(actions[rows, values.argmax(axis=1)])
         checked = np.take_along_axis(actions, self._promising(values)[..., None], axis=1)
         worth = worth_of_plans(observation, checked, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
-        return checked[rows, worth.argmax(axis=1)]
+        return np.asarray(checked[rows, worth.argmax(axis=1)])
 
     def _promising(self, values: Numbers) -> NDArray[np.intp]:
         """Return indices of the candidates to check, shape (B, checks), from their Q, shape (B, N).
