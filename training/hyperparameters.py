@@ -139,7 +139,7 @@ VIA_POLICY: dict[str, Allowed] = {
     "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
     "heads": _whole(1),
     "width": _whole(1),
-    "instants": _whole(2),
+    "instants": _or(_whole(2), NONE),
     "candidates": _whole(1),
     "refinements": _whole(0),
     "per_refinement": _whole(1),

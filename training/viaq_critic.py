@@ -202,8 +202,8 @@ class PairMinimum(nn.Module):
     ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Find the least value of each plan, shape (B, H), and its body, part and instant."""
         bodies, _, scenes, plans, instants = poses.centre.shape
-        least = torch.full((scenes, plans), torch.inf)
-        where = tuple(torch.zeros((scenes, plans), dtype=torch.long) for _ in range(3))
+        least = torch.full((scenes, parts.present.shape[1], plans), torch.inf)
+        at = torch.zeros(least.shape, dtype=torch.long)
         scene, part = torch.nonzero(parts.present, as_tuple=True)
         several = max(ROWS // (bodies * plans * instants), 1)
         for first in range(0, len(scene), several):
@@ -211,33 +211,10 @@ class PairMinimum(nn.Module):
             values = self._values(poses, parts, b, k)
             if late is not None:
                 values = values.masked_fill(late[b][:, :, None], torch.inf)
-            lowest, at = values.reshape(len(b), plans, -1).min(dim=-1)
-            self._reduce(least, where, lowest, at, b, k, instants)
-        return least, where  # type: ignore[return-value]
-
-    @staticmethod
-    def _reduce(
-        least: Tensor,
-        where: tuple[Tensor, ...],
-        lowest: Tensor,
-        at: Tensor,
-        b: Tensor,
-        k: Tensor,
-        instants: int,
-    ) -> None:
-        """Take over the values of some pairs of scene and part where they are the least so far."""
-        rank = torch.arange(len(b)) - torch.searchsorted(b, b)
-        for each in range(int(rank.max()) + 1 if len(b) else 0):
-            some = rank == each
-            rows = b[some]
-            lower = lowest[some] < least[rows]
-            found = at[some]
-            for target, value in zip(
-                (least, *where),
-                (lowest[some], found // instants, k[some][:, None].expand_as(found), found % instants),
-                strict=True,
-            ):
-                target[rows] = torch.where(lower, value, target[rows])
+            least[b, k], at[b, k] = values.reshape(len(b), plans, -1).min(dim=-1)
+        lowest, nearest = least.min(dim=1)
+        found = at.gather(1, nearest[:, None])[:, 0]
+        return lowest, (found // instants, nearest, found % instants)
 
     def _values(self, poses: Poses, parts: Parts, b: Tensor, k: Tensor) -> Tensor:
         """Values of pairs of scene b and part k for every plan, body and instant, shape (P, H, L, T)."""

@@ -20,7 +20,7 @@ from viapoint.envs.task import Task
 from viapoint.training.candidates import candidate_actions, normal_steps
 from viapoint.training.geometry_checks import CLEARANCE_MARGIN, REACH_MARGIN
 from viapoint.training.geometry_search import worth_of_plans
-from viapoint.training.planned import Observation, direction, is_replanning, planned
+from viapoint.training.planned import Observation, direction, is_replanning, part, planned
 from viapoint.training.viaq_critic import (
     PairMinimum,
     Parts,
@@ -46,8 +46,8 @@ BEST = 8
 """How many of the best candidates are refined in each round."""
 SPREAD = 0.15
 """Standard deviation of the first round of refinement; each further round halves it."""
-ROWS = 16_384
-"""Plans whose values are computed together."""
+PLACES = 1 << 16
+"""Places of plans that are computed together, so that temporary arrays stay in the cache."""
 
 
 class Values(NamedTuple):
@@ -65,25 +65,31 @@ class Values(NamedTuple):
     """Predicted sum of the terms for smoothness and duration."""
 
 
+class SceneInputs(NamedTuple):
+    """Inputs of the critic that belong to B scenes."""
+
+    ends: Tensor
+    """Start, goal and, on the way, the present motion, shape (B, E)."""
+    rows: Tensor
+    """Obstacles in the frame of start and goal, shape (B, n, F)."""
+    present: Tensor
+    """Shape (B, n), bool."""
+    parts: Parts | None
+    """Parts of the obstacles; None where the critic takes the action itself."""
+
+
 class PlanInputs(NamedTuple):
     """Inputs of the critic: H plans in each of B scenes."""
 
+    scene: SceneInputs
     actions: Tensor
     """Shape (B, H, m)."""
-    ends: Tensor
-    """Start, goal and, on the way, the present motion, shape (B, E)."""
     effort: Tensor
     """Shape (B, H, EFFORT)."""
     reach: Tensor
     """Least distance of the hand inside the arm's reach, shape (B, H), [m]; negative where the plan leaves it."""
     poses: Poses | None
     """Planned poses of the arm's bodies; None where the critic takes the action itself."""
-    parts: Parts | None
-    """Parts of the obstacles for the planned poses."""
-    rows: Tensor
-    """Obstacles in the frame of start and goal, shape (B, n, F)."""
-    present: Tensor
-    """Shape (B, n), bool."""
     until: Tensor | None = None
     """Time after which contact does not count, shape (B, H), [s]: a plan may have been carried out in part."""
 
@@ -154,14 +160,12 @@ class ViaQCritic(nn.Module):
 
     def forward(self, inputs: PlanInputs) -> Values:
         """Return the predictions for each plan."""
-        ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         plan = torch.cat((ends, inputs.actions), dim=-1)
         if self.form == "places":
-            assert inputs.poses is not None
-            assert inputs.parts is not None
-            margin = self.pairs(inputs.poses, inputs.parts, inputs.until)
+            margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
         else:
-            margin = self._of_actions(plan, inputs)
+            margin = self._of_actions(plan, inputs.scene)
         reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
         # On the way, keeping a plan and making the same plan anew are worth the same: the action itself is not seen.
         rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
@@ -194,18 +198,18 @@ class ViaQCritic(nn.Module):
         merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
         return merit
 
-    def _of_actions(self, plan: Tensor, inputs: PlanInputs) -> Tensor:
+    def _of_actions(self, plan: Tensor, scene: SceneInputs) -> Tensor:
         """Return the margin from actions and obstacles, shape (B, H), [m]."""
-        plans, rows = plan.shape[1], inputs.rows.shape[1]
+        plans, rows = plan.shape[1], scene.rows.shape[1]
         pairs = torch.cat(
             (
                 plan[:, :, None].expand(-1, -1, rows, -1),
-                inputs.rows[:, None].expand(-1, plans, -1, -1),
+                scene.rows[:, None].expand(-1, plans, -1, -1),
             ),
             dim=-1,
         )
         values = self.pairs(pairs)
-        present = inputs.present[:, None, :, None]
+        present = scene.present[:, None, :, None]
         if self.pooled is not None:
             summed = (values.relu() * present).sum(dim=2)
             pooled: Tensor = 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
@@ -226,7 +230,8 @@ class ViaQPolicy(BasePolicy):
         form: Input of the critic's pair networks: `places` or `action`.
         pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
         heads: Networks for the action form, of which the minimum is taken.
-        width: Of the hidden layers of the pair networks.
+        width: Of the hidden layers of the pair networks; if not given, 32 for planned places where every link must
+            clear, 16 where the hand alone must, and 160 for the action itself.
         instants: Instants of a plan at which the arm's planned places are taken; if not given, 16 where every link
             must clear, and 32 where the hand alone must.
         candidates: Actions that are spread evenly over the action space (Sobol points).
@@ -245,7 +250,7 @@ class ViaQPolicy(BasePolicy):
         form: Form = "places",
         pooling: Pooling = "minimum",
         heads: int = 1,
-        width: int = 32,
+        width: int | None = None,
         instants: int | None = None,
         candidates: int = 128,
         refinements: int = 2,
@@ -268,6 +273,7 @@ class ViaQPolicy(BasePolicy):
         self.checks = checks
         self.instants = instants or (16 if self.task.whole_arm else 32)
         self.shares = instants_of(self.instants)
+        width = width or (160 if form == "action" else 32 if self.task.whole_arm else 16)
         self.settings: dict[str, Any] = {"form": form, "pooling": pooling, "heads": heads, "width": width}
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
@@ -297,20 +303,11 @@ class ViaQPolicy(BasePolicy):
             "checks": self.checks,
         }
 
-    def inputs(self, observation: Observation, actions: Numbers) -> PlanInputs:
-        """Return what the critic sees of H actions in each of B scenes, shape (B, H, m)."""
-        places = self.settings["form"] == "places"
-        moves = planned(observation, actions, self.task, self.shares)
-        relative = moves.duration / self.task.action.centre_duration
-        spare = np.zeros_like(relative)
-        if self.replanning:
-            spare = np.clip(observation["time_left"] - moves.duration - SETTLING, -0.2, 0.2)
-        effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
-        reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
+    def scene(self, observation: Observation) -> SceneInputs:
+        """Return what the critic sees of B scenes, whatever the plan."""
         ends, rows, present = seen_from_line(observation, self.task)
-        poses = parts = None
-        if places and "obstacles" in observation:
-            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * self.shares)
+        parts = None
+        if self.settings["form"] == "places" and "obstacles" in observation:
             obstacles = self.task.observation.obstacles(observation["obstacles"])
             whole = np.concatenate(
                 (obstacles.centre, obstacles.half_axis, obstacles.radius[..., None]), axis=-1
@@ -318,39 +315,54 @@ class ViaQPolicy(BasePolicy):
             velocity = observation.get("obstacle_velocities")
             moving = None if velocity is None else velocity.reshape(obstacles.centre.shape)
             parts = cut_obstacles(whole, obstacles.present > 0.5, moving)
-        elif places:
-            poses, parts = _nothing(self.task, moves.path)
-        return PlanInputs(
-            _tensor(actions), _tensor(ends), _tensor(effort), _tensor(reach), poses, parts,
-            _tensor(rows), torch.from_numpy(present),
-        )  # fmt: skip
+        elif self.settings["form"] == "places":
+            none = np.zeros((len(ends), 1, 2 * self.task.arm.dimension + 1))
+            parts = cut_obstacles(none, np.zeros((len(ends), 1), dtype=bool))
+        return SceneInputs(_tensor(ends), _tensor(rows), torch.from_numpy(present), parts)
+
+    def inputs(
+        self, observation: Observation, actions: Numbers, scene: SceneInputs | None = None
+    ) -> PlanInputs:
+        """Return what the critic sees of H actions in each of B scenes, shape (B, H, m)."""
+        moves = planned(observation, actions, self.task, self.shares)
+        relative = moves.duration / self.task.action.centre_duration
+        spare = np.zeros_like(relative)
+        if self.replanning:
+            spare = np.clip(observation["time_left"] - moves.duration - SETTLING, -0.2, 0.2)
+        effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
+        reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
+        poses = None
+        if self.settings["form"] == "places":
+            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * self.shares)
+        scene = scene or self.scene(observation)
+        return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
 
     @torch.no_grad()
-    def values(self, observation: Observation, actions: Numbers) -> Numbers:
+    def values(self, observation: Observation, actions: Numbers, scene: SceneInputs | None = None) -> Numbers:
         """Return the critic's merit of H actions in each of B scenes, shape (B, H): Q, but where success is unlikely.
 
         On the way the first action, which keeps the plan, is worth KEEP more: a plan is not revised for less.
         """
-        several = max(ROWS // (actions.shape[1] * self.instants), 1)
-        pieces = []
-        for first in range(0, len(actions), several):
-            some = slice(first, first + several)
-            inputs = self.inputs({name: part[some] for name, part in observation.items()}, actions[some])
-            pieces.append(self.critic.merit(self.critic(inputs)).numpy())
-        values = np.concatenate(pieces)
+        values: Numbers = self.critic.merit(self.critic(self.inputs(observation, actions, scene))).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
 
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
         """Return candidates, shape (B, N, m), the first of them the zero action, and their merits, shape (B, N)."""
+        block = max(PLACES // (self.candidates * self.instants), 1)
+        number = len(observation["hand"])
+        if number > block:
+            pieces = [self.propose(part(observation, slice(i, i + block))) for i in range(0, number, block)]
+            actions, values = (np.concatenate(each) for each in zip(*pieces, strict=True))
+            return actions, values
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
-        actions = np.broadcast_to(spread, (len(observation["hand"]), *spread.shape))
-        values = self.values(observation, actions)
+        actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
+        values = self.values(observation, actions, scene)
         for each in range(self.refinements):
             near = self._near(actions, values, each)
             actions = np.concatenate((actions, near), axis=1)
-            values = np.concatenate((values, self.values(observation, near)), axis=1)
+            values = np.concatenate((values, self.values(observation, near, scene)), axis=1)
         return actions, values
 
     def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
@@ -391,7 +403,7 @@ class ViaQPolicy(BasePolicy):
         return self._predict(observation, deterministic)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        arrays = {name: part.cpu().numpy() for name, part in observation.items()}
+        arrays = {name: each.cpu().numpy() for name, each in observation.items()}
         return torch.from_numpy(np.ascontiguousarray(self.decide(arrays), dtype=np.float32))
 
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
@@ -414,9 +426,9 @@ class ViaQPolicy(BasePolicy):
             raise ValueError(
                 f"observation must have the parts {wanted}; got {', '.join(map(str, observation))}"
             )
-        for name, part in observation.items():
-            if not np.isfinite(np.asarray(part)).all():
-                raise ValueError(f"observation must be finite; {name} is {np.asarray(part)}")
+        for name, each in observation.items():
+            if not np.isfinite(np.asarray(each)).all():
+                raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
         apart = np.asarray(observation["goal"]) != np.asarray(observation["hand"])
         if not self.replanning and not apart.any(axis=-1).all():
             raise ValueError("hand and goal must be apart: where they are the same there is no movement")
@@ -466,13 +478,6 @@ def instants_of(number: int) -> NDArray[np.float32]:
     share = np.linspace(0.0, 1.0, 2001)
     gone = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     return np.interp((np.arange(number) + 0.5) / number, 0.7 * gone + 0.3 * share, share).astype(np.float32)
-
-
-def _nothing(task: Task, path: Numbers) -> tuple[Poses, Parts]:
-    """Return poses and obstacles of scenes without obstacles."""
-    scenes, d = len(path), task.arm.dimension
-    poses = Poses(_tensor(np.moveaxis(path, -1, 0)[None]), None, _tensor(np.zeros(path.shape[:3])))
-    return poses, cut_obstacles(np.zeros((scenes, 1, 2 * d + 1)), np.zeros((scenes, 1), dtype=bool))
 
 
 def _tensor(values: Any) -> Tensor:
