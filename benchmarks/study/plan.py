@@ -27,7 +27,7 @@ BASELINES = (
     "search4096", "ompl",
 )  # fmt: skip
 """Of the results: names of viapoint.training.baselines, and the planner's solutions that are stored with the scenes."""
-VALIDATIONS, CHECKPOINTS = 16, 8
+VALIDATIONS, CHECKPOINTS = 8, 2
 """Of each training, however long it is."""
 
 
