@@ -41,7 +41,7 @@ class Variant:
     """In the tables."""
     algo: Algorithm = "viaq"
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of ViaQ or of its policy, instead of the preset's."""
+    """Of the algorithm, or of ViaQ's policy, instead of the preset's."""
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Of the environment."""
     step_wise: bool = False
@@ -69,9 +69,33 @@ ABLATIONS = (
         settings={"form": "action"},
     ),
     Variant(
+        name="viaq-action-heads",
+        label="the same with 8 heads",
+        settings={"form": "action", "heads": 8},
+    ),
+    Variant(
         name="viaq-sum",
-        label="sum over obstacles (Deep Sets) instead of the minimum",
+        label="critic of action and scene: sum over obstacles (Deep Sets) instead of the minimum",
         settings={"form": "action", "pooling": "sum"},
+    ),
+    Variant(
+        name="sac-minimum",
+        label="actor of SAC instead of candidates, minimum critic of action and obstacle",
+        algo="sac",
+        settings={"policy_kwargs": {"critic": "minimum"}},
+    ),
+    Variant(
+        name="td3-minimum",
+        label="actor of TD3 instead of candidates, minimum critic of action and obstacle",
+        algo="td3",
+        settings={"policy_kwargs": {"critic": "minimum"}},
+    ),
+    Variant(name="sac", label="actor of SAC, pooled critic: SAC as its preset says", algo="sac"),
+    Variant(name="td3", label="actor of TD3, pooled critic: TD3 as its preset says", algo="td3"),
+    Variant(
+        name="viaq-sparse",
+        label="no clearance term in the reward: success and contact only",
+        env_kwargs={"reward_weights": {"clearance": 0.0}},
     ),
     Variant(name="viaq-no-refinement", label="no refined candidates", settings={"refinements": 0}),
     Variant(
@@ -200,7 +224,9 @@ class Cell:
             out=self.folder(study),
             eval_scenes=min(study.n_scenes or 500, 500),
             env_kwargs=dict(self.variant.env_kwargs),
-            hyperparameters=placed(self.variant.settings),
+            hyperparameters=placed(self.variant.settings)
+            if self.variant.algo == "viaq"
+            else dict(self.variant.settings),
             progress=False,
         )
         total = config.total_timesteps
