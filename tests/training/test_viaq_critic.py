@@ -1,0 +1,333 @@
+"""Laws of the minimum critics, of what they learn from, and of learning without the geometry of obstacles."""
+
+import inspect
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import SAC, TD3
+
+import viapoint.envs.approach
+import viapoint.envs.clearance
+import viapoint.envs.courses
+import viapoint.envs.nearness
+import viapoint.envs.outcome
+import viapoint.training.geometry_checks
+import viapoint.training.geometry_search
+from viapoint.envs.registration import TASKS
+from viapoint.training import viaq_policy
+from viapoint.training.candidates import best_duration, candidate_actions
+from viapoint.training.minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
+from viapoint.training.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
+from viapoint.training.vec_env import TERMS, ViaVecEnv
+from viapoint.training.viaq import ViaQ
+from viapoint.training.viaq_critic import PART, PairMinimum, Poses, cut_obstacles, pair_features
+from viapoint.training.viaq_policy import Values, _Saturated
+
+PLANE, WHOLE, SPACE = (
+    "viapoint/PlanarObstacles-v0",
+    "viapoint/PlanarWholeArm-v0",
+    "viapoint/PandaObstacles-v0",
+)
+MOVING = "viapoint/PlanarMovingObstacles-v0"
+KNOW_OBSTACLES = (
+    viapoint.envs.approach,
+    viapoint.envs.clearance,
+    viapoint.envs.courses,
+    viapoint.envs.nearness,
+    viapoint.envs.outcome,
+    viapoint.training.geometry_checks,
+    viapoint.training.geometry_search,
+)
+FEW = {"candidates": 32, "refinements": 1, "per_refinement": 16, "width": 8}
+
+
+def small(env_id, **kwargs):
+    env = ViaVecEnv(env_id, 8, seed=0, threads=1, **kwargs)
+    settings = {"learning_starts": 16, "batch_size": 16, "gradient_steps": 1, "explore_candidates": 8}
+    model = ViaQ("ViaQPolicy", env, seed=0, policy_kwargs=dict(FEW), **settings)
+    return model, env
+
+
+def refuse_geometry(monkeypatch):
+    """Let every function that could know of obstacles fail, wherever it was imported to."""
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("the geometry of obstacles was computed")
+
+    for module in KNOW_OBSTACLES:
+        for name, function in inspect.getmembers(module, inspect.isfunction):
+            if function.__module__ == module.__name__:
+                monkeypatch.setattr(module, name, refuse)
+                for user in (viaq_policy, viapoint.training.viaq):
+                    if getattr(user, name, None) is function:
+                        monkeypatch.setattr(user, name, refuse)
+
+
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, SPACE, MOVING])
+def test_nothing_is_learned_or_decided_from_the_geometry_of_obstacles(env_id, monkeypatch):
+    model, env = small(env_id)
+    model.learn(32)
+    observation = env.reset()
+    refuse_geometry(monkeypatch)
+    model.policy.checks = 0
+    model.train(2, 8)
+    model._sample_action(0, None, 8)
+    actions, _ = model.predict(observation)
+    assert actions.shape == (8, *env.action_space.shape)
+    model.policy.checks = 4
+    with pytest.raises(AssertionError, match="geometry"):
+        model.predict(observation)
+    env.close()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3),
+    st.lists(st.floats(-0.17, 0.17), min_size=3, max_size=3),
+    st.floats(0.005, 0.1),
+    st.sampled_from([2, 3]),
+)
+def test_the_parts_of_an_obstacle_are_short_and_together_are_the_obstacle(centre, half, radius, d):
+    row = np.array([[[*centre[:d], *half[:d], radius]]])
+    parts = cut_obstacles(row, np.ones((1, 1), dtype=bool))
+    assert parts.present.all()
+    lengths = parts.half_axis.norm(dim=-1)
+    assert (lengths <= PART[d] * 1.001 + 1e-5).all()
+    assert lengths.sum() == pytest.approx(np.linalg.norm(half[:d]), abs=1e-5)
+    ends = torch.cat((parts.centre - parts.half_axis, parts.centre + parts.half_axis), dim=1)[0]
+    for sign in (
+        -1.0,
+        1.0,
+    ):  # both ends of the obstacle are ends of parts, and each part begins where one ends
+        end = torch.tensor(centre[:d]) + sign * torch.tensor(half[:d])
+        assert (ends - end).norm(dim=-1).min() < 1e-5
+    first, last = (parts.centre + sign * parts.half_axis for sign in (-1.0, 1.0))
+    for before, after in itertools.pairwise(range(parts.centre.shape[1])):
+        assert torch.allclose(last[0, before], first[0, after], atol=1e-5)
+    assert torch.allclose(parts.radius, torch.full_like(parts.radius, radius))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("with_axis", [False, True])
+def test_a_pair_looks_the_same_from_everywhere(d, with_axis):
+    """Rotations, reflections and the direction in which an obstacle is written change nothing."""
+    generator = torch.Generator().manual_seed(0)
+    centre, axis, half = (torch.randn(64, d, generator=generator, dtype=torch.float64) for _ in range(3))
+    axis = axis / axis.norm(dim=-1, keepdim=True)
+    radius = torch.rand(64, generator=generator, dtype=torch.float64)
+
+    def features(turn, sign=1.0):
+        parts = [[(each @ turn)[:, i] for i in range(d)] for each in (centre, axis, sign * half)]
+        return torch.stack(pair_features(parts[0], parts[1] if with_axis else None, parts[2], radius))
+
+    seen = features(torch.eye(d, dtype=torch.float64))
+    for _ in range(5):
+        turn, _ = torch.linalg.qr(torch.randn(d, d, generator=generator, dtype=torch.float64))
+        assert torch.allclose(features(turn), seen, atol=1e-4)
+    assert torch.allclose(features(torch.eye(d, dtype=torch.float64), -1.0), seen, atol=1e-4)
+
+
+def scene(number=4, plans=5, instants=6, bodies=2, d=3):
+    torch.manual_seed(1)
+    poses = Poses(
+        torch.randn(bodies, d, number, plans, instants),
+        torch.nn.functional.normalize(torch.randn(bodies, d, number, plans, instants), dim=1),
+        torch.linspace(0.0, 1.0, instants).expand(number, plans, -1),
+    )
+    rows = np.random.default_rng(0).uniform(-0.2, 0.2, (number, 3, 2 * d + 1))
+    rows[..., -1] = 0.02
+    return poses, rows, PairMinimum(d, bodies, 8)
+
+
+def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles():
+    poses, rows, network = scene()
+    present = np.array([[True, True, True], [True, False, True], [False, True, False], [False, False, False]])
+    whole = network(poses, cut_obstacles(rows, present))
+    single = []
+    for obstacle, instant, body in itertools.product(range(3), range(6), range(2)):
+        only = present & (np.arange(3) == obstacle)
+        one = Poses(
+            poses.centre[..., instant : instant + 1],
+            poses.axis[..., instant : instant + 1],
+            poses.time[..., :1],
+        )
+        parts = cut_obstacles(rows, only)
+        values = network._values(one, parts, *torch.nonzero(parts.present, as_tuple=True))[:, :, body, 0]
+        scenes = torch.nonzero(parts.present, as_tuple=True)[0]
+        each = torch.full(whole.shape, torch.inf)
+        for row, value in zip(scenes, values, strict=True):
+            each[row] = torch.minimum(each[row], value * 0.05)
+        single.append(each)
+    expected = torch.stack(single).amin(dim=0)
+    assert torch.allclose(whole[:3], expected[:3], atol=1e-5)
+    assert (whole[3] == 1.0).all()
+
+
+def test_only_what_was_carried_out_counts_where_one_says_until_when():
+    poses, rows, network = scene()
+    parts = cut_obstacles(rows, np.ones((4, 3), dtype=bool))
+    some = Poses(poses.centre[..., :3], poses.axis[..., :3], poses.time[..., :3])
+    until = torch.full(poses.time.shape[:2], 0.45)  # instants are 0, .2, .4, .6, .8 and 1
+    assert torch.allclose(network(poses, parts, until), network(some, parts))
+    assert torch.allclose(network(poses, parts, until + torch.inf), network(poses, parts))
+
+
+def test_gradients_flow_through_the_responsible_pair_alone():
+    poses, rows, network = scene()
+    parts = cut_obstacles(rows, np.ones((4, 3), dtype=bool))
+    with torch.no_grad():
+        searched = network(poses, parts)
+    learned = network(poses, parts)
+    assert torch.allclose(searched, learned, atol=1e-6)
+    centre = poses.centre.clone().requires_grad_()
+    network(poses._replace(centre=centre), parts)[0, 0].backward()
+    touched = (centre.grad.abs().sum(dim=1) > 0.0).nonzero()
+    assert len(touched) <= 1
+
+
+def test_a_saturated_prediction_is_pulled_back_but_never_pushed_out():
+    values = torch.tensor([-2.0, -2.0, 0.0, 0.0, 2.0, 2.0], requires_grad=True)
+    push = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])  # descent moves against the gradient
+    _Saturated.apply(values, -1.0, 1.0).backward(push)
+    assert values.grad.tolist() == [0.0, -1.0, 1.0, -1.0, 1.0, 0.0]
+
+
+def test_merit_prefers_likely_success_and_orders_the_rest_by_its_probability():
+    model, env = small(PLANE)
+    zero = torch.zeros(1, 4)
+    values = Values(
+        zero, torch.tensor([[5.0, 5.0, -1.0, -3.0]]), zero + 5.0, zero, torch.tensor([[0.0, -0.3, 9.0, 99.0]])
+    )
+    merit = model.policy.critic.merit(values)[0]
+    assert merit.argsort(descending=True).tolist() == [0, 1, 2, 3]
+    assert torch.allclose(merit[:2], model.policy.critic.value(values)[0, :2])
+    env.close()
+
+
+def step(clearance, done=False, **more):
+    """Info of one decision."""
+    info = dict.fromkeys(TERMS, 0.0) | {"reward_clearance": clearance, "elapsed": 0.3, **more}
+    return info, sum(info[name] for name in TERMS), done
+
+
+def test_clearance_is_summed_over_an_episode_and_the_decision_that_lowered_it_is_known():
+    env = ViaVecEnv(MOVING, 1, seed=0)
+    buffer = OutcomeReplayBuffer(
+        16, env.observation_space, env.action_space, n_envs=1, gamma=0.9, device="cpu"
+    )
+    observation = {name: part[:1] for name, part in env.reset().items()}
+    for info, reward, done in (
+        step(0.1), step(0.0), step(-0.3), step(0.0, True), step(-0.2), step(-0.1), step(0.05, True),
+    ):  # fmt: skip
+        action = np.zeros((1, 3), dtype=np.float32)
+        buffer.add(observation, observation, action, np.array([reward]), np.array([done]), [info])
+    kept = Outcomes(*buffer.outcomes[:7, 0].T)
+    assert np.allclose(kept.clearance, [0.1, 0.1, -0.2, -0.2, -0.2, -0.3, -0.25])
+    assert kept.lower.tolist() == [1.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0]
+    assert np.allclose(buffer.elapsed[:7], 0.3)
+    buffer.begin()  # the environment was reset in the middle of an episode
+    buffer.add(observation, observation, action, np.array([0.04]), np.array([False]), [step(0.04)[0]])
+    buffer.add(observation, observation, action, np.array([0.0]), np.array([False]), [step(0.0)[0]])
+    assert np.allclose(buffer.outcomes[7:9, 0, Outcomes._fields.index("clearance")], 0.04)
+    env.close()
+
+
+def test_without_terms_only_the_sum_is_learned_from():
+    assert np.isnan(outcome_of({"is_success": True}, 1.0)).all()
+    model, env = small(PLANE)
+    model.learn(64)
+    model.replay_buffer.outcomes[:] = np.nan
+    before = model.policy.critic.pairs.networks.weights[0].clone()
+    losses = model._losses(model.replay_buffer.sample_outcomes(16))
+    assert losses["reward"].item() > 0.0
+    assert all(loss.item() == 0.0 for name, loss in losses.items() if name != "reward")
+    model.train(20, 16)
+    assert not torch.equal(before, model.policy.critic.pairs.networks.weights[0])
+    env.close()
+
+
+def test_what_follows_counts_only_where_an_episode_goes_on():
+    model, env = small(MOVING, n_obstacles=1)
+    model.learn(128)
+    batch = model.replay_buffer.sample_outcomes(64)
+    over = batch._replace(ended=np.ones_like(batch.ended))
+    other = over._replace(discount=0.0 * over.discount)
+    assert {n: v.item() for n, v in model._losses(over).items() if n == "rest"} == {
+        n: v.item() for n, v in model._losses(other).items() if n == "rest"
+    }
+    on = batch._replace(ended=np.zeros_like(batch.ended), discount=np.ones_like(batch.discount))
+    assert model._losses(on)["rest"].item() != model._losses(over)["rest"].item()
+    env.close()
+
+
+@pytest.mark.parametrize("temperature", [1e-3, 1e6])
+def test_exploration_goes_from_the_best_candidate_to_any(temperature, monkeypatch):
+    model, env = small(PLANE)
+    model.explore_uniformly, model.temperature, model.num_timesteps = 0.0, temperature, 100
+    model._last_obs = env.reset()
+    seen = {}
+
+    def valued(observation, candidates):
+        seen["candidates"] = candidates
+        return np.tile(np.linspace(0.0, 1.0, 8, dtype=np.float32), (8, 1))
+
+    monkeypatch.setattr(model.policy, "values", valued)
+    chosen = []
+    for _ in range(60):
+        actions, _ = model._sample_action(0, None, 8)
+        chosen += (seen["candidates"] == actions[:, None]).all(axis=-1).argmax(axis=1).tolist()
+    counts = np.bincount(chosen, minlength=8)
+    if temperature < 1.0:
+        assert counts[7] == 480
+    else:
+        assert counts.min() > 30  # of 60 each
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", [name for name in TASKS if "Panda" in name or "Planar" in name])
+def test_candidates_are_different_allowed_and_begin_with_the_straight_movement(env_id):
+    env = ViaVecEnv(env_id, 1)
+    task = env.get_attr("task", [0])[0]
+    actions = candidate_actions(task, 64, replanning=False)
+    assert (actions[0] == 0.0).all()
+    assert (np.abs(actions) <= 1.0).all()
+    assert len(np.unique(actions, axis=0)) == 64
+    at = task.action.n_via * task.action.dimension
+    assert np.allclose(actions[1:, at], best_duration(task))
+    low, high = task.action.duration_range
+    durations = np.linspace(-1.0, 1.0, 401)
+    relative = (high / low) ** (0.5 * durations)
+    worth = 5.0 * task.weights.smoothness * np.log(relative) - task.weights.duration * (relative - 1.0)
+    assert durations[worth.argmax()] == pytest.approx(best_duration(task), abs=0.01)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy"), [(SAC, MinimumCriticSACPolicy), (TD3, MinimumCriticTD3Policy)]
+)
+def test_algorithms_of_sb3_learn_with_a_minimum_critic(algorithm, policy):
+    """Its Q is that of the worst obstacle, whatever their order, and does not rise when one more is there."""
+    env = ViaVecEnv(PLANE, 4, seed=0)
+    model = algorithm(policy, env, learning_starts=8, batch_size=8, seed=0, policy_kwargs={"heads": 2})
+    model.learn(24)
+    observation = {name: torch.as_tensor(part) for name, part in env.reset().items()}
+    actions = torch.zeros(4, 3)
+    rows = observation["obstacles"].reshape(4, 5, 6)
+
+    def q(obstacles):
+        with torch.no_grad():
+            return model.critic({**observation, "obstacles": obstacles.reshape(4, -1)}, actions)[0][:, 0]
+
+    turned = rows[:, torch.tensor([3, 1, 4, 0, 2])]
+    assert torch.allclose(q(rows), q(turned), atol=1e-6)
+    fewer = rows.clone()
+    first = rows[..., -1].argmax(dim=1)
+    fewer[torch.arange(4), first] = 0.0
+    several = rows[..., -1].sum(dim=1) > 1.0
+    assert several.any()
+    assert (q(rows)[several] <= q(fewer)[several] + 1e-6).all()
+    env.close()
