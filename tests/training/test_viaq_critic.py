@@ -1,5 +1,6 @@
 """Laws of the minimum critics, of what they learn from, and of learning without the geometry of obstacles."""
 
+import copy
 import inspect
 import itertools
 
@@ -229,10 +230,12 @@ def test_clearance_is_summed_over_an_episode_and_the_decision_that_lowered_it_is
     assert np.allclose(kept.clearance, [0.1, 0.1, -0.2, -0.2, -0.2, -0.3, -0.25])
     assert kept.lower.tolist() == [1.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0]
     assert np.allclose(buffer.elapsed[:7], 0.3)
-    buffer.begin()  # the environment was reset in the middle of an episode
-    buffer.add(observation, observation, action, np.array([0.04]), np.array([False]), [step(0.04)[0]])
-    buffer.add(observation, observation, action, np.array([0.0]), np.array([False]), [step(0.0)[0]])
-    assert np.allclose(buffer.outcomes[7:9, 0, Outcomes._fields.index("clearance")], 0.04)
+    for clearance in (-0.3, 0.04, 0.0):
+        if clearance > 0.0:
+            buffer.begin()  # the environment is reset in the middle of an episode
+        reward, info = np.array([clearance]), step(clearance)[0]
+        buffer.add(observation, observation, action, reward, np.array([False]), [info])
+    assert np.allclose(buffer.outcomes[7:10, 0, Outcomes._fields.index("clearance")], [-0.3, 0.04, 0.04])
     env.close()
 
 
@@ -327,6 +330,19 @@ def test_algorithms_of_sb3_learn_with_a_minimum_critic(algorithm, policy):
     fewer = rows.clone()
     first = rows[..., -1].argmax(dim=1)
     fewer[torch.arange(4), first] = 0.0
+    network, features = (
+        model.critic.qf0,
+        model.critic.extract_features(observation, model.critic.features_extractor),
+    )
+    each = []
+    for head in range(2):
+        one = copy.deepcopy(network)
+        one.pairs[-1] = torch.nn.Linear(one.pairs[-1].in_features, 1)
+        one.pairs[-1].weight.data[0] = network.pairs[-1].weight[head]
+        one.pairs[-1].bias.data[0] = network.pairs[-1].bias[head]
+        with torch.no_grad():
+            each.append(one(torch.cat((features, actions), dim=-1))[:, 0])
+    assert torch.allclose(torch.minimum(*each), q(rows), atol=1e-5)
     several = rows[..., -1].sum(dim=1) > 1.0
     assert several.any()
     assert (q(rows)[several] <= q(fewer)[several] + 1e-6).all()
