@@ -90,8 +90,7 @@ ABLATIONS = (
         algo="td3",
         settings={"policy_kwargs": {"critic": "minimum"}},
     ),
-    Variant(name="sac", label="actor of SAC, pooled critic: SAC as its preset says", algo="sac"),
-    Variant(name="td3", label="actor of TD3, pooled critic: TD3 as its preset says", algo="td3"),
+    *(each for each in METHODS if each.name in ("sac", "td3")),
     Variant(
         name="viaq-sparse",
         label="no clearance term in the reward: success and contact only",
@@ -145,7 +144,7 @@ class Study:
     """Processes that train and measure at once, each on its share of the cores; 0 works in this process."""
     baselines: tuple[str, ...] = BASELINES
     """Of the results; `stored` is the planner's solutions from the files of scenes, `planner` searches anew."""
-    checks: int = 16
+    checks: int = 64
     """How many of an agent's proposals are checked by exact geometry in its second row."""
     alone: bool = False
     """Leave out what the page holds and these files do not, such as what was measured on another machine."""
