@@ -257,7 +257,7 @@ class DemoConfig:
     seed: int = 0
     """Seed of the training."""
     n_timesteps: int | None = None
-    """Decisions to train for; two thirds of the preset's if not given, so that nobody waits for long."""
+    """Decisions to train for; a quarter of those of the preset if not given, so that nobody waits for long."""
     n_scenes: int | None = None
     """Test scenes to evaluate on; all if not given."""
     checks: int = 16
@@ -278,7 +278,7 @@ class DemoConfig:
     @property
     def total_timesteps(self) -> int:
         """Decisions of a training that begins."""
-        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps * 2 // 3
+        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps // 4
 
 
 @dataclass(frozen=True, kw_only=True)
