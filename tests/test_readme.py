@@ -10,8 +10,11 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 STUDY = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
 ROWS = {
-    "agent, one forward pass (*policy alone*)": ("viatd3", "alone"),
-    "agent, its critic ranks 80 candidates (*ranked candidates*)": ("viatd3", "ranked"),
+    "agent, learned alone": ("viaq", "alone"),
+    "agent, 64 checks": ("viaq", "checked"),
+    "untrained network, 64 checks": ("viaq", "untrained"),
+    "search without learning, 16 checks": ("search16", None),
+    "search without learning, 512 checks": ("search512", None),
     "SAC": ("sac", "alone"),
     "TQC": ("tqc", "alone"),
     "TD3": ("td3", "alone"),

@@ -156,7 +156,7 @@ class ViaQCritic(nn.Module):
         self.scales = nn.Parameter(
             torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
         )
-        """w_s, w_c, w_g and w_m: the environment's, unless only the sum of the terms is known."""
+        """w_s, w_c, w_g and w_m: at the beginning the environment's, then adapted to the rewards."""
 
     def forward(self, inputs: PlanInputs) -> Values:
         """Return the predictions for each plan."""
