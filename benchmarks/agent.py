@@ -177,10 +177,61 @@ def write_page(words: argparse.Namespace) -> None:
     record["command"] = "python benchmarks/agent.py"
     write_json(file, record)
     draw(record["measured"], words.docs / "images" / "agent_checks.png")
-    page = words.docs / "agent.md"
-    text = page.read_text()
-    between = re.compile(r"(<!-- table:checks -->\n).*?(<!-- end -->)", re.DOTALL)
-    page.write_text(between.sub(lambda found: found[1] + table(record["measured"]) + found[2], text))
+    study = read_json(words.docs / "results.json")
+    place(
+        words.docs / "agent.md",
+        "checks",
+        table({k: v for k, v in record["measured"].items() if not online(k)}),
+    )
+    place(
+        words.docs / "agents-online.md",
+        "online",
+        table({k: v for k, v in record["measured"].items() if online(k)}),
+    )
+    place(words.docs / "agent.md", "ablations", ablations(study))
+
+
+def online(env: str) -> bool:
+    """Return whether plans are revised in an environment."""
+    return f"viapoint/{env}" in ONLINE_TASKS
+
+
+def place(page: Path, name: str, content: str) -> None:
+    """Write a table between its markers in a page."""
+    between = re.compile(rf"(<!-- table:{name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    page.write_text(between.sub(lambda found: found[1] + content + found[2], page.read_text()))
+
+
+CHANGES = {
+    "viaq": "places of the bodies, minimum, candidates (the agent)",
+    "viaq-action": "action instead of places: minimum critic, candidates",
+    "viaq-action-heads": "action instead of places: minimum critic with 8 heads, candidates",
+    "viaq-sum": "action instead of places: pooled critic, candidates",
+    "sac-minimum": "action instead of places: minimum critic, actor of SAC",
+    "td3-minimum": "action instead of places: minimum critic, actor of TD3",
+    "sac": "action instead of places: pooled critic, actor of SAC",
+    "td3": "action instead of places: pooled critic, actor of TD3",
+    "viaq-no-refinement": "the agent without refined candidates",
+    "viaq-random": "the agent, trained on random actions only",
+    "viaq-sparse": "the agent, trained without the clearance term of the reward",
+}
+"""Rows of the ablations by the name of their training."""
+
+
+def ablations(study: dict[str, Any]) -> str:
+    """Return the table of ablations as Markdown, from the results of the study."""
+    lines = ["", "| critic and choice | seeds | `test` | `hard` |", "|---|---|---|---|"]
+    for env, entries in study["ablations"].items():
+        found = {each["name"]: each for each in entries}
+        found |= {
+            each["name"]: each for each in study["environments"][env]["methods"] if each["name"] in CHANGES
+        }
+        for name, label in CHANGES.items():
+            if name in found:
+                cells = [found[name]["sets"].get(each, {}).get("alone") for each in SETS]
+                shown = [spread({"success": cell["each"]}) if cell else "-" for cell in cells]
+                lines.append(f"| {label} | {len(found[name]['seeds'])} | {' | '.join(shown)} |")
+    return "\n".join(lines) + "\n\n"
 
 
 ROWS = {

@@ -26,6 +26,8 @@ PART = {2: 0.0625, 3: 0.15}
 """Greatest half-length of an obstacle part in plane and space, [m]."""
 SCALE = 8.0
 """Lengths are multiplied by this before they enter a network, [1/m]."""
+COLUMNS = 4_096
+"""Pairs of each body that pass through the networks together: few enough for the hidden layers to stay in the cache."""
 UNIT = 0.05
 """Length that one unit of a pair network's output stands for, [m]."""
 NOTHING = 1.0
@@ -149,6 +151,9 @@ class PairNetworks(nn.Module):
 
     def forward(self, features: Tensor, distance: Tensor) -> Tensor:
         """Return values of shape (L, N) for features (L, F, N) and distances of the centres (L, N), [m]."""
+        if features.shape[2] > COLUMNS and not torch.is_grad_enabled():
+            pieces = zip(features.split(COLUMNS, dim=2), distance.split(COLUMNS, dim=1), strict=True)
+            return torch.cat([self(*each) for each in pieces], dim=1)
         hidden = features
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = torch.baddbmm(bias, weight, hidden)
