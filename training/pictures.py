@@ -28,7 +28,7 @@ FILES = {
     "PlanarWholeArm": "planar_whole_arm.png",
 }
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
-PASSAGES = {IN_PLANE: (29, 8, 10, 37), IN_SPACE: (14, 21)}
+PASSAGES = {IN_PLANE: (29, 4, 10, 37), IN_SPACE: (14, 21)}
 """Scenes of their sets `test` that the shipped agents are shown in; in space a slot, and a shelf among spheres."""
 MOMENTS = (0.3, 0.45, 0.6, 1.0)
 """Of a movement, as parts of its duration."""
