@@ -152,8 +152,8 @@ class PairNetworks(nn.Module):
     def forward(self, features: Tensor, distance: Tensor) -> Tensor:
         """Return values of shape (L, N) for features (L, F, N) and distances of the centres (L, N), [m]."""
         if features.shape[2] > COLUMNS and not torch.is_grad_enabled():
-            pieces = zip(features.split(COLUMNS, dim=2), distance.split(COLUMNS, dim=1), strict=True)
-            return torch.cat([self(*each) for each in pieces], dim=1)
+            several = (torch.split(each, COLUMNS, dim=-1) for each in (features, distance))
+            return torch.cat([self(*each) for each in zip(*several, strict=True)], dim=1)
         hidden = features
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = torch.baddbmm(bias, weight, hidden)
