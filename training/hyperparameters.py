@@ -138,7 +138,7 @@ VIA_POLICY: dict[str, Allowed] = {
     "form": Allowed("places or action", lambda value: value in ("places", "action")),
     "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
     "heads": _whole(1),
-    "width": _whole(1),
+    "width": _or(_whole(1), NONE),
     "instants": _or(_whole(2), NONE),
     "candidates": _whole(1),
     "refinements": _whole(0),
