@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 import argparse
 import re
 import statistics
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,8 @@ ORDERED = (1, 4, 16, 64, 256, 512)
 """Checks of plans without learning."""
 MOVING_SCENES = 250
 """Scenes in which several decisions are made, at most."""
+TIMED = 60
+"""Decisions that are timed."""
 SETS = ("test", "hard")
 
 
@@ -78,6 +81,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/agent"), help="folder for single measurements")
     parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the page")
     parser.add_argument("--envs", nargs="*", default=None, help="ids; all that have agents if not given")
+    parser.add_argument("--times", action="store_true", help="only time decisions anew, on an idle machine")
     parser.add_argument("--page", action="store_true", help="only write the page from what is measured")
     words = parser.parse_args()
     known = [*TASKS, *ONLINE_TASKS]
@@ -87,7 +91,7 @@ def main() -> None:
         parser.error(f"envs must be among {', '.join(known)}, got {unknown[0]}")
     with one_thread():
         for env in envs if not words.page else ():
-            measure(env, words)
+            (time_anew if words.times else measure)(env, words)
     write_page(words)
 
 
@@ -115,6 +119,34 @@ def measure(env: str, words: argparse.Namespace) -> None:
                 once(words, env, name, f"random-{checks}", lambda n=checks: RandomOrder(trial.task, n))
         for search in SEARCHES:
             once(words, env, name, search, lambda n=search: make_method(n, env))
+    trial.close()
+
+
+def time_anew(env: str, words: argparse.Namespace) -> None:
+    """Time single decisions of every method that is measured in an environment, with the agent of the first seed."""
+    trial = new_trial(env, 2)
+    seeds = seeds_of(words.runs, env)
+    frozen = load("test", env).take(slice(0, TIMED))
+    for file in sorted((words.out / env.rpartition("/")[2] / "test").glob("*.json")):
+        kind, _, rest = file.stem.partition("-")
+        number = int(rest.partition("-")[0]) if rest else 0
+        if kind in ("viaq", "untrained"):
+            method = agent(seeds[min(seeds)], number, trained=kind == "viaq")()
+        elif kind in ("sobol", "random"):
+            method = (
+                GeometrySearch(trial.task, number) if kind == "sobol" else RandomOrder(trial.task, number)
+            )
+        else:
+            method = make_method(file.stem, env)
+        times = []
+        for row in range(TIMED):
+            scene = frozen.scenes.take(slice(row, row + 1))
+            observation = trial.observe(scene)
+            began = time.perf_counter()
+            method.decide(observation, scene)
+            times.append(time.perf_counter() - began)
+        write_json(file, {**read_json(file), "decision_time": statistics.median(times[1:])})
+        print(env, file.stem, f"{1e3 * statistics.median(times[1:]):.2f} ms", flush=True)
     trial.close()
 
 
