@@ -43,7 +43,7 @@ UNLIKELY = 10.0
 KEEP = 0.1
 """Difference of Q for which a plan under way is revised."""
 BEST = 8
-"""How many of the best candidates are refined in each round."""
+"""Number of the best candidates that are refined in each round."""
 SPREAD = 0.15
 """Standard deviation of the first round of refinement; each further round halves it."""
 PLACES = 1 << 16

@@ -39,8 +39,8 @@ so the difference between the two is what was learned.
 
 FAILURES = """## Failures, drawn
 
-The shipped agent's in the `hard` scenes of PlanarObstacles-v0, policy alone, from the deepest of a kind to its mildest
-(`viapoint evaluate --pretrained viapoint/PlanarObstacles-v0 --methods agent --scenes hard --failures
+Failures of the shipped agent in the `hard` scenes of PlanarWholeArm-v0, policy alone, from the deepest of a kind to its
+mildest (`viapoint evaluate --pretrained viapoint/PlanarWholeArm-v0 --methods agent --scenes hard --failures
 docs/images/failures`).
 
 ![The plan enters an obstacle by 5 mm or less](images/failures/graze.png)
