@@ -4,13 +4,12 @@ Every function takes NumPy arrays or torch tensors with any leading (batch) dime
 kind. Units are metres and seconds.
 """
 
-from ._arrays import FREE
-from ._extremes import Extrema
+from ._extrema import Extrema
+from .array_api import FREE
 from .gradients import CostGradient, cost_gradient
-from .limits import minimum_duration
-from .online import retarget
+from .minimum_jerk import minimum_jerk_coefficients, point_to_point, through
 from .passage_times import passage_durations
-from .reaching import minimum_jerk_coefficients, point_to_point
+from .retargeting import retarget
 from .smoothness import (
     SpeedEvents,
     curvature,
@@ -21,8 +20,8 @@ from .smoothness import (
     speed_peaks,
     speed_valleys,
 )
+from .time_scaling import minimum_duration
 from .trajectory import Trajectory
-from .via_points import through
 
 __all__ = [
     "FREE",

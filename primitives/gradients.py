@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import factorial
 from typing import Any
 
-from ._arrays import Array
+from .array_api import Array
 from .trajectory import Trajectory, require_trajectory
 
 

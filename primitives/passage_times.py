@@ -7,14 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from . import _passage_gradient
-from ._arrays import FREE, Array, Boundary, as_floats, broadcast_to, follows_gradient, like, require, to_numpy
-from ._connecting import boundary_values
-from ._passage_cost import PassageCost
-from ._passage_moving import fractions_moving
-from ._passage_newton import fractions_by_newton
-from ._passage_rest import fractions_at_rest
-from .via_points import check_waypoints
+from ._boundary import boundary_values
+from ._passage.cost import PassageCost
+from ._passage.gradient import attach
+from ._passage.moving_ends import fractions_moving
+from ._passage.newton import fractions_by_newton
+from ._passage.rest_to_rest import fractions_at_rest
+from .array_api import (
+    FREE,
+    Array,
+    Boundary,
+    as_floats,
+    broadcast_to,
+    follows_gradient,
+    like,
+    require,
+    to_numpy,
+)
+from .minimum_jerk import check_waypoints
 
 
 def passage_durations(
@@ -62,7 +72,7 @@ def passage_durations(
     fractions = like(xp, _fractions(points, ends).reshape(*batch, waypoints.shape[-2] - 1), waypoints)
     if xp is not np and follows_gradient(waypoints, duration, *boundary.values()):
         waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
-        fractions = _passage_gradient.attach(fractions, waypoints, duration, boundary, xp)
+        fractions = attach(fractions, waypoints, duration, boundary, xp)
     return fractions * duration[..., None]
 
 

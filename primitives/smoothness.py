@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
 from ._polynomial import differentiate, multiply, root_candidates, unit_size
+from .array_api import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
 _SPECTRUM_SAMPLES = 1000

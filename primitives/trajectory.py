@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import (
+from ._evaluate import evaluate
+from ._extrema import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
+from ._hermite_tables import energy_table
+from .array_api import (
     Array,
     Namespace,
     as_floats,
@@ -26,9 +29,6 @@ from ._arrays import (
     whole_order,
     whole_orders,
 )
-from ._extremes import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
-from ._hermite import energy_table
-from ._sampling import evaluate
 
 
 @dataclass(frozen=True, eq=False, repr=False)

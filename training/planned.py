@@ -12,7 +12,7 @@ from viapoint import primitives
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.scenes import SHORTEST
 from viapoint.envs.task import Task
-from viapoint.primitives._passage_rest import _ARRAYS, _root
+from viapoint.primitives._passage.rest_to_rest import _ARRAYS, _root
 
 Numbers = NDArray[np.floating[Any]]
 Observation = Mapping[str, Numbers]

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from ._arrays import FREE, Array
-from ._hermite import stiffness_table
+from ._hermite_tables import stiffness_table
+from .array_api import FREE, Array
 
 Entry: TypeAlias = Any
 States: TypeAlias = list[list[Any]]

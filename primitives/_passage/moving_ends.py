@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import FREE
-from ._connecting import connect
-from ._polynomial import Floats, differentiate, evaluate, multiply, root_candidates
+from .._boundary import connect
+from .._polynomial import Floats, differentiate, evaluate, multiply, root_candidates
+from ..array_api import FREE
 
 _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {
     (False, False): (5, (1.0,)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ._arrays import Array, broadcast_batch, refuse_free, require
+from .array_api import Array, broadcast_batch, refuse_free, require
 from .trajectory import Trajectory, require_trajectory
 
 

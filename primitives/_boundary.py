@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import (
+from ._hermite_tables import ORDERS, coefficient_table
+from ._knot_solver import States, solve_states
+from .array_api import (
     FREE,
     Array,
     Boundary,
@@ -21,8 +23,6 @@ from ._arrays import (
     to_numpy,
     unit_factors,
 )
-from ._banded import States, solve_states
-from ._hermite import ORDERS, coefficient_table
 from .trajectory import Trajectory
 
 

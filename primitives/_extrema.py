@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import Array, Namespace, like, to_numpy
+from ._evaluate import derivative_coefficients
 from ._polynomial import Floats, differentiate, evaluate, multiply, root_candidates, unit_size
-from ._sampling import derivative_coefficients
+from .array_api import Array, Namespace, like, to_numpy
 
 
 @dataclass(frozen=True)

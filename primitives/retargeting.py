@@ -5,7 +5,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any
 
-from ._arrays import (
+from ._boundary import check_boundary_shapes
+from .array_api import (
     FREE,
     Array,
     Boundary,
@@ -17,10 +18,9 @@ from ._arrays import (
     require,
     require_vectors,
 )
-from ._connecting import check_boundary_shapes
+from .minimum_jerk import through
 from .passage_times import passage_durations
 from .trajectory import Trajectory, require_trajectory
-from .via_points import through
 
 
 def retarget(

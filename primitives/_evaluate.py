@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import Array, Namespace, blocks, constant
-from ._hermite import derivative_factors
+from ._hermite_tables import derivative_factors
+from .array_api import Array, Namespace, blocks, constant
 
 _BLOCK_BYTES = 1_200_000
 """Size of the basis of one block of trajectories: it stays in a core's second-level cache while it is

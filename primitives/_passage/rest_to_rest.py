@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ._arrays import Array, Namespace, like, to_numpy
+from ..array_api import Array, Namespace, like, to_numpy
 
 Number: TypeAlias = Any
 """A float, or an array with one entry per movement: the same operations, the same bits."""

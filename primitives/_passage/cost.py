@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._arrays import FREE
-from ._banded import States, assemble, factorise
+from .._knot_solver import States, assemble, factorise
+from ..array_api import FREE
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 

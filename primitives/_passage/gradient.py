@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ._arrays import FREE, Array, Boundary, Namespace, detach, like, to_numpy
-from ._connecting import connect
-from ._newton import solve_positive
-from ._passage_cost import PassageCost
-from ._passage_newton import log_cost
-from ._passage_rest import attach_gradient
-from .gradients import duration_gradient
+from .._boundary import connect
+from ..array_api import FREE, Array, Boundary, Namespace, detach, like, to_numpy
+from ..gradients import duration_gradient
+from .cost import PassageCost
+from .newton import log_cost, solve_positive
+from .rest_to_rest import attach_gradient
 
 _LARGEST = 1e3
 """Bound on the entries of the inverse Hessian of the log-cost, so that nearly merging knots keep a finite

@@ -1,0 +1,1 @@
+"""Free passage times of via-points."""
