@@ -29,7 +29,6 @@ TOOLS = [
     "hypothesis",
     "mpmath",
     "moviepy",
-    "scipy",
     "setuptools",
     "build",
     "ruff",

@@ -83,7 +83,7 @@ def test_what_training_imports_is_declared():
     [
         ("viapoint.primitives", ("torch", "mujoco", "gymnasium", "scipy", "matplotlib")),
         ("viapoint.envs", ("torch", "stable_baselines3", "matplotlib", "scipy", "viapoint.training")),
-        ("viapoint.training.cli", ("torch", "stable_baselines3", "matplotlib")),
+        ("viapoint.training.cli", ("torch", "stable_baselines3", "matplotlib", "scipy")),
     ],
 )
 def test_importing_is_light(module, absent):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 Float = NDArray[np.float64]
 
@@ -27,103 +27,60 @@ class Comparison(NamedTuple):
     difference: float
     """Success rate of the first minus that of the second."""
     only_first: int
-    """Scenes in which the first alone succeeded."""
+    """Scenes in which the second alone failed."""
     only_second: int
-    """Scenes in which the second alone succeeded."""
+    """Scenes in which the first alone failed."""
     p_value: float
-    """Of the exact test that both are as likely; two-sided."""
+    """Two-sided p-value of the exact McNemar test."""
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> Interval:
-    """Wilson's score interval of a success rate; without trials it is (nan, 0, 1).
+    """Return Wilson's score interval of a success rate; without trials it is (nan, 0, 1).
 
-    With p = successes / n and z the normal quantile of (1 + confidence) / 2:
-
-        (p + z^2 / 2n  -+  z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
-
-    Source: Wilson 1927, J. Am. Stat. Assoc. 22, 209-212; recommended by Brown, Cai and DasGupta 2001, Stat.
-        Sci. 16.
+    Recommended by Brown, Cai and DasGupta 2001, Stat. Sci. 16; computed by `scipy.stats.binomtest`.
 
     Raises:
-        ValueError: Not whole numbers with 0 <= successes <= trials, or not 0 < confidence < 1.
+        ValueError: Not 0 <= successes <= trials, or not 0 < confidence < 1.
+        TypeError: A count is not an integer.
     """
     _check_confidence(confidence)
-    if not (0 <= successes <= trials < math.inf and successes % 1 == trials % 1 == 0):
-        raise ValueError(f"successes must lie between 0 and trials and be whole, got {successes} of {trials}")
-    if trials == 0:
+    if successes == trials == 0:
         return Interval(math.nan, 0.0, 1.0)
-    z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
-    p, scale = successes / trials, 1.0 + z * z / trials
-    centre = (p + z * z / (2.0 * trials)) / scale
-    half = z / scale * math.sqrt(p * (1.0 - p) / trials + z * z / (4.0 * trials * trials))
-    low = 0.0 if successes == 0 else max(centre - half, 0.0)
-    high = 1.0 if successes == trials else min(centre + half, 1.0)
-    return Interval(p, low, high)
+    test = stats.binomtest(successes, trials)
+    low, high = test.proportion_ci(confidence, method="wilson")
+    return Interval(test.statistic, float(low), float(high))
 
 
 def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
-    """Exact McNemar test of two methods' successes on the same scenes.
+    """Compare the successes of two methods on the same scenes by the exact McNemar test.
 
-    Only the b scenes where the first alone succeeded and the c where the second alone did tell them apart; if
-    both are equally likely, b is binomial(b + c, 1/2):
-
-        p = min(1, 2 sum_{k <= min(b, c)} C(b + c, k) / 2^(b + c))
-
-    Source: McNemar 1947, Psychometrika 12, 153-157, in its exact form.
+    Only the b scenes where the first alone succeeded and the c where the second alone did distinguish them. If
+    both are equally likely, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
 
     Args:
         first: Successes, true or false, or 0 and 1, shape (N,).
         second: Successes, shape (N,), in the same scenes.
 
     Raises:
-        ValueError: The shapes differ, there are no scenes, or something else is among the successes.
+        ValueError: The shapes differ, there are no scenes, or a value is neither 0 nor 1.
     """
-    a, b = _paired(first, second)
-    only_first, only_second = int((a & ~b).sum()), int((b & ~a).sum())
-    number = only_first + only_second
-    tail = sum(math.comb(number, k) for k in range(min(only_first, only_second) + 1))
+    a, b = np.asarray(first), np.asarray(second)
+    if a.shape != b.shape or a.ndim != 1 or not a.size:
+        raise ValueError(f"both must have the same shape (N,), N > 0, got {a.shape} and {b.shape}")
+    if not np.isin((a, b), (0, 1)).all():
+        raise ValueError(f"successes must be 0 or 1, got {np.setdiff1d((a, b), (0, 1))[0]}")
+    only_first, only_second = int((a > b).sum()), int((b > a).sum())
+    differing = only_first + only_second
     return Comparison(
         difference=float(a.mean() - b.mean()),
         only_first=only_first,
         only_second=only_second,
-        p_value=min(1.0, 2.0 * (tail / 2**number)),
+        p_value=float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0,
     )
 
 
-def paired_bootstrap(
-    first: ArrayLike,
-    second: ArrayLike,
-    generator: np.random.Generator,
-    *,
-    confidence: float = 0.95,
-    samples: int = 10_000,
-) -> Interval:
-    """Percentile bootstrap interval of the mean difference of two methods' scores on the same scenes.
-
-    Scenes are drawn with replacement and keep their pair of scores. Source: Efron and Tibshirani 1993, An
-    Introduction to the Bootstrap, chapter 13.
-
-    Args:
-        first: Scores, shape (N,).
-        second: Scores, shape (N,), in the same scenes.
-        generator: Of the draws.
-        confidence: Of the interval.
-        samples: Number of draws.
-
-    Raises:
-        ValueError: The shapes differ, there are no scenes, or a score is no number.
-    """
-    _check_draws(confidence, samples)
-    a, b = _scores(first), _scores(second)
-    if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise ValueError(f"both must have the same shape (N,), N > 0, got {a.shape} and {b.shape}")
-    difference = a - b
-    means = [difference[generator.integers(a.size, size=a.size)].mean() for _ in range(samples)]
-    return _percentile(float(difference.mean()), np.array(means), confidence)
-
-
-def interquartile_mean(scores: ArrayLike) -> float:
-    """Mean of the middle half of all scores: robust as the median, efficient almost as the mean.
+def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:
+    """Return the mean of the middle half of the scores: robust as the median, efficient almost as the mean.
 
     The lowest and the highest floor(n / 4) are left out. Source: Agarwal et al. 2021, Deep Reinforcement
     Learning at the Edge of the Statistical Precipice, arXiv 2108.13264, section 4.3.
@@ -131,45 +88,10 @@ def interquartile_mean(scores: ArrayLike) -> float:
     Raises:
         ValueError: There are no scores, or one is no number.
     """
-    ordered = np.sort(_scores(scores), axis=None)
-    if not ordered.size:
+    values = _scores(scores)
+    if not values.size:
         raise ValueError("scores must not be empty")
-    cut = ordered.size // 4
-    return float(ordered[cut : ordered.size - cut].mean())
-
-
-def stratified_bootstrap(
-    scores: ArrayLike,
-    generator: np.random.Generator,
-    *,
-    statistic: Callable[[Float], float] = interquartile_mean,
-    confidence: float = 0.95,
-    samples: int = 2_000,
-) -> Interval:
-    """Percentile interval of an aggregate over seeds and tasks, each task's seeds drawn separately.
-
-    Source: Agarwal et al. 2021, arXiv 2108.13264, section 4.1.
-
-    Args:
-        scores: Shape (seeds, tasks).
-        generator: Of the draws.
-        statistic: Of a whole array of scores.
-        confidence: Of the interval.
-        samples: Number of draws.
-
-    Raises:
-        ValueError: The scores have another shape, or one is no number.
-    """
-    _check_draws(confidence, samples)
-    table = _scores(scores)
-    if table.ndim != 2 or not table.size:
-        raise ValueError(f"scores must have shape (seeds, tasks), got {table.shape}")
-    seeds, tasks = table.shape
-    draws = [
-        statistic(table[generator.integers(seeds, size=(seeds, tasks)), np.arange(tasks)])
-        for _ in range(samples)
-    ]
-    return _percentile(statistic(table), np.array(draws), confidence)
+    return stats.trim_mean(values, 0.25, axis=axis)
 
 
 def across_seeds(
@@ -177,27 +99,28 @@ def across_seeds(
     strata: ArrayLike,
     generator: np.random.Generator,
     *,
-    statistic: Callable[[Float], float] = interquartile_mean,
+    statistic: Callable[..., Any] = interquartile_mean,
     confidence: float = 0.95,
     samples: int = 2_000,
 ) -> Interval:
-    """An aggregate over seeds of each seed's mean over scenes, for other seeds in other scenes of the same make.
+    """Return an aggregate over seeds of each seed's mean over scenes, with a two-way bootstrap interval.
 
-    All agents meet the same scenes. So a draw takes seeds as whole rows and scenes as whole columns, scenes within
-    their strata. Were the entries drawn one by one, an agent that fails in many scenes would pass for many agents,
-    and the interval would be far too narrow. Scores of 0 and 1 that differ in no stratum show no spread to a bootstrap;
-    then the interval is Wilson's over the scenes.
+    The interval is for other seeds in other scenes of the same distribution. All agents meet the same scenes, so a draw
+    takes seeds as whole rows and scenes as whole columns, scenes within their strata. Were the entries drawn one by
+    one, an agent that fails in many scenes would pass for many agents, and the interval would be far too narrow
+    (`scipy.stats.bootstrap` resamples one axis only). Scores of 0 and 1 that differ in no stratum show no spread to a
+    bootstrap; then the interval is Wilson's over the scenes.
 
     Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; strata and aggregate from Agarwal et al.
         2021, arXiv 2108.13264. Intervals of a few seeds may be a little too narrow: those of five simulated agents
         covered the truth in 88 to 99 % of trials, least where agents differed most.
 
     Args:
-        scores: Shape (seeds, scenes).
+        scores: Scores, shape (seeds, scenes).
         strata: Stratum of each scene, such as its band, shape (scenes,).
-        generator: Of the draws.
-        statistic: Of the seeds' means, shape (seeds,).
-        confidence: Of the interval.
+        generator: Random generator of the draws.
+        statistic: Aggregate of the seeds' means, a function of an array and of the axis of the seeds.
+        confidence: Confidence of the interval.
         samples: Number of draws.
 
     Raises:
@@ -219,8 +142,9 @@ def across_seeds(
         times_drawn[rows] = generator.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), samples).T
     means = table @ times_drawn / scenes
     chosen = generator.integers(seeds, size=(seeds, samples))
-    draws = [statistic(each) for each in np.take_along_axis(means, chosen, axis=0).T]
-    return _percentile(statistic(table.mean(axis=1)), np.array(draws), confidence)
+    draws = statistic(np.take_along_axis(means, chosen, axis=0), axis=0)
+    low, high = np.quantile(draws, (0.5 - confidence / 2.0, 0.5 + confidence / 2.0))
+    return Interval(float(statistic(table.mean(axis=1), axis=0)), float(low), float(high))
 
 
 def probability_of_improvement(
@@ -231,18 +155,18 @@ def probability_of_improvement(
     confidence: float = 0.95,
     samples: int = 2_000,
 ) -> Interval:
-    """How likely a run of the first method is to beat one of the second, on a task drawn at random.
+    """Return the probability that a run of the first method beats one of the second, with a bootstrap interval.
 
-        P(X > Y) = mean over tasks of 1/(N M) sum_ij (1[x_i > y_j] + 1/2 1[x_i = y_j])
+        P(X > Y) = 1/(N M) sum_ij (1[x_i > y_j] + 1/2 1[x_i = y_j])
 
-    With a percentile interval, each task's runs drawn separately. Source: Agarwal et al. 2021, arXiv 2108.13264, 4.3;
-    for one task it is Mann and Whitney's U / (N M).
+    It is Mann and Whitney's U / (N M). The interval is the percentile interval of `scipy.stats.bootstrap`; a method
+    with a single run shows it no spread. Source: Agarwal et al. 2021, arXiv 2108.13264, section 4.3.
 
     Args:
-        first: Scores, shape (N, tasks).
-        second: Scores, shape (M, tasks).
-        generator: Of the draws.
-        confidence: Of the interval.
+        first: Scores of the runs, shape (N,).
+        second: Scores of the runs, shape (M,).
+        generator: Random generator of the draws.
+        confidence: Confidence of the interval.
         samples: Number of draws.
 
     Raises:
@@ -250,23 +174,23 @@ def probability_of_improvement(
     """
     _check_draws(confidence, samples)
     x, y = _scores(first), _scores(second)
-    if x.ndim != 2 or y.ndim != 2 or x.shape[1] != y.shape[1] or not x.size or not y.size:
-        raise ValueError(f"both must have shape (seeds, tasks) with equal tasks, got {x.shape} and {y.shape}")
-    tasks = np.arange(x.shape[1])
-    wins = (x[:, None] > y[None]) + 0.5 * (x[:, None] == y[None])
-    draws = [
-        wins[
-            generator.integers(len(x), size=(len(x), 1, len(tasks))),
-            generator.integers(len(y), size=(1, len(y), len(tasks))),
-            tasks,
-        ].mean()
-        for _ in range(samples)
-    ]
-    return _percentile(float(wins.mean()), np.array(draws), confidence)
+    if x.ndim != 1 or y.ndim != 1 or not x.size or not y.size:
+        raise ValueError(f"both must have shape (runs,), got {x.shape} and {y.shape}")
+    # SciPy asks for two runs at least; a single run twice gives the draws of a single run
+    low, high = stats.bootstrap(
+        [np.repeat(each, 2 if each.size == 1 else 1) for each in (x, y)],
+        _superiority,
+        n_resamples=samples,
+        confidence_level=confidence,
+        method="percentile",
+        vectorized=True,
+        rng=generator,
+    ).confidence_interval
+    return Interval(float(_superiority(x, y)), float(low), float(high))
 
 
 def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:
-    """SPL: how often a method succeeds, each success weighed by how short its path was.
+    """Return SPL: the success rate with each success weighted by how short its path was.
 
         SPL = mean(S l / max(p, l))
 
@@ -289,24 +213,15 @@ def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken:
     return float((s * shortest / np.maximum(taken, shortest)).mean())
 
 
-def _paired(first: ArrayLike, second: ArrayLike) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    a, b = np.asarray(first), np.asarray(second)
-    if a.shape != b.shape or a.ndim != 1 or not a.size:
-        raise ValueError(f"both must have the same shape (N,), N > 0, got {a.shape} and {b.shape}")
-    if not np.isin((a, b), (0, 1)).all():
-        raise ValueError(f"successes must be 0 or 1, got {np.setdiff1d((a, b), (0, 1))[0]}")
-    return a.astype(bool), b.astype(bool)
+def _superiority(x: Float, y: Float, axis: int = -1) -> Any:
+    """Compute the share of pairs in which x is greater, a tie counting half, over the last axis of both."""
+    return 0.5 + 0.5 * np.sign(x[..., :, None] - y[..., None, :]).mean(axis=(-2, -1))
 
 
 def _scores(values: ArrayLike) -> Float:
     if np.isnan(scores := np.asarray(values, dtype=np.float64)).any():
         raise ValueError(f"scores and lengths must be numbers, got nan in an array of shape {scores.shape}")
     return scores
-
-
-def _percentile(estimate: float, draws: Float, confidence: float) -> Interval:
-    low, high = np.quantile(draws, (0.5 - confidence / 2.0, 0.5 + confidence / 2.0))
-    return Interval(estimate, float(low), float(high))
 
 
 def _check_draws(confidence: float, samples: int) -> None:

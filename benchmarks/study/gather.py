@@ -250,7 +250,7 @@ def improvement(methods: Sequence[Numbers]) -> Numbers:
     result = {}
     for name, others in each.items():
         generator = np.random.default_rng(0)
-        interval = probability_of_improvement(np.c_[mine], np.c_[others], generator, samples=2000)
+        interval = probability_of_improvement(mine, others, generator, samples=2000)
         result[name] = {"interval": list(interval), "pairs": len(mine) * len(others)}
     rounded: Numbers = _rounded(result)
     return rounded
