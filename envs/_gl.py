@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import os
 import sys
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +22,8 @@ Frame = NDArray[np.uint8]
 
 OFF = ("disable", "disabled", "off", "false", "0")
 """What MUJOCO_GL says to forbid rendering."""
+LARGEST = 8192
+"""Side of a picture beyond which it is not rendered larger than it is, as OpenGL may have no room for it."""
 INSTALL = "on Debian and Ubuntu: apt-get install libegl1 libgl1"
 
 
@@ -30,41 +32,41 @@ class GLUnavailableError(gym.error.DependencyNotInstalled):
 
 
 class Canvas:
-    """A picture in memory that a scene is rendered to.
+    """Picture in memory that a scene is rendered to.
 
-    Smooth edges and soft shadows come from the mean of several passes, each with the picture moved by
-    a fraction of a pixel and the lamps by a fraction of their size.
+    `mujoco.Renderer` is not used: it takes the OpenGL platform that MUJOCO_GL named when MuJoCo was imported, GLFW if
+    none, which needs a display, and it leaves its context current in the thread that rendered.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, supersampling: int = 1) -> None:
         """Open a context for pictures of this size, whatever the model's own offscreen size is.
+
+        Args:
+            model: What is to be seen; its `vis.quality.offsamples` say how many samples a pixel takes.
+            width: Of a picture, in pixels.
+            height: Of a picture, in pixels.
+            supersampling: How many times larger it is rendered in both directions; shadows have no other smooth edges.
 
         Raises:
             GLUnavailableError: There is no OpenGL library, or it refuses.
         """
-        self.width, self.height = width, height
         self._context: Any = None
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._factor = supersampling if supersampling * max(width, height) <= LARGEST else 1
+        self._rectangle = mujoco.MjrRect(0, 0, self._factor * width, self._factor * height)
+        size = model.vis.global_
+        size.offwidth, size.offheight = self._rectangle.width, self._rectangle.height
         self._context, self._mjr = _open(model)
 
-    def draw(self, scene: mujoco.MjvScene, passes: int = 1, lamp_radius: float = 0.0) -> Frame:
-        """The scene as a picture, shape (height, width, 3).
-
-        Args:
-            scene: What is to be seen.
-            passes: How many pictures to take the mean of.
-            lamp_radius: Size of the lamps, [m]; the larger, the softer the shadows.
-        """
-        rectangle = mujoco.MjrRect(0, 0, self.width, self.height)
-        pixels = np.empty((self.height, self.width, 3), dtype=np.uint8)
-        total = np.zeros(pixels.shape, dtype=np.uint16)
+    def draw(self, scene: mujoco.MjvScene) -> Frame:
+        """Render the scene to a picture, shape (height, width, 3)."""
+        rows, columns, factor = self._rectangle.height, self._rectangle.width, self._factor
+        pixels = np.empty((rows, columns, 3), dtype=np.uint8)
         with self._context.as_current():
-            for shift in _spread(passes):
-                with _moved(scene, shift, self.height, lamp_radius):
-                    mujoco.mjr_render(rectangle, scene, self._mjr)
-                    mujoco.mjr_readPixels(pixels, None, rectangle, self._mjr)
-                total += pixels
-        return np.ascontiguousarray((total // passes).astype(np.uint8)[::-1])
+            mujoco.mjr_render(self._rectangle, scene, self._mjr)
+            mujoco.mjr_readPixels(pixels, None, self._rectangle, self._mjr)
+        upright = pixels[::-1].reshape(rows // factor, factor, columns // factor, factor, 3)
+        total = upright.sum(axis=(1, 3), dtype=np.uint16)
+        return (total // factor**2).astype(np.uint8)
 
     def close(self) -> None:
         """Give the context back; a second call changes nothing."""
@@ -140,6 +142,7 @@ def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     wish = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wish in OFF:
         raise GLUnavailableError(f"rendering is switched off by MUJOCO_GL={wish}: unset it, or set it to egl")
+    _import_triton()
     reasons = []
     for platform in _platforms(wish):
         try:
@@ -167,6 +170,17 @@ def _open_on(platform: str, model: mujoco.MjModel) -> tuple[Any, mujoco.MjrConte
     return context, mjr
 
 
+def _import_triton() -> None:
+    """Import triton, if torch can use it, before OpenGL is loaded.
+
+    Mesa's software renderer and triton both bring LLVM. If Mesa's is loaded first, the later import of triton, which
+    torch does when it makes an optimizer, ends the process; in the other order both work.
+    """
+    if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
+        with contextlib.suppress(Exception):  # a broken triton is torch's concern
+            importlib.import_module("triton")
+
+
 def _platforms(wish: str) -> tuple[str, ...]:
     """MuJoCo's OpenGL platforms in the order to try."""
     if wish in ("egl", "osmesa", "glfw", "cgl"):
@@ -182,38 +196,3 @@ def _has_display() -> bool:
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _spread(passes: int) -> NDArray[np.float64]:
-    """Points spread over the square [-1/2, 1/2]^2, shape (passes, 2): M. Roberts' R2 sequence (2018)."""
-    if passes == 1:
-        return np.zeros((1, 2))
-    steps = np.arange(passes)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])
-    return np.asarray((steps + 0.5) % 1.0 - 0.5)
-
-
-@contextlib.contextmanager
-def _moved(
-    scene: mujoco.MjvScene, shift: NDArray[np.float64], height: int, lamp_radius: float
-) -> Iterator[None]:
-    """For a while, the scene with its picture moved by `shift` pixels and its lamps by `shift` diameters."""
-    pixel = (scene.camera[0].frustum_top - scene.camera[0].frustum_bottom) / height
-    step = pixel * shift[1]
-    lamp_step = 2.0 * lamp_radius * np.array([*shift, 0.0])
-    eyes = [(eye, eye.frustum_center, eye.frustum_bottom, eye.frustum_top) for eye in scene.camera]
-    lamps = [(lamp, lamp.pos.copy()) for lamp in scene.lights[: scene.nlight] if lamp.castshadow]
-    for eye, centre, bottom, top in eyes:
-        _set_frustum(eye, centre + pixel * shift[0], bottom + step, top + step)
-    for lamp, place in lamps:
-        lamp.pos = place + lamp_step
-    try:
-        yield
-    finally:
-        for eye, *frustum in eyes:
-            _set_frustum(eye, *frustum)
-        for lamp, place in lamps:
-            lamp.pos = place
-
-
-def _set_frustum(eye: Any, centre: float, bottom: float, top: float) -> None:
-    eye.frustum_center, eye.frustum_bottom, eye.frustum_top = centre, bottom, top

@@ -21,10 +21,8 @@ __all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame
 
 Frame = NDArray[np.uint8]
 
-STILL_PASSES, FILM_PASSES = 16, 2
-"""How many pictures one picture is the mean of: many for one that is looked at, few for one of a film."""
-LAMP_RADIUS = 0.30
-"""[m]"""
+STILL_SUPERSAMPLING = 2
+"""How many times larger a single picture is rendered than it is shown; the frames of a film are not."""
 
 
 def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
@@ -103,7 +101,8 @@ class MovementRenderer:
             if self.mode == "human":
                 self._window = Window(stage.model, *self._size, title="Viapoint")
             else:
-                self._canvas = Canvas(stage.model, *self._size)
+                factor = STILL_SUPERSAMPLING if self.mode == "rgb_array" else 1
+                self._canvas = Canvas(stage.model, *self._size, supersampling=factor)
             self._stage = stage
         return self._stage
 
@@ -113,13 +112,13 @@ class MovementRenderer:
             self._window.show(stage.scene)
             return None
         assert self._canvas is not None
-        frame = self._canvas.draw(stage.scene, STILL_PASSES, LAMP_RADIUS)
+        frame = self._canvas.draw(stage.scene)
         return [frame] if self.mode == "rgb_array_list" else frame
 
     def _frame(self, stage: Stage, scene: Scenes, movement: Movement, step: int) -> Frame:
         assert self._canvas is not None
         stage.set(scene, movement.joints[step], movement, step)
-        return self._canvas.draw(stage.scene, FILM_PASSES, LAMP_RADIUS)
+        return self._canvas.draw(stage.scene)
 
     def _play(self, stage: Stage, scene: Scenes, movement: Movement, steps: NDArray[np.int64]) -> None:
         """Play the film in the window in real time; frames that come too late are left out."""

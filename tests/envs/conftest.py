@@ -16,9 +16,8 @@ OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 
 @pytest.fixture
 def quick_pictures(monkeypatch):
-    """One pass for each picture: what is tested here does not need to look good."""
-    monkeypatch.setattr(rendering, "FILM_PASSES", 1)
-    monkeypatch.setattr(rendering, "STILL_PASSES", 1)
+    """Pictures without supersampling: what is tested here does not need to look good."""
+    monkeypatch.setattr(rendering, "STILL_SUPERSAMPLING", 1)
 
 
 @pytest.fixture(scope="session")

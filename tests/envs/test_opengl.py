@@ -123,3 +123,27 @@ def test_nothing_of_opengl_is_loaded_before_the_first_picture():
     )
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+@pytest.mark.usefixtures("opengl")
+@pytest.mark.parametrize("names", [("torch", "triton"), ("triton",)])
+def test_triton_is_loaded_before_opengl_where_torch_could_use_it(tmp_path, names):
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(
+            f"import sys; assert 'mujoco.egl' not in sys.modules; print('{name}')"
+        )
+    code = (
+        "import sys\n"
+        "if 'torch' not in NAMES: sys.modules['torch'] = None\n"
+        "import gymnasium as gym, viapoint.envs\n"
+        "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array', width=16, height=16)\n"
+        "env.reset(seed=0); env.render()\n"
+        "env.close()\n"
+    ).replace("NAMES", repr(names))
+    path = os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    environment["PYTHONPATH"] = path
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.split() == (["triton"] if "torch" in names else [])
