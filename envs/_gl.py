@@ -66,7 +66,7 @@ class Canvas:
             mujoco.mjr_readPixels(pixels, None, self._rectangle, self._mjr)
         upright = pixels[::-1].reshape(rows // factor, factor, columns // factor, factor, 3)
         total = upright.sum(axis=(1, 3), dtype=np.uint16)
-        return (total // factor**2).astype(np.uint8)
+        return np.asarray(total // factor**2, dtype=np.uint8)
 
     def close(self) -> None:
         """Give the context back; a second call changes nothing."""
