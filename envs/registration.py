@@ -58,6 +58,9 @@ ONLINE_TASKS: dict[str, dict[str, Any]] = {
 They are those of :class:`~viapoint.envs.reach_online.OnlineReachVectorEnv`.
 """
 
+ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
+"""Every id."""
+
 
 def register_all() -> None:
     """Make every id known to Gymnasium; a second call changes nothing."""
@@ -71,6 +74,20 @@ def register_all() -> None:
     for name, kwargs in ONLINE_TASKS.items():
         module = "viapoint.envs.reach_online"
         _register(name, f"{module}:OnlineReachEnv", f"{module}:OnlineReachVectorEnv", kwargs)
+
+
+def check_registered(env_id: str) -> None:
+    """Check that Gymnasium knows an id; otherwise the error lists those of this package.
+
+    Raises:
+        ValueError: No such environment is registered.
+    """
+    try:
+        gym.spec(env_id)
+    except gym.error.UnregisteredEnv as error:
+        raise ValueError(
+            f"there is no environment {env_id!r} ({error}); `import viapoint.envs` registers {', '.join(ENV_IDS)}"
+        ) from None
 
 
 def twin_of(env_id: str) -> str:

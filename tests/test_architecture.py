@@ -83,6 +83,7 @@ def test_what_training_imports_is_declared():
     [
         ("viapoint.primitives", ("torch", "mujoco", "gymnasium", "scipy", "matplotlib")),
         ("viapoint.envs", ("torch", "stable_baselines3", "matplotlib", "scipy", "viapoint.training")),
+        ("viapoint.training.entry", ("tyro", "rich", "tqdm", "numpy", "torch", "mujoco")),
         ("viapoint.training.cli", ("torch", "stable_baselines3", "matplotlib", "scipy")),
     ],
 )

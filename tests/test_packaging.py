@@ -68,4 +68,4 @@ def test_nothing_else_is_inside(wheel):
 
 def test_the_console_script_is_declared(wheel):
     (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
-    assert "viapoint = viapoint.training.cli:main" in wheel.read(name).decode()
+    assert "viapoint = viapoint.training.entry:main" in wheel.read(name).decode()

@@ -11,23 +11,20 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
-from viapoint.training import doctor
+import tyro
 
-try:
-    import tyro
-
-    from viapoint.training.config import (
-        BenchConfig,
-        DemoConfig,
-        DoctorConfig,
-        EvaluateConfig,
-        ImportConfig,
-        PaperConfig,
-        PlayConfig,
-        TrainConfig,
-    )
-except ImportError as error:  # something is missing, or broken
-    doctor.without_command(error)
+from viapoint.envs.registration import ENV_IDS
+from viapoint.training.config import (
+    BenchConfig,
+    DemoConfig,
+    DoctorConfig,
+    EvaluateConfig,
+    ImportConfig,
+    PaperConfig,
+    PlayConfig,
+    TrainConfig,
+)
+from viapoint.training.doctor import explain_import_error
 
 
 class UsageError(ValueError):
@@ -60,7 +57,8 @@ COMMANDS: dict[str, Command] = {
 
 DESCRIPTION = (
     "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
-    "`viapoint COMMAND --help` shows a command's options; --debug shows where an error came from."
+    "`viapoint COMMAND --help` shows a command's options and an example; --debug shows where an error came from. "
+    f"Environments: {', '.join(ENV_IDS)}."
 )
 
 
@@ -142,6 +140,8 @@ def _unboxed(text: str) -> str:
 
 
 def _one_line(error: Exception) -> str:
+    if isinstance(error, ImportError):
+        return explain_import_error(error)
     known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
         ("viapoint", "gymnasium")
     )

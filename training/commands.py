@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.training import report

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 
@@ -33,9 +33,10 @@ GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
 
 def check_env(env: str) -> None:
     """Refuse an id that is not one of this package's."""
-    known = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
-    if env not in known:
-        raise ValueError(f"env must be one of {', '.join(known)}, got {env!r}")
+    if env not in ENV_IDS:
+        raise ValueError(
+            f"env must be one of {', '.join(ENV_IDS)}, which `import viapoint.envs` registers; got {env!r}"
+        )
 
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:

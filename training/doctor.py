@@ -6,6 +6,7 @@ Nothing but the standard library is imported before a check asks for it, so that
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -14,11 +15,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 PATIENCE = 120.0
 """Time that a check in a process of its own may take, [s]."""
@@ -27,6 +28,7 @@ SPACE = 1 << 30
 REINSTALL = "pip install --force-reinstall 'mujoco>=4'"
 OPTIONAL = {"moviepy": "gymnasium's RecordVideo", "ompl": "the baseline by a motion planner (RRT-Connect)"}
 """Packages that only some things need, and what these are."""
+INSTALL_TRAINING = "pip install 'viapoint[training]'"
 REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
 
 STEP = """
@@ -45,6 +47,20 @@ context = env.unwrapped.batch._renderer._canvas._context
 print("a frame rendered by", type(context).__module__.rpartition(".")[2])
 env.close()
 """
+RENDER_THEN_TRAIN = """
+import gymnasium as gym, viapoint.envs
+env = gym.make("viapoint/PlanarObstacles-v0", render_mode="rgb_array", width=16, height=16)
+env.reset(seed=0)
+try:
+    env.render()
+except viapoint.envs.rendering.GLUnavailableError:
+    print("nothing can be rendered, so nothing can collide")
+    raise SystemExit
+import torch
+torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
+print("an optimizer was made after a frame was rendered")
+"""
+UPDATE_TRITON = "import torch (and triton) before the first picture is rendered, or pip uninstall triton"
 AGENT = """
 from viapoint.training.commands import find_agent
 agent = find_agent(None, "viapoint/PlanarObstacles-v0")
@@ -83,11 +99,31 @@ def run(config: Any) -> None:
     raise SystemExit(0 if all_works(findings) else 1)
 
 
-def without_command(error: ImportError) -> NoReturn:
-    """Report nevertheless where `viapoint doctor` was asked for and what reads the command line cannot be imported."""
-    if sys.argv[1:2] == ["doctor"]:
-        run(SimpleNamespace(out=Path("runs"), json="--json" in sys.argv))
-    raise error
+def run_without_command(words: Sequence[str]) -> NoReturn:
+    """Check everything where what reads the command line cannot be imported."""
+    run(SimpleNamespace(out=Path("runs"), json="--json" in words))
+    raise AssertionError  # run exits
+
+
+def explain_import_error(error: ImportError) -> str:
+    """Return one line on a failed import: what to install if packages of the extra `training` are missing."""
+    missing = missing_packages()
+    if missing:
+        return (
+            f"the command needs the extra `training`, {', '.join(missing)} not installed: {INSTALL_TRAINING}"
+        )
+    return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"
+
+
+def missing_packages() -> list[str]:
+    """Return the packages of the extra `training` that are not installed."""
+    try:
+        requirements = importlib.metadata.requires("viapoint") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    return [
+        each.name for each in parsed(requirements) if each.extra == "training" and not installed(each.name)
+    ]
 
 
 def all_works(findings: list[Finding]) -> bool:
@@ -110,34 +146,65 @@ def examine(folder: Path) -> Iterator[Finding]:
         "OpenGL", FRAME, "without it films are drawn from above; on Debian and Ubuntu: apt-get install libegl1 libgl1",
         needed=False,
     )  # fmt: skip
-    yield attempt("video encoder", encoder, "pip install imageio-ffmpeg")
-    yield attempt("torch", torch_threads, "pip install 'viapoint[training]'")
-    yield in_a_process("shipped agent", AGENT, "pip install --force-reinstall viapoint")
+    if not missing_packages():
+        yield attempt("video encoder", encoder, "pip install imageio-ffmpeg")
+        yield attempt("torch", torch_threads, INSTALL_TRAINING)
+        yield in_a_process("train and render", RENDER_THEN_TRAIN, UPDATE_TRITON)
+        yield in_a_process("shipped agent", AGENT, "pip install --force-reinstall viapoint")
     yield attempt("processors", processors, "")
     yield attempt(
         "disk", lambda: disk(folder), f"choose another folder than {folder}, or make room on its disk"
     )
 
 
-def packages(requirements: list[str]) -> Iterator[Finding]:
-    """Versions against the bounds that the installed package states."""
-    for line in requirements:
+class Requirement(NamedTuple):
+    """Line of the package's metadata on a package that it needs."""
+
+    name: str
+    least: str
+    """Oldest version."""
+    extra: str
+    """Name of the extra that needs it; '' if it is always needed."""
+
+
+def parsed(lines: Iterable[str]) -> Iterator[Requirement]:
+    """Yield the requirements that the installed package states."""
+    for line in lines:
         found = REQUIREMENT.match(line)
         extra = re.search(r"extra == ['\"](\w+)['\"]", line)
-        if found is None or found["name"] == "viapoint":
-            continue
-        name, least = found["name"], found["least"] or "0"
-        if extra is not None and extra[1] != "training" and name not in OPTIONAL:
+        if found is not None and found["name"] != "viapoint":
+            yield Requirement(found["name"], found["least"] or "0", extra[1] if extra else "")
+
+
+def installed(name: str) -> str:
+    """Return the version of a package that can be found by an import as well, '' if there is none."""
+    try:
+        version = importlib.metadata.version(name)
+        return version if importlib.util.find_spec(name.replace("-", "_")) else ""
+    except (importlib.metadata.PackageNotFoundError, ImportError):
+        return ""
+
+
+def packages(lines: Iterable[str]) -> Iterator[Finding]:
+    """Compare versions with the bounds that the installed package states."""
+    missing = []
+    for name, least, extra in parsed(lines):
+        if extra not in ("", "training") and name not in OPTIONAL:
             continue  # a tool of development
-        try:
-            version = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            version = ""
+        version = installed(name)
+        if extra == "training" and not version:
+            missing.append(name)
+            continue
         use = f" (for {OPTIONAL[name]})" if name in OPTIONAL else ""
         yield Finding(
             name=name, works=bool(version) and at_least(version, least), needed=name not in OPTIONAL,
             found=f"{version or 'not installed'}, {least} or newer wanted{use}",
             remedy=f"pip install '{name}>={least}'",
+        )  # fmt: skip
+    if missing:
+        yield Finding(
+            name="extra training", works=False, needed=True, remedy=INSTALL_TRAINING,
+            found=f"the environments work without, the commands do not; not installed: {', '.join(missing)}",
         )  # fmt: skip
 
 

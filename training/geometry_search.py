@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from viapoint.envs.action import Plan
+from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes import Scenes, problems
 from viapoint.envs.task import Task
 from viapoint.training.candidates import candidate_actions, sobol_actions
@@ -208,6 +209,7 @@ def worth_of_plans(
 
 def task_of(env_id: str, **kwargs: Any) -> Task:
     """Return the task of a registered environment made with `kwargs`."""
+    check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
     task: Task = env.unwrapped.task
     env.close()

@@ -6,12 +6,14 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
+from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.baselines import agent_method
 from viapoint.training.drawn_scenes import drawn, frozen_fit
@@ -104,11 +106,24 @@ class Monitor(BaseCallback):
         """Trained so far, earlier parts of the run included, validation excluded, [s]."""
         return self._seconds_before + time.monotonic() - self._began
 
+    @property
+    def _title(self) -> str:
+        return f"{self.config.algo} on {self.config.env.rpartition('/')[2]}"
+
+    @contextmanager
+    def _showing(self, work: str) -> Iterator[None]:
+        """Show in the progress bar what learning waits for."""
+        self._bar.set_description(work)
+        try:
+            yield
+        finally:
+            self._bar.set_description(self._title)
+
     def __enter__(self) -> Monitor:
         self._bar = tqdm(
             total=self.config.total_timesteps,
             unit=" decisions",
-            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
+            desc=self._title,
             disable=not self.config.progress,
             file=sys.stderr,
             dynamic_ncols=True,
@@ -172,20 +187,22 @@ class Monitor(BaseCallback):
         return True
 
     def _keep(self) -> None:
-        self.run.checkpoint(self.model, self.state())
+        with self._showing("saving a checkpoint"):
+            self.run.checkpoint(self.model, self.state())
 
     def _validate(self, frozen: FrozenScenes) -> None:
         """Measure the policy alone, add to the learning curve, keep the model if it is the best so far."""
         if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
             return
         seconds, began = self.seconds, time.monotonic()
-        result = evaluate(
-            [agent_method("agent", self.model)],
-            frozen,
-            frozen.env_id,
-            env_kwargs=whole_task(self.config.env, self.config.env_kwargs)[1],
-            time_decisions=False,
-        ).results[0]
+        with self._showing(f"validating in {len(frozen.share)} scenes"):
+            result = evaluate(
+                [agent_method("agent", self.model)],
+                frozen,
+                frozen.env_id,
+                env_kwargs=whole_task(self.config.env, self.config.env_kwargs)[1],
+                time_decisions=False,
+            ).results[0]
         if result.partial:
             return
         self.curve.append(self._record(result, seconds))
@@ -194,7 +211,9 @@ class Monitor(BaseCallback):
         ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
-            self.run.save("best", self.model)
+            with self._showing("saving the best model"):
+                self.run.save("best", self.model)
+        self._show_progress()
         self._began += time.monotonic() - began
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
@@ -245,11 +264,12 @@ class Monitor(BaseCallback):
 
     def _show_progress(self) -> None:
         self._bar.update(min(self.num_timesteps, self.config.total_timesteps) - self._bar.n)
+        shown = {}
         if self._recent:
-            shown = {"success": f"{100.0 * self._average('is_success'):.0f} %"}
-            if self.curve:
-                shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
-            self._bar.set_postfix(shown, refresh=False)
+            shown["success"] = f"{100.0 * self._average('is_success'):.0f} %"
+        if self.curve:
+            shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
+        self._bar.set_postfix(shown, refresh=False)
 
 
 def _timestep(env: Any) -> float:

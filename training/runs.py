@@ -72,6 +72,16 @@ class Run:
                 folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
             ) from None
 
+    def __repr__(self) -> str:
+        config, curve = self.config, self.curve
+        success = (
+            f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
+        )
+        return (
+            f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
+            f"{self.decisions} of {config.total_timesteps} decisions{success})"
+        )
+
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
         """Make the folder of a new run.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from viapoint.envs.action import Plan
 from viapoint.envs.reach import ReachVectorEnv
 from viapoint.envs.reach_vector import Decision
+from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes import Scenes
 
 Float = NDArray[np.float64]
@@ -39,6 +40,7 @@ class Trial:
     """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
+        check_registered(env_id)
         self.env_id, self.kwargs = env_id, kwargs
         sizes = {num_envs, min(num_envs, 64)}
         self._envs: dict[int, ReachVectorEnv] = {

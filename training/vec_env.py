@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
+from viapoint.envs.registration import check_registered
 from viapoint.envs.reward import RewardTerms
 from viapoint.training.discount import ELAPSED
 
@@ -44,6 +45,7 @@ class ViaVecEnv(VecEnv):
     """
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
+        check_registered(env_id)
         native = gym.spec(env_id).vector_entry_point is not None
         same_step: dict[str, Any] = (
             {} if native else {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}

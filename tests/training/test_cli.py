@@ -7,6 +7,7 @@ import shlex
 
 import pytest
 
+from viapoint.envs.registration import ENV_IDS
 from viapoint.training import cli
 from viapoint.training.commands import pretrained_folder
 from viapoint.training.config import EvaluateConfig, TrainConfig
@@ -55,6 +56,13 @@ def test_help_is_short_and_has_an_example(words, capsys):
     assert len(text.splitlines()) < 60
 
 
+def test_help_lists_the_environments(capsys):
+    with pytest.raises(SystemExit):
+        run("--help")
+    text = "".join(capsys.readouterr().out.split())
+    assert all(env_id in text for env_id in ENV_IDS)
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [
@@ -65,6 +73,7 @@ def test_help_is_short_and_has_an_example(words, capsys):
         ("train --seed x", "--seed"),
         ("train --speed 3", "--speed"),
         ("train --env CartPole-v1", "viapoint/Reach-v0, viapoint/Obstacles-v0"),
+        ("train --env CartPole-v1", "`import viapoint.envs` registers; got 'CartPole-v1'"),
         ("train --env-kwargs n_via", "NAME=VALUE"),
         ("train --env-kwargs n_via=2 n_via=3", "n_via is there twice, as 2 and as 3"),
         ("train --env-kwargs whole_arm=True", "whole_arm=True is no JSON"),

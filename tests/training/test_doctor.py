@@ -15,7 +15,7 @@ GOOD, GONE = "print('fine')", "import no_such_module"
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """The checks in processes of their own are tried once, below."""
-    for name in ("STEP", "FRAME", "AGENT"):
+    for name in ("STEP", "FRAME", "RENDER_THEN_TRAIN", "AGENT"):
         monkeypatch.setattr(doctor, name, GOOD)
 
 
@@ -34,6 +34,7 @@ def test_all_is_well_here(capsys, tmp_path, monkeypatch):
     assert record["works"] is (code == 0)
     assert [name for name, each in findings.items() if each["needed"] and not each["works"]] == []
     assert "physics steps" in findings["MuJoCo engine"]["found"]
+    assert findings["train and render"]["works"]
     assert not (tmp_path / "runs").exists()
 
 
@@ -124,7 +125,7 @@ def broken(tmp_path):
 
 def test_an_upgrade_in_place_is_recognised_even_if_nothing_can_be_imported(broken):
     env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(broken), os.environ.get("PYTHONPATH", "")))}
-    script = "import sys; sys.argv[1:] = WORDS; from viapoint.training.cli import main; main()"
+    script = "import sys; sys.argv[1:] = WORDS; from viapoint.training.entry import main; main()"
     told = subprocess.run(
         [sys.executable, "-c", script.replace("WORDS", "['doctor', '--json']")],
         capture_output=True,
@@ -140,4 +141,72 @@ def test_an_upgrade_in_place_is_recognised_even_if_nothing_can_be_imported(broke
     other = subprocess.run(
         [sys.executable, "-c", script.replace("WORDS", "['train']")], capture_output=True, text=True, env=env
     )
-    assert "--force-reinstall" in other.stderr.splitlines()[-1]
+    assert other.returncode == 2
+    (line,) = other.stderr.splitlines()
+    assert "--force-reinstall" in line
+
+
+EXTRA = (
+    "torch",
+    "stable_baselines3",
+    "sb3_contrib",
+    "tyro",
+    "rich",
+    "tqdm",
+    "matplotlib",
+    "scipy",
+    "safetensors",
+)
+
+
+@pytest.fixture
+def without_extra(tmp_path):
+    """Environment variables of a Python that cannot import the packages of the extra."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] in {EXTRA}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+    )
+    return {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))}
+
+
+@pytest.mark.parametrize("words", [["train"], [], ["--help"], ["evaluate", "--env", "viapoint/Nothing-v0"]])
+def test_without_the_extra_the_command_says_in_one_line_what_to_install(without_extra, words):
+    script = f"import sys; sys.argv[1:] = {words}; from viapoint.training.entry import main; main()"
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)
+    assert told.returncode == 2
+    (line,) = told.stderr.splitlines()
+    assert "pip install 'viapoint[training]'" in line
+    assert "tyro" in line
+
+
+def test_without_the_extra_the_report_advises_the_extra_and_no_new_installation(without_extra):
+    script = (
+        "import sys; sys.argv[1:] = ['doctor', '--json']; from viapoint.training.entry import main; main()"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)
+    assert told.returncode == 1, told.stderr
+    failed = [each for each in json.loads(told.stdout)["findings"] if each["needed"] and not each["works"]]
+    assert [(each["name"], each["remedy"]) for each in failed] == [
+        ("extra training", "pip install 'viapoint[training]'")
+    ]
+    assert "torch" in failed[0]["found"]
+
+
+def test_a_package_that_only_one_command_needs_is_named_by_that_command(capsys, monkeypatch):
+    def broken(self, config):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    monkeypatch.setattr(cli.Command, "__call__", broken)
+    monkeypatch.setattr(doctor, "installed", lambda name: "" if name == "torch" else "1")
+    with pytest.raises(SystemExit) as end:
+        cli.main(["train"])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        "viapoint: the command needs the extra `training`, torch not installed: "
+        "pip install 'viapoint[training]'"
+    )

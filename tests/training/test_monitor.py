@@ -77,3 +77,33 @@ def test_arguments_of_the_action_leave_the_validation_scenes_as_they_are(shipped
         run = Run.create(TrainConfig(out=tmp_path / str(same), env_kwargs=kwargs, eval_scenes=8))
         scenes = monitor.validation_scenes(run)
         assert (scenes.sha256 == shipped.take(slice(0, 8)).sha256) == same
+
+
+def test_the_bar_says_what_learning_waits_for_and_shows_the_last_validation(shipped, tmp_path, capsys):
+    run = train(
+        TrainConfig(
+            algo="viaq",
+            n_timesteps=64,
+            n_envs=32,
+            eval_every=32,
+            eval_scenes=4,
+            checkpoint_every=32,
+            out=tmp_path / "run",
+            env_kwargs={"threads": 1},
+            hyperparameters={"learning_starts": 32},
+        )
+    )
+    shown = capsys.readouterr().err
+    for words in (
+        "viaq on PlanarObstacles-v0",
+        "validating in 4 scenes",
+        "saving a checkpoint",
+        "saving the best model",
+    ):
+        assert words in shown
+    success = f"{100.0 * run.curve[-1]['success']['rate']:.1f} %"
+    assert shown.rstrip().splitlines()[-1].count(f"validation={success}")
+    assert repr(run) == (
+        f"Run({str(run.folder)!r}: viaq on viapoint/PlanarObstacles-v0, seed 0, 64 of 64 decisions, success {success} "
+        "on validation scenes)"
+    )

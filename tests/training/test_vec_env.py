@@ -1,5 +1,8 @@
 """SB3's view of the environment is the environment."""
 
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +11,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
+from viapoint.training.geometry_search import GeometrySearch
+from viapoint.training.trial import Trial
 from viapoint.training.vec_env import ViaVecEnv
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -234,3 +239,31 @@ def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
     assert not [each for each in recwarn if "Monitor" in str(each.message)]
     assert lengths == [1] * 12
     assert len(set(rewards)) == 12
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ViaVecEnv("viapoint/Nothing-v0", 2),
+        lambda: GeometrySearch("viapoint/Nothing-v0"),
+        lambda: Trial("Nothing-v3"),
+    ],
+)
+def test_an_unknown_id_is_answered_with_those_that_there_are(make):
+    with pytest.raises(
+        ValueError, match=r"Nothing.*`import viapoint\.envs` registers viapoint/PlanarReach-v0, "
+    ):
+        make()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from viapoint.training.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
+        "from viapoint.training.geometry_search import GeometrySearch; GeometrySearch(ID)",
+        "from viapoint.training.trial import Trial; Trial(ID, 2)",
+        "from viapoint.training.commands import find_agent; find_agent(None, ID)",
+    ],
+)
+def test_whoever_is_given_an_id_registers_it(line):
+    subprocess.run([sys.executable, "-c", line.replace("ID", "'viapoint/PlanarObstacles-v0'")], check=True)
