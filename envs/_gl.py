@@ -96,6 +96,7 @@ class Window:
                 "WAYLAND_DISPLAY is set): use render_mode='rgb_array' or 'rgb_array_list', or run under a "
                 "virtual display, e.g. xvfb-run -a python ..."
             )
+        _import_triton()
         import glfw
 
         self._glfw = glfw

@@ -207,6 +207,6 @@ def test_a_package_that_only_one_command_needs_is_named_by_that_command(capsys, 
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == (
-        "viapoint: the command needs the extra `training`, torch not installed: "
+        "viapoint: the command needs the extra `training` (not installed: torch): "
         "pip install 'viapoint[training]'"
     )
