@@ -109,9 +109,8 @@ def explain_import_error(error: ImportError) -> str:
     """Return one line on a failed import: what to install if packages of the extra `training` are missing."""
     missing = missing_packages()
     if missing:
-        return (
-            f"the command needs the extra `training`, {', '.join(missing)} not installed: {INSTALL_TRAINING}"
-        )
+        names = ", ".join(missing)
+        return f"the command needs the extra `training` (not installed: {names}): {INSTALL_TRAINING}"
     return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"
 
 
