@@ -1,4 +1,4 @@
-"""Minimum-jerk movements through via-points: numbers in, trajectories out.
+"""Minimum-jerk movements through via-points.
 
 Every function takes NumPy arrays or torch tensors with any leading (batch) dimensions and returns the same
 kind. Units are metres and seconds.

@@ -1,8 +1,14 @@
-"""Values of many piecewise polynomials at many times: the part that limits the speed.
+"""Evaluation of many piecewise polynomials at many times: the part that limits the speed.
 
-All segments go into one small matrix product per trajectory: column (k, s) of the basis is u_s^k where
-segment s is the current one and zero elsewhere. NumPy's stacked product treats every trajectory by itself
-with the same inner sizes, so a batch gives bit for bit what each item gives alone.
+All segments go into one small matrix product per trajectory,
+
+    x^(nu)(t) = sum_(k, s) B_(k, s)(t) c^(nu)_(k, s),   B_(k, s)(t) = u_s^k if segment s is current, else 0.  (1)
+
+NumPy's stacked product computes every trajectory by itself with the same inner sizes, so an item of a batch
+gives the same bits as alone.
+
+The basis is implemented twice: for any library, and for NumPy into a reused buffer, where most of the time is
+spent. Without the buffer 4,096 movements with 200 samples each take 17 % (K = 1) to 27 % (K = 3) longer.
 """
 
 from __future__ import annotations
@@ -14,17 +20,17 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import derivative_factors
-from .array_api import Array, Namespace, blocks, constant
+from .array_api import Array, Namespace, constant, power
 
 _BLOCK_BYTES = 1_200_000
-"""Size of the basis of one block of trajectories: it stays in a core's second-level cache while it is
-used."""
+"""Size of the basis of one block of trajectories, which stays in a core's second-level cache."""
+
 _FEW = 8
-"""Below so many times the libraries of linear algebra have special cases for the distance of the rows."""
+"""Number of times below which linear algebra libraries have special cases that depend on the row distance."""
 
 
-def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:
-    """Return the columns of the basis, transposed.
+def _power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:
+    """Return the transposed basis of Eq. 1.
 
     Args:
         time: (..., T) [s], within the movement.
@@ -36,23 +42,22 @@ def power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Names
     Returns:
         (..., (degree + 1) S, T); row k S + s is u_s^k where segment s is current, else 0.
     """
-    power = (time[..., None, :] - starts[..., None]) * rates[..., None]
-    current = xp.ones_like(power)
+    local = (time[..., None, :] - starts[..., None]) * rates[..., None]
+    current = xp.ones_like(local)
     if starts.shape[-1] > 1:
         current = xp.astype(_current_segment(time, starts, xp), starts.dtype)
-        power = power * current
-    rows, local = [current, power], power
+        local = local * current
+    rows = [current, local]
     while len(rows) <= degree:
-        power = power * local
-        rows.append(power)
+        rows.append(rows[-1] * local)
     return xp.concat(rows, axis=-2)
 
 
 def _power_basis_into(basis: Any, time: Any, starts: Any, rates: Any) -> Any:
-    """Do the same for NumPy in a buffer (degree + 1, S, ..., T): here most of the time is spent.
+    """Compute the basis of Eq. 1 in a NumPy buffer (degree + 1, S, ..., T).
 
-    With the batch inside, every step runs over contiguous memory, and the rows of one trajectory are still
-    evenly spaced, as a matrix product needs them.
+    With the batch axes inside, every step runs over contiguous memory, and the rows of one trajectory are
+    still evenly spaced, as a matrix product needs them.
     """
     current, local = basis[0], basis[1]
     if len(current) == 1:
@@ -68,12 +73,12 @@ def _power_basis_into(basis: Any, time: Any, starts: Any, rates: Any) -> Any:
     for k in range(2, len(basis)):
         np.multiply(basis[k - 1], factor, out=basis[k])
     rows = _first_inside(basis.reshape(len(basis) * len(current), *current.shape[1:]))
-    # At one to three times some products depend on where the rows lie: there they lie as in a batch of one.
+    # At one to three times some products depend on the memory layout: copy to the layout of a batch of one.
     return rows if rows.shape[-1] >= _FEW else np.ascontiguousarray(rows)
 
 
 def _buffer(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return an empty array that begins on a line of the cache: a quarter of the time, against chance."""
+    """Return an empty array aligned to a cache line, which vector instructions read faster."""
     size = math.prod(shape)
     memory = np.empty(size + 64 // dtype.itemsize, dtype)
     first = -memory.__array_interface__["data"][0] % 64 // dtype.itemsize
@@ -81,12 +86,12 @@ def _buffer(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def _first_inside(array: Any) -> Any:
-    """(rows, ..., T) as (..., rows, T), a view."""
+    """Return a view of (rows, ..., T) as (..., rows, T)."""
     return array.transpose(*range(1, array.ndim - 1), 0, -1)
 
 
 def _current_segment_into(current: Any, time: Any, starts: Any) -> None:
-    """Fill (S, ..., T) with what `_current_segment` gives."""
+    """Write the indicator of `_current_segment` to `current` (S, ..., T)."""
     if starts.ndim < time.ndim:
         starts = starts.reshape((1,) * (time.ndim - starts.ndim) + starts.shape)
     later = starts.transpose(-1, *range(starts.ndim - 1))[1:, ..., None]
@@ -97,7 +102,7 @@ def _current_segment_into(current: Any, time: Any, starts: Any) -> None:
 
 
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
-    """(..., S, T): True where start_s <= time < start_(s+1), S >= 2; the last segment has no end."""
+    """Return (..., S, T), True where start_s <= time < start_(s+1), S >= 2; the last segment has no end."""
     reached = time[..., None, :] >= starts[..., 1:, None]
     parts = [~reached[..., :1, :], reached[..., -1:, :]]
     if reached.shape[-2] > 1:
@@ -109,11 +114,8 @@ def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array
     """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time."""
     if nu == 0:
         return coefficients
-    order = coefficients.shape[-3] // 2
-    scale = rates
-    for _ in range(nu - 1):
-        scale = scale * rates
-    factors = constant(derivative_factors(order, nu), coefficients) * scale[..., None, :]
+    table = derivative_factors(coefficients.shape[-3] // 2, nu)
+    factors = constant(table, coefficients) * power(rates, nu)[..., None, :]
     return coefficients[..., nu:, :, :] * factors[..., None]
 
 
@@ -126,7 +128,7 @@ def evaluate(
     out: Sequence[Array] | None,
     xp: Namespace,
 ) -> list[Array]:
-    """Return derivatives `orders` at `time`, each (..., T, D), in `out` where it is given.
+    """Return derivatives `orders` at `time`, each (..., T, D), written to `out` if that is given.
 
     Args:
         coefficients: (..., 2m, S, D).
@@ -144,7 +146,7 @@ def evaluate(
         weights.append(weight.reshape(*weight.shape[:-3], (powers - nu) * segments, dimension))
     degree = max(1, powers - 1 - min(orders))
     if xp is not np:
-        return _products(power_basis(time, starts, rates, degree, xp), weights, out, xp)
+        return _products(_power_basis(time, starts, rates, degree, xp), weights, out, xp)
     if out is None:
         batch = np.broadcast(coefficients[..., 0, 0, :1], time[..., :1]).shape[:-1]
         out = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
@@ -160,22 +162,20 @@ def evaluate(
 
 
 def _products(basis: Array, weights: list[Array], out: Sequence[Array] | None, xp: Namespace) -> list[Array]:
-    """Multiply the basis with the coefficients of each derivative; it uses the first rows of the basis."""
-    results = []
-    for place, weight in enumerate(weights):
-        columns = basis[..., : weight.shape[-2], :].mT
-        if out is None:
-            results.append(xp.matmul(columns, weight))
-        elif xp is np:
-            results.append(np.matmul(columns, weight, out=out[place]))
+    """Return the products of the basis with the coefficients of each derivative, which use its first rows."""
+    factors = [(basis[..., : weight.shape[-2], :].mT, weight) for weight in weights]
+    if out is None:
+        return [xp.matmul(*pair) for pair in factors]
+    for buffer, pair in zip(out, factors, strict=True):
+        if xp is np:
+            np.matmul(*pair, out=buffer)
         else:
-            out[place][...] = xp.matmul(columns, weight)
-            results.append(out[place])
-    return results
+            buffer[...] = xp.matmul(*pair)
+    return list(out)
 
 
 def _blocks(coefficients: Any, starts: Any, time: Any) -> Iterator[tuple[Any, tuple[Any, Any]]]:
-    """Index of each block of the batch, and of the same block in `time` and `starts` (or all, if shared)."""
+    """Return indices of each block of the batch, and of the block in `time` and `starts` (all, if shared)."""
     count, own = len(coefficients), [array.ndim == 2 and len(array) > 1 for array in (time, starts)]
     plain = coefficients.ndim == 4 and all(array.ndim <= 2 for array in (time, starts))
     fitting = all(len(array) in (1, count) for array in (time, starts) if array.ndim == 2)
@@ -184,5 +184,5 @@ def _blocks(coefficients: Any, starts: Any, time: Any) -> Iterator[tuple[Any, tu
         return
     each = math.prod(coefficients.shape[1:3]) * time.shape[-1] * coefficients.itemsize
     size = max(1, _BLOCK_BYTES // max(1, each))
-    for where in blocks(count, size):
+    for where in (slice(first, first + size) for first in range(0, count, size)):
         yield where, (where if own[0] else ..., where if own[1] else ...)

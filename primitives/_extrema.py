@@ -1,33 +1,36 @@
-"""Exact extremes of piecewise polynomials: stationary points from roots, and the ends of the pieces.
+"""Exact extrema of piecewise polynomials: stationary points from polynomial roots, and segment ends.
 
-The places are found in NumPy, outside of any gradient. The values are then read there in the caller's own
-array library; since the slope vanishes at an extremum, or the place is an end, their gradients are right as
-well.
+The times are computed in NumPy, outside of any gradient. The values are then evaluated in the caller's array
+library. Their gradients are right: the slope vanishes at an extremum (envelope theorem), or the time is a knot.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from math import frexp
 from typing import Any
 
 import numpy as np
 
 from ._evaluate import derivative_coefficients
-from ._polynomial import Floats, differentiate, evaluate, multiply, root_candidates, unit_size
-from .array_api import Array, Namespace, like, to_numpy
+from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
+from .array_api import Array, Floats, Namespace, largest_exponent, like, ordered_sum, to_numpy
 
 
 @dataclass(frozen=True)
 class Extrema:
-    """Least and greatest value along each axis, and when they are reached first.
+    """Least and greatest value along each axis, with the first time of each.
 
     Attributes:
         minimum: (..., D) [m/s^nu].
         minimum_time: (..., D) [s].
         maximum: (..., D) [m/s^nu].
         maximum_time: (..., D) [s].
+
+    Example:
+        >>> from viapoint.primitives import point_to_point
+        >>> extrema = point_to_point([0.0], [1.0], 2.0).extrema(1)  # of the velocity
+        >>> extrema.maximum.round(9).tolist(), extrema.maximum_time.round(9).tolist()
+        ([0.9375], [1.0])
     """
 
     minimum: Array
@@ -38,7 +41,7 @@ class Extrema:
 
 @dataclass(frozen=True)
 class Pieces:
-    """One derivative: (..., n, S, D) coefficients, (..., S) starts and rates, (..., 1) end."""
+    """One derivative of a trajectory: (..., n, S, D) coefficients, (..., S) starts and rates, (..., 1) end."""
 
     coefficients: Array
     starts: Array
@@ -60,7 +63,7 @@ def pieces_of(coefficients: Array, starts: Array, rates: Array, end: Array, nu: 
 
 
 def axis_extrema(pieces: Pieces) -> Extrema:
-    """Return the extremes of every component."""
+    """Return the extrema of every component."""
     polynomials, _ = pieces.polynomials()
     u = _with_ends(root_candidates(differentiate(polynomials)))
     values = evaluate(polynomials[..., None, :], u)
@@ -70,36 +73,28 @@ def axis_extrema(pieces: Pieces) -> Extrema:
 
 
 def largest_norm(pieces: Pieces) -> Array:
-    """Return (...,) the largest Euclidean norm."""
+    """Return (...,) the largest Euclidean norm, from the roots of x . dx/du."""
     xp = pieces.namespace
     polynomials, exponent = pieces.polynomials()
-    square = _over_axes(multiply(polynomials, polynomials))
-    change = _over_axes(multiply(polynomials, differentiate(polynomials)))
+    square = ordered_sum(multiply(polynomials, polynomials), -2)
+    change = ordered_sum(multiply(polynomials, differentiate(polynomials)), -2)
     u = _with_ends(root_candidates(change))
     place = _best(pieces, u, evaluate(square[..., None, :], u), per_axis=False)
     values, _ = _read(pieces, place)
-    largest = min(float(xp.finfo(values.dtype).max), sys.float_info.max)
-    limit = frexp(largest)[1] - 2  # powers of two up to this one, and their inverses, are of full precision
+    limit = largest_exponent(xp, values.dtype)
     exponent = np.clip(exponent, -limit, limit)
     down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
     return xp.linalg.vector_norm(values * down, axis=-1) * up[..., 0]
 
 
-def _over_axes(polynomials: Floats) -> Floats:
-    """Sum over the axes of space, (..., S, D, n) -> (..., S, n), in their order."""
-    total: Floats = polynomials[..., 0, :]
-    for d in range(1, polynomials.shape[-2]):
-        total = total + polynomials[..., d, :]
-    return total
-
-
 def _with_ends(u: Floats) -> Floats:
+    """Return the points with 0 before and 1 after them."""
     edge = np.zeros((*u.shape[:-1], 1))
     return np.concatenate([edge, u, edge + 1.0], axis=-1)
 
 
 def _best(pieces: Pieces, u: Floats, score: Floats, *, per_axis: bool) -> tuple[Any, Floats]:
-    """Segment and unit time of the best candidate, each (..., D) or (..., 1); the earliest if several."""
+    """Return segment and unit time of the best candidate, each (..., D) or (..., 1); the earliest if several."""
     empty = to_numpy(pieces.rates) <= 0
     score = np.where(empty[..., None, None] if per_axis else empty[..., None], -np.inf, score)
     if per_axis:  # (..., S, D, P) -> (..., D, S, P)
@@ -113,12 +108,10 @@ def _best(pieces: Pieces, u: Floats, score: Floats, *, per_axis: bool) -> tuple[
 
 
 def _read(pieces: Pieces, place: tuple[Any, Floats]) -> tuple[Array, Array]:
-    """Value (..., D) of axis d at place d (or of all axes at the one place), and the time."""
+    """Return the value (..., D) of axis d at place d (or of all axes at the one place), and the time."""
     segment, u = place
     powers, segments, _ = pieces.coefficients.shape[-3:]
-    chosen = (segment[..., None, None, :] == np.arange(segments)[:, None]).astype(
-        np.float64
-    )  # (..., 1, S, D or 1)
+    chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
     basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
     xp, coefficients = pieces.namespace, pieces.coefficients
     values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
@@ -127,5 +120,5 @@ def _read(pieces: Pieces, place: tuple[Any, Floats]) -> tuple[Array, Array]:
     shape = (*segment.shape[:-1], segments)
     start = np.take_along_axis(np.broadcast_to(starts, shape), segment, axis=-1)
     span = np.take_along_axis(np.broadcast_to(spans, shape), segment, axis=-1)
-    time = np.minimum(start + u * span, to_numpy(pieces.end))  # rounding must not lead past the end
+    time = np.minimum(start + u * span, to_numpy(pieces.end))  # no rounding past the end
     return values, like(xp, time, coefficients)

@@ -2,16 +2,16 @@
 
 A segment is a polynomial of degree 2 m - 1 in unit time u = (t - t_k) / h. Its data are, in this order,
 
-    s = (x0, V0_1, ..., V0_(m-1), D, V1_1, ..., V1_(m-1)),   V_i = h^i x^(i),   D = x1 - x0,
+    s = (x0, V0_1, ..., V0_(m-1), D, V1_1, ..., V1_(m-1)),   V_i = h^i x^(i),   D = x1 - x0,        (1)
 
-with the step D instead of x1, so that a far origin costs no accuracy.
+with the step D instead of x1, so that a distant origin costs no accuracy.
 """
 
 from __future__ import annotations
 
 from fractions import Fraction
 from functools import cache
-from math import factorial, perm, sqrt
+from math import comb, factorial, perm, sqrt
 from typing import TypeAlias
 
 Table: TypeAlias = tuple[tuple[float, ...], ...]
@@ -22,7 +22,7 @@ ORDERS = (2, 3, 4)
 
 @cache
 def coefficient_table(order: int) -> Table:
-    """Return the matrix that maps s to the coefficients of 1, u, ..., u^(2m-1)."""
+    """Return the matrix that maps s of Eq. 1 to the coefficients of 1, u, ..., u^(2m-1)."""
     return _floats(_coefficients(order))
 
 
@@ -30,82 +30,84 @@ def coefficient_table(order: int) -> Table:
 def stiffness_table(order: int) -> Table:
     """Return the matrix W of the cost 1/2 s^T W s / h^(2m-1) of a segment, without row and column of x0.
 
-    Rows and columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). For m = 3 it holds 720, 360, 192, 168, 60,
-        ...
+    Rows and columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). For m = 3 the entries are 720, 360, 192, 168,
+    60, ... W = U^T G U, with the upper half U of the coefficients and the Gram matrix G of Eq. 2 for nu = m.
     """
-    places = [order, *range(1, order), *range(order + 1, 2 * order)]
-    upper = [[row[place] for place in places] for row in _coefficients(order)[order:]]
-    gram = _gram(order, order)
-    size = 2 * order - 1
-    return _floats(
-        [
-            [
-                sum(
-                    (upper[k][i] * gram[k][j] * upper[j][n] for k in range(order) for j in range(order)),
-                    Fraction(),
-                )
-                for n in range(size)
-            ]
-            for i in range(size)
-        ]
-    )
+    m = order
+    columns = [m, *range(1, m), *range(m + 1, 2 * m)]
+    upper = [[row[column] for column in columns] for row in _coefficients(m)[m:]]
+    gram = [
+        [Fraction(perm(k, m) * perm(j, m), k + j - 2 * m + 1) for j in range(m, 2 * m)]
+        for k in range(m, 2 * m)
+    ]
+    return _floats(_product(_product(_transposed(upper), gram), upper))
 
 
 @cache
 def energy_table(order: int, nu: int) -> Table:
     """Return L with |L c|^2 = integral over [0, 1] of the squared nu-th derivative.
 
-    It is the transposed Cholesky factor of the Gram matrix (scaled shifted Legendre polynomials), so a cost
-    is a sum of squares and loses nothing by cancellation.
+    L is the transposed Cholesky factor of the Gram matrix of the derivatives of u^nu, ..., u^(2m-1),
+
+        G_kj = k! / (k - nu)!  j! / (j - nu)! / (k + j - 2 nu + 1).                                 (2)
+
+    Its rows are expansions in orthonormal shifted Legendre polynomials P_i,
+
+        u^j = sum_i (2 i + 1) j!^2 / ((j - i)! (j + i + 1)!) P_i(2 u - 1),                          (3)
+
+    so that a cost is a sum of squares, without cancellation.
     """
-    gram = _gram(order, nu)
-    size = len(gram)
-    lower = [[Fraction()] * size for _ in range(size)]
-    pivots: list[Fraction] = []
-    for j in range(size):
-        pivots.append(gram[j][j] - sum((lower[j][k] ** 2 * pivots[k] for k in range(j)), Fraction()))
-        for i in range(j, size):
-            rest = sum((lower[i][k] * lower[j][k] * pivots[k] for k in range(j)), Fraction())
-            lower[i][j] = (gram[i][j] - rest) / pivots[j]
-    return tuple(tuple(sqrt(pivots[j]) * float(lower[i][j]) for i in range(size)) for j in range(size))
+    size = range(2 * order - nu)
+    # Eq. 3 divided by 2 i + 1: P_i has the squared norm 1 / (2 i + 1).
+    modes = [
+        [
+            perm(j + nu, nu) * Fraction(factorial(j) ** 2, factorial(j - i) * factorial(j + i + 1))
+            if j >= i
+            else 0
+            for j in size
+        ]
+        for i in size
+    ]
+    norms = [sqrt((2 * i + 1) * modes[i][i] ** 2) for i in size]
+    return tuple(tuple(norms[i] * float(modes[i][j] / modes[i][i]) for j in size) for i in size)
 
 
 @cache
 def derivative_factors(order: int, nu: int) -> Table:
-    """Return the column of factors k! / (k - nu)! that the nu-th derivative puts on u^k, k = nu ... 2m-1."""
+    """Return the column of factors k! / (k - nu)! of the nu-th derivative of u^k, k = nu ... 2m-1."""
     return tuple((float(perm(k, nu)),) for k in range(nu, 2 * order))
 
 
-def _gram(order: int, nu: int) -> Exact:
-    powers = range(nu, 2 * order)
-    return [[Fraction(perm(k, nu) * perm(j, nu), k + j - 2 * nu + 1) for j in powers] for k in powers]
-
-
 def _coefficients(order: int) -> Exact:
-    size = 2 * order
-    rows = [[Fraction(int(k == j), factorial(k)) for j in range(size)] for k in range(order)]
-    # The upper coefficients c_k solve sum_k c_k k!/(k-i)! = V1_i - (what the lower ones give), i = 0 ... m-1.
-    right = []
-    for i in range(order):
-        target = [Fraction(int(j == order + i)) for j in range(size)]
-        for k in range(max(i, 1), order):  # x0 itself drops out, since D = x1 - x0
-            target[k] -= Fraction(perm(k, i), factorial(k))
-        right.append(target)
-    left = [[Fraction(perm(k, i)) for k in range(order, size)] for i in range(order)]
-    return rows + _solve(left, right)
+    """Return the coefficients of the two-point Taylor interpolation, exactly.
+
+    With b_i(u) = u^i / i! (1 - u)^m sum_(k < m-i) C(m - 1 + k, k) u^k it is (Davis 1975, Interpolation and
+    Approximation)
+
+        x(u) = x0 + sum_(0 < i < m) V0_i b_i(u) + D b_0(1 - u) + sum_(0 < i < m) (-1)^i V1_i b_i(1 - u).   (4)
+    """
+    m = order
+    table = [[Fraction(0)] * (2 * m) for _ in range(2 * m)]
+    for i in range(m):
+        for k in range(m - i):
+            weight = Fraction(comb(m - 1 + k, k), factorial(i))
+            for n in range(m + 1):
+                table[i + k + n][i] += weight * comb(m, n) * (-1) ** n
+            for n in range(i + k + 1):
+                table[m + n][m + i] += weight * comb(i + k, n) * (-1) ** (n + i)
+    for row in table:  # D instead of x1: x0 moves the whole segment
+        row[0] = Fraction(0)
+    table[0][0] = Fraction(1)
+    return table
 
 
-def _solve(left: Exact, right: Exact) -> Exact:
-    size = len(left)
-    work = [a + b for a, b in zip(left, right, strict=True)]
-    for j in range(size):
-        pivot = next(i for i in range(j, size) if work[i][j])
-        work[j], work[pivot] = work[pivot], work[j]
-        work[j] = [value / work[j][j] for value in work[j]]
-        for i in range(size):
-            if i != j:
-                work[i] = [a - work[i][j] * b for a, b in zip(work[i], work[j], strict=True)]
-    return [row[size:] for row in work]
+def _transposed(table: Exact) -> Exact:
+    return [list(column) for column in zip(*table, strict=True)]
+
+
+def _product(left: Exact, right: Exact) -> Exact:
+    columns = _transposed(right)
+    return [[sum((a * b for a, b in zip(row, c, strict=True)), Fraction()) for c in columns] for row in left]
 
 
 def _floats(table: Exact) -> Table:

@@ -1,12 +1,16 @@
-"""The states at the knots that make a movement through given points least costly.
+"""Least-cost trajectories through given points at given times: a banded linear system for the knot states.
 
-With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments, a zero gradient with respect to the unknown
-derivatives at the knots is a symmetric positive definite system with a narrow band. The equations say that
-the higher derivatives (snap and jerk for m = 3) are continuous there; the lower ones are by construction.
+With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments (see `_hermite_tables`), a zero gradient with
+respect to the unknown derivatives y at the knots is
 
-Nothing here knows how a batch lies in memory: the entries are arrays, or Python floats where all movements
-share their durations, and every operation works element by element. So a batch gives bit for bit what each
-item gives alone.
+    A y = b,                                                                                        (1)
+
+symmetric, positive definite, with a narrow band: block tridiagonal with blocks of size m - 1. The equations
+state that snap and jerk (m = 3) are continuous at the knots, as in Flash & Hogan 1985, Appendix C; position,
+velocity and acceleration are so by construction.
+
+All operations work element by element, on arrays or on Python floats where all movements share their
+durations. So an item of a batch gives the same bits as alone, which LAPACK does not promise.
 """
 
 from __future__ import annotations
@@ -15,17 +19,39 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from ._hermite_tables import stiffness_table
-from .array_api import FREE, Array
+import numpy as np
+
+from ._hermite_tables import coefficient_table, stiffness_table
+from .array_api import (
+    FREE,
+    Array,
+    Namespace,
+    broadcast_to,
+    constant,
+    is_given,
+    like,
+    own,
+    to_numpy,
+    unit_factors,
+)
+from .trajectory import Trajectory
 
 Entry: TypeAlias = Any
+"""An array or a Python float."""
+
 States: TypeAlias = list[list[Any]]
 """states[k][i - 1] = i-th time derivative at knot k: an array, None for zero, FREE for unknown."""
+
+Nodes: TypeAlias = dict[tuple[int, int], int]
+"""Row of each unknown states[k][i] in Eq. 1, by (k, i)."""
+
+_SHORT, _LONG = 1e-3, 1e3
+"""Durations [s] between which no power of them over- or underflows, even in single precision."""
 
 
 @dataclass(frozen=True)
 class BandedFactor:
-    """L D L^T of a symmetric positive definite matrix, by rows of the entries that can be nonzero."""
+    """L D L^T factorisation of a symmetric positive definite matrix, stored as sparse rows."""
 
     pivots: list[Entry]
     upper: list[dict[int, Entry]]
@@ -44,8 +70,8 @@ class BandedFactor:
         return work
 
 
-def factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
-    """Eliminate without pivoting; upper[p][q] is entry (p, q), q >= p, and is consumed."""
+def _factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
+    """Eliminate without pivoting (stable for positive definite A); upper[p][q], q >= p, is consumed."""
     multipliers: list[dict[int, Entry]] = []
     pivots: list[Entry] = []
     for p, row in enumerate(upper):
@@ -61,8 +87,10 @@ def factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
     return BandedFactor(pivots, upper, multipliers)
 
 
-def solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
-    """Fill in the FREE derivatives at the knots with their values of least cost.
+def solve_states(
+    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States
+) -> tuple[States, Nodes, BandedFactor]:
+    """Compute the FREE derivatives at the knots.
 
     Args:
         order: m.
@@ -71,36 +99,33 @@ def solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array],
         states: per knot, its m - 1 derivatives (see States).
 
     Returns:
-        The same with every FREE replaced.
+        The states with every FREE replaced, the rows of the unknowns, and the factorisation of A.
     """
-    nodes: dict[tuple[int, int], int] = {}
-    for k, state in enumerate(states):
-        for i, value in enumerate(state):
-            if value is FREE:
-                nodes[k, i] = len(nodes)
-    if not nodes:
-        return states
-    upper, right = assemble(order, durations, steps, states, nodes)
-    solution = factorise(upper).solve(right)
-    return [
-        [solution[nodes[k, i]] if (k, i) in nodes else value for i, value in enumerate(s)]
-        for k, s in enumerate(states)
-    ]
+    unknown = [(k, i) for k, state in enumerate(states) for i, value in enumerate(state) if value is FREE]
+    if not unknown:
+        return states, {}, BandedFactor([], [], [])
+    nodes = {node: row for row, node in enumerate(unknown)}
+    upper, right = _assemble(order, durations, steps, states, nodes)
+    factor = _factorise(upper)
+    solved = [list(state) for state in states]
+    for (k, i), value in zip(unknown, factor.solve(right), strict=True):
+        solved[k][i] = value
+    return solved, nodes, factor
 
 
-def assemble(
-    order: int,
-    durations: Sequence[Entry],
-    steps: Sequence[Array],
-    states: States,
-    nodes: dict[tuple[int, int], int],
+def _assemble(
+    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States, nodes: Nodes
 ) -> tuple[list[dict[int, Entry]], list[Array]]:
-    """Return the upper half of the matrix and the right side of the zero-gradient equations of `nodes`."""
+    """Return the upper half of A and the right side b of Eq. 1.
+
+    A segment adds W_ab h^(i + j + 2 - (2m - 1)) to the entry of the unknowns x^(i+1), x^(j+1) at its ends,
+    since its data are V_i = h^i x^(i). Its step D and given derivatives go to the right side.
+    """
     table = stiffness_table(order)
     upper: list[dict[int, Entry]] = [{} for _ in nodes]
     right: list[Any] = [None] * len(nodes)
     for s, (duration, step) in enumerate(zip(durations, steps, strict=True)):
-        powers = inverse_powers(duration, 2 * order - 2)
+        powers = _inverse_powers(duration, 2 * order - 2)
         local = [(s, i) for i in range(order - 1)] + [(s + 1, i) for i in range(order - 1)]
         for a, node in enumerate(local):
             p = nodes.get(node)
@@ -121,10 +146,143 @@ def assemble(
     return upper, right
 
 
-def inverse_powers(duration: Entry, highest: int) -> list[Entry]:
-    """[1, 1/h, 1/h^2, ...]; index = exponent."""
+def _inverse_powers(duration: Entry, highest: int) -> list[Entry]:
+    """Return [1, 1/h, 1/h^2, ...]; index = exponent."""
     inverse = 1.0 / duration
     powers = [1.0, inverse]
     while len(powers) <= highest:
         powers.append(powers[-1] * inverse)
     return powers
+
+
+def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
+    """Return the least-cost trajectory through all waypoints at fixed times.
+
+    Args:
+        xp: namespace.
+        order: m.
+        waypoints: (..., S + 1, D) with the full batch shape [m].
+        durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
+        states: per knot, its derivatives (see States).
+    """
+    durations = own(durations)
+    if (durations <= 0).any():
+        return _connect_with_empty(xp, order, waypoints, durations, states)
+    return Trajectory.from_segments(
+        _scaled_coefficients(xp, order, waypoints, durations, states), durations, xp
+    )
+
+
+def _scaled_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (..., 2m, S, D), with time scaled where powers of it would over- or underflow.
+
+    The scale is a power of two: x^(i) / scale^i is exact.
+    """
+    sizes = to_numpy(durations)
+    if sizes.size and not (sizes.min() >= _SHORT and sizes.max() <= _LONG):
+        scale = unit_factors(xp, durations)
+        scaled: States = []
+        for state in states:
+            row, factor = [], xp.ones_like(scale)
+            for value in state:
+                factor = factor / scale
+                row.append(value * factor if is_given(value) else value)
+            scaled.append(row)
+        durations, states = durations * scale, scaled
+    return _coefficients(xp, order, waypoints, durations, states)
+
+
+def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
+    segments = waypoints.shape[-2] - 1
+    steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
+    pieces = [steps[..., s, :] for s in range(segments)]
+    if xp is np and durations.size == segments and durations.dtype == np.float64:
+        lengths = durations.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
+    else:
+        lengths = [durations[..., s : s + 1] for s in range(segments)]
+    states = solve_states(order, lengths, pieces, states)[0]
+    rest = 0.0 * pieces[0]
+    # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables, segment by segment.
+    rows = [waypoints[..., s, :] for s in range(segments)]
+    rows += _unit_time_states(states[:-1], lengths, rest, order)
+    rows += pieces
+    rows += _unit_time_states(states[1:], lengths, rest, order)
+    shape = rest.shape
+    data = xp.stack([broadcast_to(xp, row, shape) for row in rows], axis=-2)
+    batch = data.shape[:-2]
+    data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
+    coefficients = xp.matmul(constant(coefficient_table(order), data), data)
+    return xp.reshape(coefficients, (*batch, 2 * order, segments, shape[-1]))
+
+
+def _unit_time_states(states: States, lengths: Sequence[Any], rest: Array, order: int) -> list[Array]:
+    """Return V_i = h^i x^(i) for i = 1 ... m - 1, all segments of one i together."""
+    rows = []
+    powers: Sequence[Any] = lengths
+    for i in range(order - 1):
+        for state, power in zip(states, powers, strict=True):
+            rows.append(rest if state[i] is None else power * state[i])
+        powers = [power * length for power, length in zip(powers, lengths, strict=True)]
+    return rows
+
+
+def _connect_with_empty(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Trajectory:
+    """Connect waypoints where some durations are 0: drop those via-points, movement by movement."""
+    *batch, knots, dimension = waypoints.shape
+    count = int(np.prod(batch, dtype=int))
+    durations = broadcast_to(xp, durations, (*batch, knots - 1))
+    if not count:
+        nothing = like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
+        return Trajectory.from_segments(nothing, durations, xp, some_empty=True)
+    flat_points = xp.reshape(waypoints, (count, knots, dimension))
+    flat_durations = xp.reshape(durations, (count, knots - 1))
+    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
+    empty = to_numpy(flat_durations) <= 0
+
+    def index(rows: Any) -> Any:
+        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
+
+    parts, members = [], []
+    for pattern in np.unique(empty, axis=0):  # movements with the same empty segments are solved together
+        where = np.flatnonzero((empty == pattern).all(axis=1))
+        rows = index(where)
+        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
+        parts.append(_connect_pattern(xp, order, flat_points[rows], flat_durations[rows], chosen, pattern))
+        members.append(where)
+    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
+    joined = xp.reshape(joined, (*batch, *joined.shape[1:]))
+    return Trajectory.from_segments(joined, durations, xp, some_empty=True)
+
+
+def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
+    """Return a derivative with the batch in one axis, (N, D); None and FREE stay."""
+    if not is_given(value):
+        return value
+    return xp.reshape(broadcast_to(xp, value, (*batch, value.shape[-1])), (-1, value.shape[-1]))
+
+
+def _connect_pattern(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, empty: Any
+) -> Array:
+    """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
+    full = np.flatnonzero(~empty).tolist()
+    # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
+    kept = [0, *(s + 1 for s in full)]
+    chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
+    points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
+    lengths = xp.stack([durations[..., s] for s in full], axis=-1)
+    solved = _scaled_coefficients(xp, order, points, lengths, chosen)
+    zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
+    columns = []
+    for s, is_empty in enumerate(empty):
+        if is_empty:
+            first = waypoints[..., s : s + 1, :][..., None, :, :]
+            columns.append(xp.concat([first, zeros + 0.0 * first], axis=-3))
+        else:
+            place = full.index(s)
+            columns.append(solved[..., :, place : place + 1, :])
+    return xp.concat(columns, axis=-2)

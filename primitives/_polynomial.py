@@ -1,20 +1,22 @@
-"""Polynomials in unit time, many at once: products, derivatives, values, and every root that lies in [0, 1].
+"""Batched polynomials in unit time: sums, products, derivatives, values, and all real roots in [0, 1].
 
-Coefficients are the last axis, lowest power first, always NumPy float64. Each polynomial is treated by
-itself.
+Coefficients are the last axis, lowest power first, in NumPy float64. Each polynomial is computed by itself,
+so results do not depend on the batch.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from math import comb
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
+from .array_api import Floats
 
 _SHIFT = 0.6180339887498949
+"""s of w = 1 / (u + s), irrational so that -s is no root of a polynomial with simple coefficients."""
+
 _POLISHING_STEPS = 3
 
 
@@ -33,33 +35,42 @@ def differentiate(coefficients: Floats) -> Floats:
     return coefficients[..., 1:] * np.arange(1.0, coefficients.shape[-1])
 
 
+def add(p: Floats, q: Floats) -> Floats:
+    """Return the coefficients of the sum of polynomials of any degrees."""
+    batch = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
+    total: Floats = np.zeros((*batch, max(p.shape[-1], q.shape[-1])))
+    total[..., : p.shape[-1]] += p
+    total[..., : q.shape[-1]] += q
+    return total
+
+
 def multiply(p: Floats, q: Floats) -> Floats:
     """Return the coefficients of the product."""
-    product: Floats = np.zeros(
-        (*np.broadcast_shapes(p.shape[:-1], q.shape[:-1]), p.shape[-1] + q.shape[-1] - 1)
-    )
+    batch = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
+    product: Floats = np.zeros((*batch, p.shape[-1] + q.shape[-1] - 1))
     for k in range(p.shape[-1]):
         product[..., k : k + q.shape[-1]] += p[..., k : k + 1] * q
     return product
 
 
 def unit_size(array: Any, axis: tuple[int, ...]) -> tuple[Any, Any]:
-    """Bring an array to a size of about 1 along the axes, so that no square over- or underflows.
+    """Scale an array to a size of about 1 along the axes, so that no square over- or underflows.
 
     Returns:
-        The array times a power of two, which changes no digit, and the exponent of that which was taken out.
+        The array times 2^-n, which is exact, and n.
     """
     exponent = np.frexp(np.abs(array).max(axis=axis, keepdims=True))[1]
     return np.ldexp(array, -exponent), exponent
 
 
 def root_candidates(coefficients: Floats) -> Floats:
-    """Return points of [0, 1] among which are all real roots there, (..., n) ascending.
+    """Return points of [0, 1], (..., n) ascending, that include all real roots there.
 
-    The others are real parts of complex roots or nearest ends: a caller that compares a function at all of
-        them loses
-    nothing by their company. They are the eigenvalues w of a companion matrix in w = 1 / (u + s): so roots at
-    infinity, where the degree is lower than it looks, become w = 0 and do no harm.
+    The other points are real parts of complex roots, or the nearest end of the interval. They do no harm to a
+    caller that compares a function at all points.
+
+    The roots are eigenvalues of a companion matrix (Edelman & Murakami 1995) in w = 1 / (u + s). Where the
+    leading coefficients vanish, the roots at infinity become w = 0 instead of infinite matrix entries.
     """
     degree = coefficients.shape[-1] - 1
     if degree < 1:
@@ -75,12 +86,12 @@ def root_candidates(coefficients: Floats) -> Floats:
     companion[..., 0, :] = -shifted[..., 1:] / leading
     w = np.linalg.eigvals(companion)
     square = w.real * w.real + w.imag * w.imag
-    u = w.real / np.where(square > 0, square, 1.0) - _SHIFT  # the real part of 1/w - s
+    u = w.real / np.where(square > 0, square, 1.0) - _SHIFT  # Re(1/w) - s
     return np.sort(_polish(scaled, np.clip(u, 0.0, 1.0)), axis=-1)
 
 
 def _polish(coefficients: Floats, u: Floats) -> Floats:
-    """Newton steps within [0, 1]."""
+    """Improve roots by Newton steps within [0, 1]; long steps belong to points that are no roots."""
     polynomial = coefficients[..., None, :]
     slope = differentiate(polynomial)
     for _ in range(_POLISHING_STEPS):
@@ -92,9 +103,6 @@ def _polish(coefficients: Floats, u: Floats) -> Floats:
 
 @cache
 def _shift_matrix(degree: int) -> Floats:
-    """Matrix that turns coefficients of u = v - s into those of v."""
-    rows = [
-        [comb(k, j) * (-_SHIFT) ** (k - j) if j <= k else 0.0 for j in range(degree + 1)]
-        for k in range(degree + 1)
-    ]
-    return np.array(rows)
+    """Return the matrix that maps coefficients in u = v - s to those in v, by the binomial theorem."""
+    size = range(degree + 1)
+    return np.array([[comb(k, j) * (-_SHIFT) ** (k - j) if j <= k else 0.0 for j in size] for k in size])

@@ -1,30 +1,44 @@
-"""The border of the package: any array library in, one clear error for bad numbers.
+"""Array conversion, validation and the few operations that NumPy and torch do not share.
 
-The formulas of this package use operators and Array API names only, so one source serves NumPy and torch.
-torch is imported by array-api-compat, and only when the caller hands in tensors.
+All formulas of the package use operators and Array API names, so that one source serves both libraries.
+array-api-compat imports torch only when a caller passes tensors.
 """
 
 from __future__ import annotations
 
 import enum
+import functools
 import math
+import operator
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
 
 Array: TypeAlias = Any
-"""A numpy.ndarray or a torch.Tensor of a floating dtype; anything that numpy.asarray takes comes in."""
+"""A numpy.ndarray or torch.Tensor of a floating dtype; arguments may be anything that numpy.asarray accepts."""
+
+Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
+"""A NumPy array in double precision."""
 
 Namespace: TypeAlias = Any
-"""The Array API functions that belong to an array: numpy, or array_api_compat.torch."""
+"""The Array API functions of an array: numpy, or array_api_compat.torch."""
 
 
 class Free(enum.Enum):
-    """Type of FREE."""
+    """Type of FREE, the boundary value that minimisation of the cost determines (natural boundary condition).
+
+    Pass `FREE` as goal velocity or goal acceleration to leave it open.
+
+    Example:
+        >>> from viapoint.primitives import FREE, point_to_point
+        >>> hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
+        >>> round(float(hit(1.0, 1)[0]), 9)  # a movement that hits its goal at 2.5 times its mean speed
+        2.5
+    """
 
     FREE = "FREE"
 
@@ -33,46 +47,50 @@ class Free(enum.Enum):
 
 
 FREE: Final = Free.FREE
-"""A boundary value that the least cost decides (natural boundary), instead of the caller."""
+"""Boundary value that minimisation of the cost determines (natural boundary condition)."""
 
 Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 """A given boundary value, None for rest (zero), or FREE."""
 
 _PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
-_PLAIN_OR_OPEN = (*_PLAIN, type(None), Free)
+
+
+def is_given(value: Boundary) -> TypeGuard[Array]:
+    """Return True for a boundary value that is an array, neither None nor FREE."""
+    return value is not None and value is not FREE
 
 
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
-    """Bring all arguments to one array library and one floating dtype.
+    """Convert all arguments to one array library and one floating dtype.
 
     Args:
-        optional: further arguments by name; of these None and FREE pass through.
+        optional: further arguments by name; None and FREE among these are returned unchanged.
         **required: arrays, numbers or nested lists by argument name.
 
     Returns:
-        The namespace and the arrays in the order given, first the required ones. The dtype is the widest
-        floating dtype among the arrays (numbers, lists and integer arrays do not count, and are float64 if
-        nothing else is there).
+        The namespace and the arrays in the order given, required ones first. The dtype is the widest floating
+        dtype among the arrays. Numbers, lists and integer arrays do not count; without any floating array it
+        is float64.
 
     Raises:
         ValueError: an argument is missing, not numeric, or not finite.
     """
     for name, value in required.items():
-        if value is None or value is FREE:
+        if not is_given(value):
             raise ValueError(f"{name} must be an array of real numbers, got {value!r}")
     named = {**required, **optional} if optional else required
-    if all(isinstance(value, _PLAIN_OR_OPEN) for value in named.values()):
+    if all(isinstance(value, _PLAIN) or not is_given(value) for value in named.values()):
         xp, arrays = np, _numpy_floats(named)
     else:
         xp, arrays = _foreign_floats(named)
     for name, array in zip(named, arrays, strict=True):
-        if array is not None and array is not FREE:
+        if is_given(array):
             require(xp, xp.isfinite(array), name, array, "must be finite")
     return xp, arrays
 
 
 def namespace_of(array: Array) -> Namespace:
-    """Return the Array API functions that belong to an array."""
+    """Return the Array API functions of an array."""
     if isinstance(array, np.ndarray):
         return np
     from array_api_compat import array_namespace
@@ -87,7 +105,7 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
         dtype = dtype if other == dtype else np.promote_types(dtype, other)
     arrays: list[Any] = []
     for name, value in named.items():
-        if value is None or value is FREE:
+        if not is_given(value):
             arrays.append(value)
             continue
         try:
@@ -116,10 +134,10 @@ def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
     dtype = xp.result_type(*floating) if floating else xp.float64
     arrays: list[Any] = []
     for name, value in named.items():
-        if value is None or value is FREE:
+        if not is_given(value):
             arrays.append(value)
         elif name not in foreign:
-            # A copy: torch would share the caller's memory, and takes neither read-only arrays nor long doubles.
+            # Copy: torch would share the caller's memory, and accepts neither read-only arrays nor long doubles.
             plain = np.array(_numpy_floats({name: value})[0], dtype=np.float64, order="C")
             arrays.append(xp.asarray(plain, dtype=dtype, device=place))
         elif xp.isdtype(value.dtype, ("real floating", "integral")):
@@ -129,18 +147,18 @@ def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
     return xp, arrays
 
 
-def require(xp: Namespace, holds: Array, name: str, array: Array, what: str) -> None:
-    """Raise ValueError naming the first entry of `array` for which `holds` is False."""
+def require(xp: Namespace, holds: Array, name: str, array: Array, requirement: str) -> None:
+    """Raise ValueError with the first entry of `array` for which `holds` is False."""
     if holds.all():
         return
     index = tuple(int(i) for i in np.argwhere(~to_numpy(holds))[0])
     value = float(to_numpy(array)[index])
     place = f" at index {index}" if index else ""
-    raise ValueError(f"{name} {what}, got {value}{place} (shape {tuple(array.shape)})")
+    raise ValueError(f"{name} {requirement}, got {value}{place} (shape {tuple(array.shape)})")
 
 
 def require_vectors(name: str, array: Array, dimension: int | None = None) -> None:
-    """Raise ValueError unless `array` has shape (..., D), with the D that is asked for."""
+    """Raise ValueError unless `array` has shape (..., D), with D = `dimension` if that is given."""
     if array.ndim < 1 or array.shape[-1] < 1:
         raise ValueError(f"{name} must have shape (..., D) with D >= 1, got shape {tuple(array.shape)}")
     if dimension is not None and array.shape[-1] != dimension:
@@ -148,7 +166,7 @@ def require_vectors(name: str, array: Array, dimension: int | None = None) -> No
 
 
 def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the common leading shape; ValueError names arguments that do not go together."""
+    """Return the common leading shape; raise ValueError with all shapes if they do not broadcast."""
     first, *rest = shapes.values()
     if all(shape == first for shape in rest):
         return first
@@ -160,7 +178,7 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def refuse_free(**named: Any) -> None:
-    """Raise ValueError for an argument that is FREE where a movement cannot leave it open."""
+    """Raise ValueError for an argument that is FREE but must be given."""
     for name, value in named.items():
         if value is FREE:
             raise ValueError(
@@ -169,7 +187,7 @@ def refuse_free(**named: Any) -> None:
 
 
 def is_whole(value: Any) -> bool:
-    """Whether `value` is a whole number of at least 0."""
+    """Return True for an integer of at least 0 (not for a bool)."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
 
 
@@ -189,7 +207,7 @@ def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
 
 
 def as_number(value: Any) -> float:
-    """Return a single real number as a float; anything else as NaN, which lies in no range."""
+    """Return a single real number as a float and anything else as NaN, which fails every range check."""
     try:
         single = not isinstance(value, str | bytes | bool) and np.ndim(value) == 0
         return float(value) if single else math.nan
@@ -198,7 +216,7 @@ def as_number(value: Any) -> float:
 
 
 def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: Namespace) -> None:
-    """Raise ValueError unless `out` are `count` arrays of the library and shape that numbers can be written to."""
+    """Raise ValueError unless `out` holds `count` writeable floating arrays of the given library and shape."""
     try:
         is_own = all(namespace_of(buffer) is xp for buffer in out)
     except TypeError:
@@ -217,55 +235,69 @@ def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: 
 
 
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
-    """xp.broadcast_to, free of charge where the shape is right already."""
+    """Broadcast an array, without the overhead of a call if it has the shape already."""
     return array if tuple(array.shape) == tuple(shape) else xp.broadcast_to(array, shape)
 
 
+def ordered_sum(array: Any, axis: int = 0) -> Any:
+    """Sum a NumPy array along one axis from first to last.
+
+    `numpy.sum` chooses its order by the memory layout, so that an item of a batch could differ from the same
+    item alone in the last bit.
+    """
+    return functools.reduce(operator.add, np.moveaxis(array, axis, 0) if axis else array)
+
+
+def power(base: Any, exponent: int) -> Any:
+    """Return base^exponent, exponent >= 1, by repeated multiplication: faster than `pow` on arrays."""
+    return functools.reduce(operator.mul, [base] * exponent)
+
+
 def to_numpy(array: Array) -> np.ndarray[Any, Any]:
-    """Return a NumPy view or copy of `array`, outside of any gradient."""
+    """Return a NumPy view or copy of `array`, detached from any gradient."""
     if isinstance(array, np.ndarray):
         return array
     if hasattr(array, "detach"):
         array = array.detach().cpu()
-        if str(array.dtype) == "torch.bfloat16":  # a dtype that NumPy lacks; float32 holds it exactly
+        if str(array.dtype) == "torch.bfloat16":  # a dtype that NumPy lacks; float32 represents it exactly
             array = array.float()
     return np.asarray(array)
 
 
 def own(array: Array) -> Array:
-    """Return the same numbers in memory that no caller shares, within the same gradient."""
+    """Return a copy that shares no memory with the caller and keeps the gradient."""
     return array.copy(order="K") if isinstance(array, np.ndarray) else 1.0 * array
 
 
-def detach(array: Array) -> Array:
-    """Return the same numbers, outside of any gradient."""
-    return array.detach() if hasattr(array, "detach") else array
-
-
 def follows_gradient(*arrays: Array) -> bool:
-    """Whether any of the arrays is part of a torch graph."""
+    """Return True if torch records a gradient for any of the arrays."""
     return any(getattr(array, "requires_grad", False) for array in arrays)
 
 
 def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
-    """`values` as an array of the library, dtype and device of `other`."""
+    """Convert `values` to the library, dtype and device of `other`."""
     if xp is np:
         return values.astype(other.dtype, copy=False)
     return xp.asarray(values, dtype=other.dtype, device=other.device)
 
 
+def largest_exponent(xp: Namespace, dtype: Any) -> int:
+    """Return the largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double."""
+    return math.frexp(min(float(xp.finfo(dtype).max), sys.float_info.max))[1] - 2
+
+
 def unit_factors(xp: Namespace, array: Array) -> Array:
-    """Powers of two (..., 1) that bring vectors (..., D) to a size of about 1: no square over- or underflows."""
-    size = np.abs(to_numpy(array)).max(axis=-1, keepdims=True)
-    largest = min(float(xp.finfo(array.dtype).max), sys.float_info.max)
-    # Powers of two up to this one, and their inverses, are of full precision.
-    limit = math.frexp(largest)[1] - 2
-    exponent = np.clip(np.frexp(size)[1], -limit, limit)
+    """Return powers of two (..., 1) that scale vectors (..., D) to a size of about 1.
+
+    Squares of the scaled vectors neither over- nor underflow, and multiplication by a power of two is exact.
+    """
+    limit = largest_exponent(xp, array.dtype)
+    exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
 
 
 def constant(table: tuple[tuple[float, ...], ...], other: Array) -> Array:
-    """Return a constant matrix in the library, dtype and device of `other`, made once."""
+    """Return a constant matrix in the library, dtype and device of `other`, from a cache."""
     if isinstance(other, np.ndarray):
         return _numpy_constant(table, other.dtype)
     return _tensor_constant(table, other.dtype, other.device)
@@ -281,15 +313,10 @@ def _tensor_constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: A
     import array_api_compat.torch
 
     torch: Any = array_api_compat.torch
-    with torch.inference_mode(False):  # a constant made in inference mode could not serve a gradient later
+    with torch.inference_mode(False):  # an inference tensor in the cache could not serve a gradient later
         return torch.tensor(table, dtype=dtype, device=device)
 
 
 def error_state(xp: Namespace) -> AbstractContextManager[Any]:
-    """Silence NumPy's warnings where a masked branch divides by zero; torch has none."""
+    """Return a context without NumPy's warnings, for branches that divide by zero and are masked afterwards."""
     return np.errstate(all="ignore") if xp is np else nullcontext()
-
-
-def blocks(count: int, size: int) -> Iterator[slice]:
-    """Slices of at most `size` that cover range(count)."""
-    return (slice(first, min(first + size, count)) for first in range(0, count, size))

@@ -1,22 +1,18 @@
-"""Closed-form derivatives of the cost, read from the higher derivatives at the knots.
-
-By the envelope theorem they hold for the optimum over everything that was left open: the states at the
-via-points, and the passage times if the segment durations came from `passage_durations`.
-"""
+"""Closed-form derivatives of the least cost, from the higher derivatives at the knots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import factorial
+from math import factorial, perm
 from typing import Any
 
-from .array_api import Array
+from .array_api import Array, power
 from .trajectory import Trajectory, require_trajectory
 
 
 @dataclass(frozen=True)
 class CostGradient:
-    """Derivatives of Trajectory.cost().
+    """Derivatives of Trajectory.cost() with respect to waypoints, durations and boundary values.
 
     Attributes:
         waypoints: (..., S + 1, D) with respect to start, via-points and goal. At a via-point it is minus
@@ -27,6 +23,12 @@ class CostGradient:
             rest to rest, order 3).
         start_velocity, goal_velocity: (..., D) with respect to the boundary velocities; zero where FREE.
         start_acceleration, goal_acceleration: (..., D) likewise (zero for order 2).
+
+    Example:
+        >>> from viapoint.primitives import cost_gradient, point_to_point
+        >>> gradient = cost_gradient(point_to_point([0.0], [1.0], 1.0))
+        >>> gradient.waypoints.tolist(), gradient.durations.tolist()  # the cost is 360 A^2 / T^5
+        ([[-720.0], [720.0]], [-1800.0])
     """
 
     waypoints: Array
@@ -41,12 +43,28 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
     """Return all derivatives of the least cost.
 
     For order m, dJ/dx^(i)(T) = (-1)^(m-1-i) x^(2m-1-i)(T) at the goal, the opposite at the start, and at a
-    via-point the jump of (-1)^(m-1) x^(2m-1), left minus right.
+    via-point the jump of (-1)^(m-1) x^(2m-1), left minus right. By the envelope theorem they hold for the
+    optimum over everything that was left open: the states at the via-points, and the passage times if the
+    segment durations came from `passage_durations`.
+
+    Args:
+        trajectory: least-cost movements.
+
+    Returns:
+        The derivatives [cost / unit of the argument], with the trajectory's leading shape.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import cost_gradient, through
+        >>> movement = through([[0.0, 0.0], [0.5, 0.2], [1.0, 0.0]], [0.5, 0.5])
+        >>> cost_gradient(movement).waypoints[1].round(6).tolist()  # -pi: only across the line
+        [0.0, 4096.0]
     """
     require_trajectory(trajectory)
     xp, m = trajectory.namespace, trajectory.order
-    sign = (-1.0) ** (m - 1)
-    highest = _segment_derivative(trajectory, 2 * m - 1, at_end=False) * sign
+    highest = _segment_derivative(trajectory, 2 * m - 1, at_end=False) * (-1.0) ** (m - 1)
     rows = [-highest[..., :1, :], highest[..., :-1, :] - highest[..., 1:, :], highest[..., -1:, :]]
     ends = []
     for i in (1, 2):
@@ -61,10 +79,10 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
 
 
 def duration_gradient(coefficients: Array, rates: Array) -> Array:
-    """Return dJ/dh of each segment, which is minus its Hamiltonian (Flash & Hogan's Eqs. C6, C7).
+    """Return dJ/dh of each segment, which is minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
 
-    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), the same at every instant
-    of a segment; for jerk it is -|jerk|^2/2 + snap . acceleration - crackle . velocity.
+    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment;
+    for jerk it is -|jerk|^2/2 + snap . acceleration - crackle . velocity.
 
     Args:
         coefficients: (..., 2m, S, D) in unit time.
@@ -75,24 +93,16 @@ def duration_gradient(coefficients: Array, rates: Array) -> Array:
     """
     order = coefficients.shape[-3] // 2
     total: Any = 0.0
-    for i in range(order):
+    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
         weight = (0.5 if i == 0 else (-1.0) ** i) * factorial(order + i) * factorial(order - i)
-        total = total + weight * (
-            coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
-        ).sum(-1)
-    square = rates * rates
-    power = square
-    for _ in range(order - 1):
-        power = power * square
-    return -total * power
+        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
+        total = total + weight * product.sum(-1)
+    return -total * power(rates * rates, order)
 
 
 def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Array:
     """Return the nu-th derivative of each segment at its own beginning or end, (..., S, D)."""
-    power = trajectory.rates
-    for _ in range(nu - 1):
-        power = power * trajectory.rates
     total: Any = 0.0
     for k in range(nu, 2 * trajectory.order if at_end else nu + 1):
-        total = total + factorial(k) / factorial(k - nu) * trajectory.coefficients[..., k, :, :]
-    return total * power[..., None]
+        total = total + perm(k, nu) * trajectory.coefficients[..., k, :, :]
+    return total * power(trajectory.rates, nu)[..., None]

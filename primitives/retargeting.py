@@ -1,16 +1,15 @@
-"""The online version: a movement under way gets another target, time of arrival or via-point."""
+"""Online replanning: a movement under way gets another goal, arrival time or via-point."""
 
 from __future__ import annotations
 
 from math import inf
 from typing import Any
 
-from ._boundary import check_boundary_shapes
+from ._boundary import END_NAMES, check_end_shapes
 from .array_api import (
     FREE,
     Array,
     Boundary,
-    Namespace,
     as_number,
     broadcast_batch,
     broadcast_to,
@@ -34,35 +33,41 @@ def retarget(
     goal_acceleration: Boundary = None,
     freeze: float = 0.0,
 ) -> Trajectory:
-    """Continue a movement towards another goal, as often as wanted (the primer's Eqs. 25 to 27).
+    """Return a movement that continues another one from `time` on, towards a new goal.
 
-    The new movement takes over position, velocity and acceleration at `time`, so it is as smooth as the old
-    one, and is the one of least jerk from there. With the goal and arrival unchanged it is the rest of the
-    old one.
+    It has the least jerk from the position, velocity and acceleration of the old movement at `time` (Eqs. 25
+    to 27 of the minimum-jerk primer). With goal and arrival unchanged it is the rest of the old movement. It
+    may be retargeted again.
 
-    Near arrival: an error of the state is amplified into jerk as 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where
-        R is the
-    remaining time. Here the state is the trajectory's own, so only rounding is amplified. Whoever plans from
-    a measured state instead (`point_to_point` with start values) must stop replanning while R is long enough;
-    `freeze` is that rule.
+    Near arrival an error of the state becomes a jerk of 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where R is the
+    remaining time. The state of the trajectory itself is exact up to rounding. A caller who plans from measured
+    states (`point_to_point` with start values) must stop replanning while R is long enough; `freeze`
+    implements this rule.
 
     Args:
         trajectory: the movement under way, of order 3.
-        time: (...,) the present, on the trajectory's clock [s].
-        goal: (..., D) the new goal [m].
-        arrival: (...,) when to be there, on the trajectory's clock [s].
-        via: (..., D) a point to pass on the way, at its free passage time [m].
-        goal_velocity: (..., D) [m/s]; None = zero, FREE = as the least cost decides.
+        time: (...,) present time on the trajectory's clock [s].
+        goal: (..., D) new goal [m].
+        arrival: (...,) new time of arrival on the trajectory's clock [s].
+        via: (..., D) via-point of the new movement, passed at its free passage time [m].
+        goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost.
         goal_acceleration: (..., D) [m/s^2]; likewise.
-        freeze: [s] where less time than this remains to the old arrival, the old goal, arrival and final
-            state are kept, whatever the arguments say (a given via-point is dropped).
+        freeze: remaining time to the old arrival [s] below which the old goal, arrival and final state are
+            kept, whatever the arguments say (a given via-point is dropped).
 
     Returns:
         The movement from `time` on; its own clock starts at 0.
 
     Raises:
         ValueError: time lies before the start or not before the old or the new arrival; freeze is negative
-            or not finite; other bad arguments.
+            or not finite; an argument is not finite or has a wrong shape.
+
+    Example:
+        >>> from viapoint.primitives import point_to_point, retarget
+        >>> reach = point_to_point([0.0, 0.0], [0.3, 0.0], 0.8)
+        >>> turned = retarget(reach, 0.3, [0.2, 0.2], 1.0)
+        >>> float(turned.duration), bool((abs(turned(0.0, 1) - reach(0.3, 1)) < 1e-12).all())
+        (0.7, True)
     """
     require_trajectory(trajectory)
     named = {"goal_velocity": goal_velocity, "goal_acceleration": goal_acceleration}
@@ -82,15 +87,15 @@ def retarget(
     if freeze > 0:
         frozen = end - time < freeze
         arrival = xp.where(frozen, end, arrival)
-        targets, via = _keep_old_target(trajectory, frozen, targets, via, xp)
+        targets, via = _keep_old_target(trajectory, frozen, targets, via)
     require(xp, arrival > time, "arrival", arrival, "must lie after time")
-    return _plan(trajectory, time, arrival - time, targets, via, batch, xp)
+    return _plan(trajectory, time, arrival - time, targets, via)
 
 
 def _common_batch(
     trajectory: Trajectory, time: Array, arrival: Array, targets: dict[str, Any], via: Array | None
 ) -> tuple[int, ...]:
-    """Return the common leading shape, or raise ValueError naming what is wrong."""
+    """Return the common leading shape of all arguments, or raise ValueError."""
     require_vectors("goal", targets["goal"], trajectory.dimension)
     shapes = {
         "trajectory": trajectory.batch_shape,
@@ -100,38 +105,28 @@ def _common_batch(
     if via is not None:
         require_vectors("via", via, trajectory.dimension)
         shapes["via"] = tuple(via.shape[:-1])
-    return broadcast_batch(**shapes, **check_boundary_shapes(targets, trajectory.dimension))
+    return broadcast_batch(**shapes, **check_end_shapes(targets, trajectory.dimension))
 
 
 def _plan(
-    trajectory: Trajectory,
-    time: Array,
-    remaining: Array,
-    targets: dict[str, Any],
-    via: Array | None,
-    batch: tuple[int, ...],
-    xp: Namespace,
+    trajectory: Trajectory, time: Array, remaining: Array, targets: dict[str, Any], via: Array | None
 ) -> Trajectory:
     """Return the movement of least jerk from the state at `time`."""
-    position, velocity, acceleration = (v[..., 0, :] for v in trajectory.sample(time[..., None], (0, 1, 2)))
-    shape = (*batch, trajectory.dimension)
-    points = [position, targets["goal"]] if via is None else [position, via, targets["goal"]]
+    xp, shape = trajectory.namespace, (*time.shape, trajectory.dimension)
+    position, *motion = (value[..., 0, :] for value in trajectory.sample(time[..., None], (0, 1, 2)))
+    goal, *final = targets.values()
+    points = [position, goal] if via is None else [position, via, goal]
     waypoints = xp.stack([broadcast_to(xp, point, shape) for point in points], axis=-2)
-    ends = {
-        "start_velocity": velocity,
-        "start_acceleration": acceleration,
-        "goal_velocity": targets["goal_velocity"],
-        "goal_acceleration": targets["goal_acceleration"],
-    }
+    ends: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
     durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **ends)
     return through(waypoints, durations, **ends)
 
 
 def _keep_old_target(
-    trajectory: Trajectory, frozen: Array, targets: dict[str, Any], via: Array | None, xp: Namespace
+    trajectory: Trajectory, frozen: Array, targets: dict[str, Any], via: Array | None
 ) -> tuple[dict[str, Any], Array | None]:
-    """Return the targets, those of frozen movements replaced by the old end, and the via-point."""
-    shape = (*frozen.shape, trajectory.dimension)
+    """Return targets and via-point, with the old final state as the target of frozen movements."""
+    xp, shape = trajectory.namespace, (*frozen.shape, trajectory.dimension)
     old = trajectory.sample(trajectory.duration[..., None], (0, 1, 2))
     mixed: dict[str, Any] = {}
     for (name, value), end in zip(targets.items(), old, strict=True):
@@ -141,5 +136,6 @@ def _keep_old_target(
         value = xp.zeros_like(end) if value is None else broadcast_to(xp, value, shape)
         mixed[name] = xp.where(frozen[..., None], end, value)
     if via is not None:
+        # A via-point that equals the goal gets the duration 0 and is dropped.
         via = xp.where(frozen[..., None], mixed["goal"], broadcast_to(xp, via, shape))
     return mixed, via

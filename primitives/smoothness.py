@@ -1,14 +1,13 @@
-"""How smooth a movement is, from its polynomials: nothing here depends on a sampling step.
+"""Speed, curvature and smoothness measures, computed from the polynomials of a movement.
 
-Closed forms for the straight minimum-jerk reach of amplitude A and duration T, which the tests check:
-integral of squared jerk 720 A^2 / T^5, peak speed 1.875 A / T, dimensionless jerk 204.8, its negative
-logarithm -5.3220, spectral arc length -1.4024. Where nothing moves the ratios are not defined and come out as
-NaN.
+Values of the straight minimum-jerk reach of amplitude A and duration T, which the tests check: integral of
+squared jerk 720 A^2 / T^5, peak speed 1.875 A / T, dimensionless jerk 204.8, log dimensionless jerk -5.3220,
+spectral arc length -1.4024. Where nothing moves the ratios are undefined and NaN.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,26 +17,31 @@ from .array_api import Array, Namespace, as_number, error_state, is_whole, like,
 from .trajectory import Trajectory, require_trajectory
 
 _SPECTRUM_SAMPLES = 1000
-"""Instants at which the spectral arc length takes the speed, whatever the duration: far beyond a movement's
-bandwidth."""
+"""Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth."""
 
 _MOST_PADDING = 16
-"""Beyond it the spectrum of a single movement takes gigabytes of memory."""
+"""Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory."""
 
 _LEAST_TREND = 1e-12
-"""Change of the squared speed, relative to its greatest, that counts as one in double precision."""
+"""Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision."""
 
 _ROUNDINGS = 64
-"""Of the trajectory's own precision: what it is in a lower one, where coefficients are rounded more."""
+"""Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more."""
 
 
 @dataclass(frozen=True)
 class SpeedEvents:
-    """Local extremes of the speed, padded with NaN where a movement has fewer than the others of its batch.
+    """Local extrema of the speed, padded with NaN where a movement has fewer than others of its batch.
 
     Attributes:
         time: (..., M) ascending [s].
         speed: (..., M) [m/s].
+
+    Example:
+        >>> from viapoint.primitives import point_to_point, speed_peaks
+        >>> peaks = speed_peaks(point_to_point([0.0], [0.4], 1.0))
+        >>> peaks.time.round(9).tolist(), peaks.speed.round(9).tolist()
+        ([0.5], [0.75])
     """
 
     time: Array
@@ -45,23 +49,39 @@ class SpeedEvents:
 
 
 def speed(trajectory: Trajectory, time: Array) -> Array:
-    """Return the tangential velocity |v| at `time` (T,) or (..., T): (..., T) [m/s]."""
+    """Return the tangential speed |v| at given times.
+
+    Args:
+        trajectory: the movements.
+        time: (T,) or (..., T) [s].
+
+    Returns:
+        (..., T) [m/s].
+
+    Raises:
+        ValueError: time is not finite or does not broadcast.
+
+    Example:
+        >>> from viapoint.primitives import point_to_point, speed
+        >>> speed(point_to_point([0.0, 0.0], [0.3, 0.4], 1.0), [0.0, 0.5, 1.0]).round(9).tolist()
+        [0.0, 0.9375, 0.0]
+    """
     require_trajectory(trajectory)
     return _length(trajectory.namespace, trajectory(time, 1))
 
 
 def _length(xp: Namespace, vectors: Array) -> Array:
-    """Return the Euclidean norm of the last axis, whatever the size."""
+    """Return the Euclidean norm of the last axis, without over- or underflow of squares."""
     factors = unit_factors(xp, vectors)
     return xp.linalg.vector_norm(vectors * factors, axis=-1) / factors[..., 0]
 
 
 def curvature(trajectory: Trajectory, time: Array) -> Array:
-    """Return the curvature of the path at `time`.
+    """Return the curvature of the path at given times.
 
-    In the plane it is signed, (x' y'' - y' x'') / |v|^3, positive to the left (Flash & Hogan, footnote 4); in
-    space it is |v x a| / |v|^3. A movement that passes a via-point from rest to rest has no bounded curvature
-    at its ends; at rest itself the curvature is not defined and comes out as NaN.
+    In the plane it is signed, (x' y'' - y' x'') / |v|^3, positive to the left (Flash & Hogan 1985, footnote 4).
+    In space it is |v x a| / |v|^3. It is NaN at rest. The curvature of a rest-to-rest movement through a
+    via-point grows without bound at its ends.
 
     Args:
         trajectory: movements in two or three dimensions.
@@ -71,7 +91,13 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
         (..., T) [1/m].
 
     Raises:
-        ValueError: the dimension is neither 2 nor 3; time is bad.
+        ValueError: the dimension is neither 2 nor 3; time is not finite or does not broadcast.
+
+    Example:
+        >>> from viapoint.primitives import curvature, through
+        >>> arc = through([[0.0, 0.0], [0.5, 0.5], [1.0, 0.0]], [0.5, 0.5])
+        >>> curvature(arc, [0.5]).round(4).tolist()  # a turn to the right
+        [-3.7926]
     """
     require_trajectory(trajectory)
     if trajectory.dimension not in (2, 3):
@@ -91,7 +117,24 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
 
 
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return (...,) integral |jerk|^2 dt * duration^3 / peak speed^2; 204.8 for a straight reach."""
+    """Return the dimensionless jerk, integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
+
+    The definition of Hogan & Sternad 2009, normalised by the peak speed.
+
+    Args:
+        trajectory: the movements.
+
+    Returns:
+        (...,); 204.8 for a straight reach, NaN where nothing moves.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import dimensionless_jerk, point_to_point
+        >>> round(float(dimensionless_jerk(point_to_point([0.0], [0.4], 0.7))), 6)
+        204.8
+    """
     require_trajectory(trajectory)
     xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
     duration, peak = trajectory.duration, trajectory.peak(1)
@@ -100,7 +143,22 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
 
 
 def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return (...,) minus the natural logarithm of dimensionless jerk: greater is smoother, infinite without jerk."""
+    """Return minus the natural logarithm of the dimensionless jerk; greater is smoother.
+
+    Args:
+        trajectory: the movements.
+
+    Returns:
+        (...,); -5.3220 for a straight reach, infinite without jerk, NaN where nothing moves.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import log_dimensionless_jerk, point_to_point
+        >>> round(float(log_dimensionless_jerk(point_to_point([0.0], [0.4], 0.7))), 4)
+        -5.322
+    """
     ratio = dimensionless_jerk(trajectory)
     with error_state(trajectory.namespace):
         return -trajectory.namespace.log(ratio)
@@ -109,11 +167,11 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
 def spectral_arc_length(
     trajectory: Trajectory, *, cutoff: float = 10.0, threshold: float = 0.05, padding: int = 4
 ) -> Array:
-    """Return (...,) minus the arc length of the normalised speed spectrum: greater is smoother.
+    """Return the spectral arc length of the speed (SPARC, Balasubramanian et al. 2015); greater is smoother.
 
-    The spectrum of the speed at 1000 instants is padded to 2^padding times the next power of two, scaled to 1
-    at frequency 0, and followed up to the last frequency below `cutoff` where it reaches `threshold`
-    (Balasubramanian et al. 2015).
+    It is minus the arc length of the normalised amplitude spectrum up to the last frequency below `cutoff` at
+    which the amplitude reaches `threshold`. The speed is sampled at 1000 instants and padded with zeros to
+    2^padding times the next power of two.
 
     Args:
         trajectory: the movements.
@@ -122,8 +180,16 @@ def spectral_arc_length(
         threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
         padding: powers of two of zero padding, 0 to 16.
 
+    Returns:
+        (...,); -1.4024 for a straight reach of 1 s, NaN where nothing moves.
+
     Raises:
         ValueError: cutoff or threshold is out of range, or padding is not a whole number from 0 to 16.
+
+    Example:
+        >>> from viapoint.primitives import point_to_point, spectral_arc_length
+        >>> round(float(spectral_arc_length(point_to_point([0.0], [0.4], 1.0))), 4)
+        -1.4024
     """
     require_trajectory(trajectory)
     if not as_number(cutoff) > 0:
@@ -134,32 +200,28 @@ def spectral_arc_length(
         raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
     xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
     if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
-        return xp.astype(_arc_length(_in_single_precision(trajectory), cutoff, threshold, padding), dtype)
+        arrays = {f.name: getattr(trajectory, f.name) for f in fields(trajectory) if f.name != "order"}
+        single = replace(trajectory, **{name: xp.astype(array, xp.float32) for name, array in arrays.items()})
+        return xp.astype(_arc_length(single, cutoff, threshold, padding), dtype)
     return _arc_length(trajectory, cutoff, threshold, padding)
 
 
 def _unit_sized(trajectory: Trajectory) -> Trajectory:
-    """Return the movements at a size and a duration of about 1, by powers of two, which change no digit."""
+    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
     xp, t = trajectory.namespace, trajectory
     if 0 in t.batch_shape:
         return t
     size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
     pace = unit_factors(xp, t.end)
-    times = (array * pace for array in (t.durations, t.starts))
-    return Trajectory(t.coefficients * size, next(times), t.order, next(times), t.rates / pace, t.end * pace)
-
-
-def _in_single_precision(trajectory: Trajectory) -> Trajectory:
-    xp, t = trajectory.namespace, trajectory
-    coefficients, *times = (
-        xp.astype(array, xp.float32) for array in (t.coefficients, t.durations, t.starts, t.rates, t.end)
+    return Trajectory(
+        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
     )
-    return Trajectory(coefficients, times[0], t.order, *times[1:])
 
 
 def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
+    """Return the spectral arc length (...,)."""
     xp = trajectory.namespace
-    if 0 in trajectory.batch_shape:  # libraries differ on whether nothing can be transformed
+    if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
         return 0.0 * trajectory.duration
     length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
@@ -179,16 +241,47 @@ def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding
 
 
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:
-    """Return the local minima of the speed strictly inside the movement, exact from the roots of v . a."""
+    """Return the local minima of the speed strictly inside the movement, exact from the roots of v . a.
+
+    Args:
+        trajectory: the movements.
+
+    Returns:
+        Times and speeds, padded with NaN.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import speed_valleys, through
+        >>> speed_valleys(through([[0.0, 0.0], [0.5, 0.5], [1.0, 0.0]], [0.5, 0.5])).time.round(9).tolist()
+        [0.5]
+    """
     return _speed_events(trajectory, rising_after=True)
 
 
 def speed_peaks(trajectory: Trajectory) -> SpeedEvents:
-    """Return the local maxima of the speed strictly inside the movement, exact from the roots of v . a."""
+    """Return the local maxima of the speed strictly inside the movement, exact from the roots of v . a.
+
+    Args:
+        trajectory: the movements.
+
+    Returns:
+        Times and speeds, padded with NaN.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import speed_peaks, through
+        >>> speed_peaks(through([[0.0, 0.0], [0.5, 0.5], [1.0, 0.0]], [0.5, 0.5])).time.shape
+        (2,)
+    """
     return _speed_events(trajectory, rising_after=False)
 
 
 def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
+    """Return the minima (`rising_after`) or maxima of the speed."""
     require_trajectory(trajectory)
     xp = trajectory.namespace
     times = _turning_times(trajectory)
@@ -204,7 +297,7 @@ def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
 
 
 def _turning_times(trajectory: Trajectory) -> Any:
-    """All times (..., Q), ascending, at which the speed may have an extreme: roots of v . a, and knots."""
+    """Return all times (..., Q), ascending, at which the speed may be extreme: roots of v . a, and knots."""
     coefficients = np.moveaxis(to_numpy(trajectory.coefficients).astype(float), -3, -1)  # (..., S, D, 2m)
     velocity = differentiate(unit_size(coefficients, (-3, -2, -1))[0])
     power = multiply(velocity, differentiate(velocity)).sum(axis=-2)
@@ -217,15 +310,13 @@ def _turning_times(trajectory: Trajectory) -> Any:
 
 
 def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
-    """Whether the speed falls (-1) or rises (1) before and after each of `times`; 0 outside the movement."""
+    """Return -1 or 1 where the speed falls or rises before and after each of `times`; 0 outside the movement."""
     middle = (times[..., 1:] + times[..., :-1]) / 2
     sampled = trajectory.sample(like(trajectory.namespace, middle, trajectory.coefficients), (1, 2))
     velocity, acceleration = (unit_size(to_numpy(value), (-2, -1))[0] for value in sampled)
     rate = (velocity * acceleration).sum(axis=-1)
     size = np.abs(velocity).max(axis=(-2, -1)) * np.abs(acceleration).max(axis=(-2, -1))
-    wide = (
-        np.diff(times, axis=-1) > 1e-9 * times[..., -1:]
-    )  # between two copies of one root there is only noise
+    wide = np.diff(times, axis=-1) > 1e-9 * times[..., -1:]  # only noise between two copies of one root
     precision = float(trajectory.namespace.finfo(trajectory.coefficients.dtype).eps)
     noise = max(_LEAST_TREND, _ROUNDINGS * precision) * size[..., None]
     trend = np.where(wide & (np.abs(rate) > noise), np.sign(rate), 0.0)

@@ -1,4 +1,4 @@
-"""Limits of speed, acceleration and jerk: the performance-limited movement."""
+"""Time scaling of movements to limits of velocity, acceleration and jerk."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def minimum_duration(
     """Return the shortest duration to which the movement can be scaled within the limits.
 
     Scaling time by a factor s divides the nu-th derivative by s^nu and keeps the path, so
-    s = max_nu (peak_nu / limit_nu)^(1 / nu), with the exact extremes of the trajectory.
+    s = max_nu (peak_nu / limit_nu)^(1 / nu), with the exact extrema of the trajectory.
     `trajectory.stretched(minimum_duration(trajectory, ...))` is the performance-limited movement. Boundary
     velocities and accelerations scale as well.
 
     Args:
-        trajectory: the movement, at any pace.
+        trajectory: the movement, of any duration.
         velocity: limit [m/s]: a number or an array (..., 1) limits the Euclidean norm, an array (..., D) each
             axis.
         acceleration: limit [m/s^2], likewise.
@@ -32,6 +32,13 @@ def minimum_duration(
 
     Raises:
         ValueError: no limit is given, or a limit is not finite, not positive, or of a wrong shape.
+
+    Example:
+        >>> from viapoint.primitives import minimum_duration, point_to_point
+        >>> reach = point_to_point([0.0], [0.4], 1.0)
+        >>> fastest = reach.stretched(minimum_duration(reach, velocity=1.5))
+        >>> round(float(fastest.duration), 9), round(float(fastest.peak(1)), 9)
+        (0.5, 1.5)
     """
     require_trajectory(trajectory)
     named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
@@ -53,7 +60,7 @@ def minimum_duration(
 
 
 def _excess(trajectory: Trajectory, nu: int, limit: Array) -> Array:
-    """(...,) the greatest ratio of the nu-th derivative to its limit."""
+    """Return (...,) the greatest ratio of the nu-th derivative to its limit."""
     xp = trajectory.namespace
     if limit.ndim == 0:
         return trajectory.peak(nu) / limit

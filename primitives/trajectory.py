@@ -1,4 +1,4 @@
-"""A trajectory: position as a piecewise polynomial of time; a value that any number of callers may share."""
+"""Trajectories: positions as piecewise polynomials of time, as immutable values."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from .array_api import (
     error_state,
     namespace_of,
     own,
+    power,
     refuse_free,
     require,
     require_vectors,
@@ -33,12 +34,12 @@ from .array_api import (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
-    """Movements x(t), 0 <= t <= duration, each a chain of S polynomials.
+    """Batch of movements x(t), 0 <= t <= duration, each a chain of S polynomials.
 
-    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in its own unit time u = (t - t_s) / h_s, so
-    that no duration, short or long, over- or underflows.
+    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in unit time u = (t - t_s) / h_s, so that no
+    duration, short or long, over- or underflows.
 
-    A trajectory takes its arrays over: NumPy's become read-only, and nobody should write into torch's.
+    A trajectory owns its arrays: NumPy arrays become read-only; do not write into torch tensors.
 
     Attributes:
         coefficients: (..., 2 order, S, D), c_k of segment s [m].
@@ -48,6 +49,15 @@ class Trajectory:
         starts: (..., S) first instant of each segment [s].
         rates: (..., S) 1 / h [1/s].
         end: (..., 1) the last instant [s].
+
+    Example:
+        >>> from viapoint.primitives import point_to_point
+        >>> reach = point_to_point([0.0, 0.0], [0.3, 0.4], 0.8)
+        >>> reach
+        Trajectory(batch (), 1 segments, dimension 2, order 3)
+        >>> position, velocity, acceleration = reach.sample(200)
+        >>> position.shape, round(float(reach.peak(1)), 6)  # peak speed 1.875 A / T
+        ((200, 2), 1.171875)
     """
 
     coefficients: Array
@@ -63,14 +73,21 @@ class Trajectory:
                 array.setflags(write=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle by construction, so that copies are read-only too."""
+        """Return the constructor call for copy and pickle, so that copies are read-only too."""
         return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     @classmethod
     def from_segments(
         cls, coefficients: Array, durations: Array, xp: Namespace, *, some_empty: bool = False
     ) -> Trajectory:
-        """Join segments; with `some_empty` durations may be 0, where a via-point equals its neighbour."""
+        """Return a trajectory of joined segments.
+
+        Args:
+            coefficients: (..., 2 order, S, D) [m].
+            durations: (..., S) [s].
+            xp: namespace.
+            some_empty: durations may be 0, where a via-point equals its neighbour.
+        """
         order = coefficients.shape[-3] // 2
         if durations.shape[-1] == 1:
             return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
@@ -79,7 +96,7 @@ class Trajectory:
         starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
         if some_empty:
             empty = durations <= 0
-            # An empty segment at the very end must not take over the last instant from the one before it.
+            # An empty segment at the end must not become current at the last instant: start it later.
             starts = xp.where(starts >= end, 2 * end, starts)
             rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
         else:
@@ -88,27 +105,27 @@ class Trajectory:
 
     @property
     def namespace(self) -> Namespace:
-        """The Array API functions that belong to the arrays."""
+        """Array API functions of the arrays."""
         return namespace_of(self.coefficients)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """The leading shape `...`."""
+        """Leading shape `...`."""
         return tuple(self.coefficients.shape[:-3])
 
     @property
     def dimension(self) -> int:
-        """D, the dimension of space."""
+        """Dimension of space, D."""
         return int(self.coefficients.shape[-1])
 
     @property
     def duration(self) -> Array:
-        """(...,) total duration [s]."""
+        """Total duration, (...,) [s]."""
         return broadcast_to(self.namespace, self.end[..., 0], self.batch_shape)
 
     @property
     def knots(self) -> Array:
-        """(..., S + 1) the times at start, via-points and goal [s]."""
+        """Times at start, via-points and goal, (..., S + 1) [s]."""
         xp = self.namespace
         inner = xp.cumulative_sum(self.durations[..., :-1], axis=-1)
         knots = xp.concat([0.0 * self.end, inner, self.end], axis=-1)
@@ -127,7 +144,7 @@ class Trajectory:
             nu: order of the derivative, at least 0 (from 2 order on it is zero).
 
         Returns:
-            (..., T, D) [m/s^nu]. At a knot the segment that begins there counts, at the end the last one.
+            (..., T, D) [m/s^nu]. A knot belongs to the segment that begins there, the end to the last one.
 
         Raises:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
@@ -139,12 +156,12 @@ class Trajectory:
     def sample(
         self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
     ) -> tuple[Array, ...]:
-        """Several derivatives at once, optionally into the caller's buffers.
+        """Return several time derivatives at once, optionally in the caller's buffers.
 
         Args:
-            time: as in a call; or a whole number of at least 2: so many evenly spaced times from 0 to the
-                duration of each trajectory, both included.
-            nu: the orders of derivative; one number counts as a sequence of one.
+            time: as in a call; or a whole number of at least 2, the number of evenly spaced times from 0 to
+                the duration of each trajectory, both included.
+            nu: orders of derivative; one number counts as a sequence of one.
             out: one array per order, each (..., T, D) with the full batch shape, for example the planes of
                 one array (len(nu), ..., T, D). Written without intermediate copies where they are NumPy
                 arrays of the trajectory's dtype and the batch has one dimension.
@@ -170,16 +187,14 @@ class Trajectory:
         )
 
     def _times(self, time: Array | int) -> tuple[Array, Array | None]:
-        """Return times (..., T) clipped to the movement, and where they were inside (None: everywhere)."""
+        """Return times (..., T) clipped to the movement, and True where they were inside (None: all)."""
         xp = self.namespace
         end = self.end
         if isinstance(time, int | np.integer):
             if time < 2:
                 raise ValueError(f"time as a number of samples must be at least 2, got {time}")
-            grid = xp.arange(int(time), dtype=end.dtype, device=getattr(end, "device", None)) / (
-                int(time) - 1
-            )
-            return end * grid, None
+            count = xp.arange(int(time), dtype=end.dtype, device=getattr(end, "device", None))
+            return end * (count / (int(time) - 1)), None
         (time,) = self._own_floats(time=time)
         if time.ndim < 1:
             raise ValueError(f"time must have shape (T,) or (..., T), got shape {tuple(time.shape)}")
@@ -189,7 +204,7 @@ class Trajectory:
         return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
 
     def floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
-        """Return arguments as arrays of the trajectory's own library, required ones first (see as_floats)."""
+        """Convert arguments to arrays of the trajectory's library, required ones first (see as_floats)."""
         optional = optional or {}
         reference = {"coefficients": self.coefficients[..., 0, 0, 0]}
         xp, (*arrays, _) = as_floats({**optional, **reference}, **required)
@@ -199,13 +214,13 @@ class Trajectory:
         return arrays
 
     def _own_floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
-        """Return the same, of the trajectory's own dtype."""
+        """Convert arguments to the trajectory's library and dtype."""
         xp, dtype = self.namespace, self.coefficients.dtype
         arrays = self.floats(optional, **required)
         return [a if a is None or a.dtype == dtype else xp.astype(a, dtype) for a in arrays]
 
     def _held(self, value: Array, order: int, inside: Array | None, in_place: bool) -> Array:
-        """Zero derivatives outside the movement and beyond the polynomial's degree."""
+        """Return values with zero derivatives outside the movement and beyond the polynomial's degree."""
         if order == 0 or (inside is None and order < 2 * self.order):
             return value
         factor = 0.0 if order >= 2 * self.order else self.namespace.astype(inside, value.dtype)[..., None]
@@ -215,26 +230,31 @@ class Trajectory:
         return value * factor
 
     def cost(self) -> Array:
-        """Return (...,) 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], exact."""
+        """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
         return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
-        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], exact, as a sum of squares."""
+        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
+
+        Raises:
+            ValueError: nu is not a whole number from 0 to 2 order - 1.
+        """
         xp = self.namespace
         if whole_order(nu) >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
         modes = xp.reshape(xp.matmul(constant(energy_table(self.order, nu), flat), flat), upper.shape)
-        scale = self.durations if nu == 0 else self.rates
-        for _ in range(2 * nu - 2):
-            scale = scale * self.rates
+        scale = self.durations if nu == 0 else power(self.rates, 2 * nu - 1)
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
     def extrema(self, nu: int = 0) -> Extrema:
         """Return the least and greatest nu-th derivative per axis, with their times.
 
         Where the derivative jumps at a knot both sides count.
+
+        Raises:
+            ValueError: as in `peak`.
         """
         return axis_extrema(self._pieces(nu))
 
@@ -247,6 +267,7 @@ class Trajectory:
         return largest_norm(self._pieces(nu))
 
     def _pieces(self, nu: int) -> Pieces:
+        """Return the nu-th derivative, or raise ValueError if it overflows."""
         xp, nu = self.namespace, whole_order(nu)
         with error_state(xp):
             pieces = pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, xp)
@@ -260,7 +281,7 @@ class Trajectory:
         return pieces
 
     def stretched(self, duration: Array) -> Trajectory:
-        """Return the same path at another pace, scaled to a new total duration (...,) [s].
+        """Return the movement along the same path with time scaled to a new total duration (...,) [s].
 
         Raises:
             ValueError: duration is not finite, not positive, or does not broadcast.
@@ -279,7 +300,7 @@ class Trajectory:
     def transformed(
         self, rotation: Array | None = None, translation: Array | None = None, scale: Array | None = None
     ) -> Trajectory:
-        """Scale * rotation @ x(t) + translation: the movement elsewhere, turned and resized.
+        """Return the movement scale * rotation @ x(t) + translation.
 
         Args:
             rotation: (..., D', D) matrix (any linear map), default the identity.
@@ -315,6 +336,6 @@ class Trajectory:
 
 
 def require_trajectory(value: object) -> None:
-    """Raise ValueError for anything else."""
+    """Raise ValueError unless the value is a Trajectory."""
     if not isinstance(value, Trajectory):
         raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")

@@ -12,7 +12,7 @@ from viapoint import primitives
 from viapoint.envs.action import ActionLayout, frame
 from viapoint.envs.scenes import SHORTEST
 from viapoint.envs.task import Task
-from viapoint.primitives._passage.rest_to_rest import _ARRAYS, _root
+from viapoint.primitives._passage.rest_to_rest import nearer_fraction
 
 Numbers = NDArray[np.floating[Any]]
 Observation = Mapping[str, Numbers]
@@ -143,7 +143,7 @@ def _passage(along: Numbers, across_square: Numbers, square: Numbers) -> Numbers
     length = np.sqrt(square)
     late = along > 0.5 * length
     near = np.where(late, length - along, along)
-    root = _root(near * length, square, near * near + across_square, _ARRAYS)
+    root = nearer_fraction(near * length, square, near * near + across_square)
     return np.asarray(np.where(late, 1.0 - root, root))
 
 

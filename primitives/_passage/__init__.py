@@ -1,1 +1,1 @@
-"""Free passage times of via-points."""
+"""Solvers for free passage times: closed forms for one via-point, Newton iterations for several."""

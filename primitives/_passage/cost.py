@@ -1,40 +1,47 @@
-"""The jerk cost of the best movement through given points, as a function of the segment durations alone.
+"""Reduced jerk cost of movements through given points, as a function of the segment durations h alone.
 
-With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s). Its gradient is that of phi
-at fixed states (envelope theorem), its Hessian the Schur complement phi_hh - phi_hy phi_yy^-1 phi_yh, where
-phi_yy is the banded matrix of the linear problem. phi_s = 1/2 h^-5 sum_i w_i |q_i|^2 with the three Legendre
-modes of the jerk q = P s of the segment's data s.
+phi_s is the cost of segment s with the data s = (D, V0, A0, V1, A1) in unit time. The jerk has three Legendre
+modes q = P s, so
+
+    phi_s = 1/2 h^-5 sum_i w_i |q_i|^2,   w = (1, 3, 5).                                            (1)
+
+With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s) has the derivatives
+
+    dJ/dh = phi_h                            (envelope theorem),                                    (2)
+    d2J/dh2 = phi_hh - phi_hy phi_yy^-1 phi_yh   (Schur complement),                                (3)
+
+where phi_yy is the banded matrix A of `_knot_solver`. Since V = v h and A = a h^2, h d/dh acts on s as the
+diagonal matrix E of the degrees (0, 1, 2, 1, 2): h dq/dh = P E s.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-from .._knot_solver import States, assemble, factorise
-from ..array_api import FREE
-
-Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
+from .._knot_solver import Nodes, States, solve_states
+from ..array_api import FREE, Floats, ordered_sum, power
 
 _MODES: tuple[dict[int, float], ...] = (
     {2: -1.0, 4: 1.0},
     {1: 2.0, 2: 1.0, 3: -2.0, 4: 1.0},
     {0: 12.0, 1: -6.0, 2: -1.0, 3: -6.0, 4: 1.0},
 )
-"""P: the Legendre modes of the jerk in unit time, of the data s = (D, V0, A0, V1, A1)."""
+"""P, by rows of the nonzero entries: Legendre modes of the jerk in unit time."""
 
 _WEIGHTS = (1.0, 3.0, 5.0)
-"""Integral of squared jerk = sum of weight * mode^2; whole numbers, so that modes cancel as they should."""
+"""w of Eq. 1. P has whole numbers as entries, so that modes that vanish do so without rounding."""
 
 _DEGREES = (0, 1, 2, 1, 2)
-"""The power of h by which each entry of s is scaled."""
+"""E: the power of h in each entry of s."""
 
 
 @dataclass(frozen=True)
 class PassageCost:
-    """Movements whose passage times are sought, in unit total time; the movements are the last axis.
+    """Cost of N movements whose passage times are sought, in unit total time; movements are the last axis.
 
     Attributes:
         steps: (S, D, N) differences of the waypoints.
@@ -45,153 +52,129 @@ class PassageCost:
     start: list[Any]
     goal: list[Any]
 
-    def chosen(self, items: Any) -> PassageCost:
-        """Return the movements `items`, in that order."""
-        ends = [
-            [v[:, items] if isinstance(v, np.ndarray) else v for v in end] for end in (self.start, self.goal)
-        ]
-        return PassageCost(self.steps[:, :, items], *ends)
+    @classmethod
+    def from_points(cls, points: Floats, ends: Sequence[Any]) -> PassageCost:
+        """Return the cost of movements through points (N, S + 1, D) with four boundary values (N, D)."""
+        rows = [np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v for v in ends]
+        steps = np.ascontiguousarray(np.diff(points, axis=1).transpose(1, 2, 0))
+        return cls(steps, rows[:2], rows[2:])
 
-    def refined(self, items: Any) -> PassageCost:
-        """Return the movements `items` in extended precision, where the machine has one."""
-        part = self.chosen(items)
-        ends = [
-            [v.astype(np.longdouble) if isinstance(v, np.ndarray) else v for v in end]
-            for end in (part.start, part.goal)
-        ]
-        return PassageCost(part.steps.astype(np.longdouble), *ends)
+    def chosen(self, items: Any, dtype: Any = None) -> PassageCost:
+        """Return the movements `items`, in that order, optionally in another precision."""
 
-    def scale(self) -> Floats:
-        """Return (N,) the squared extent of each movement, 1 where it is zero."""
-        total = _total(self.steps * self.steps)
+        def pick(value: Any) -> Any:
+            if not isinstance(value, np.ndarray):
+                return value
+            return value[..., items].astype(dtype or value.dtype, copy=False)
+
+        return PassageCost(pick(self.steps), *([pick(v) for v in end] for end in (self.start, self.goal)))
+
+    def reference(self) -> Floats:
+        """Return (N,) a cost far below that of any real movement of this size, to keep logarithms finite."""
+        total = ordered_sum(ordered_sum(self.steps * self.steps, -2))
         for value in (*self.start, *self.goal):
             if isinstance(value, np.ndarray):
-                total = total + _total((value * value)[None])
-        return np.where(total > 0, total, 1.0)
+                total = total + ordered_sum(value * value)
+        return 1e-3 * np.where(total > 0, total, 1.0)
 
     def derivatives(self, h: Floats) -> tuple[Floats, Floats, Floats]:
-        """J (N,), dJ/dh (S, N), d2J/dh2 (S, S, N) at durations h (S, N)."""
+        """Return J (N,), dJ/dh (S, N) and d2J/dh2 (S, S, N) at durations h (S, N)."""
         segments = len(h)
         states: States = [self.start, *([FREE, FREE] for _ in range(segments - 1)), self.goal]
-        nodes: dict[tuple[int, int], int] = {}
-        for k, state in enumerate(states):
-            for i, value in enumerate(state):
-                if value is FREE:
-                    nodes[k, i] = len(nodes)
-        factor = None
-        if nodes:
-            upper, right = assemble(3, list(h), list(self.steps), states, nodes)
-            factor = factorise(upper)
-            for (k, i), value in zip(nodes, factor.solve(right), strict=True):
-                states[k] = [value, states[k][1]] if i == 0 else [states[k][0], value]
-        modes = [_apply(self._data(h, states), power) for power in range(3)]
+        states, nodes, factor = solve_states(3, list(h), list(self.steps), states)
+        modes = [_modes(self._data(h, states), degree) for degree in range(3)]
         j, first, second = _segment_derivatives(h, *modes)
         hessian = np.zeros((segments, *h.shape), dtype=h.dtype)
-        if factor is not None:
-            rows = _mixed_rows(h, modes[0], modes[1])
-            right = [self._mixed_column(rows, k, i) for k, i in nodes]
-            solved = factor.solve(right)
-            for (k, i), column in zip(nodes, solved, strict=True):
-                for s, place in ((k - 1, 3 + i), (k, 1 + i)):
-                    if 0 <= s < segments:
-                        hessian[s] -= _sum_dimensions(rows[place][s] * column)
+        if nodes:
+            rows = _mixed_derivatives(h, modes[0], modes[1])
+            for node, column in zip(nodes, factor.solve(self._mixed_columns(rows, nodes)), strict=True):
+                for s, place in _neighbours(node, segments):
+                    hessian[s] -= ordered_sum(rows[place][s] * column, -2)  # Eq. 3
         for s in range(segments):
             hessian[s, s] += second[s]
         return j, first, hessian
 
     def _data(self, h: Floats, states: States) -> list[Floats]:
-        """S = (D, V0, A0, V1, A1), each (S, D, N)."""
-        nothing = np.zeros(self.steps.shape[1:], dtype=h.dtype)
+        """Return s = (D, V0, A0, V1, A1), each (S, D, N)."""
+        zero = np.zeros(self.steps.shape[1:], dtype=h.dtype)
         velocity, acceleration = (
-            np.stack([nothing if state[i] is None else state[i] for state in states]) for i in range(2)
+            np.stack([zero if state[i] is None else state[i] for state in states]) for i in range(2)
         )
         h = h[:, None]
         square = h * h
-        return [
-            self.steps,
-            velocity[:-1] * h,
-            acceleration[:-1] * square,
-            velocity[1:] * h,
-            acceleration[1:] * square,
+        ends = [
+            v * f
+            for k in (slice(-1), slice(1, None))
+            for v, f in ((velocity[k], h), (acceleration[k], square))
         ]
+        return [self.steps, *ends]
 
-    def _mixed_column(self, rows: dict[int, Floats], k: int, i: int) -> Floats:
-        """d2 phi / dy dh_s for all s, (S, D, N): only the two segments at the knot count."""
-        column = np.zeros_like(self.steps)
-        if k > 0:
-            column[k - 1] = rows[3 + i][k - 1]
-        if k < len(column):
-            column[k] = rows[1 + i][k]
-        return column
+    def _mixed_columns(self, rows: dict[int, Floats], nodes: Nodes) -> list[Floats]:
+        """Return phi_yh, (S, D, N) for every unknown: nonzero for the two segments at its knot."""
+        columns = []
+        for node in nodes:
+            column = np.zeros_like(self.steps)
+            for s, place in _neighbours(node, len(column)):
+                column[s] = rows[place][s]
+            columns.append(column)
+        return columns
 
 
-def _apply(data: list[Floats], power: int) -> list[Floats]:
-    """P E^power s, with E the degrees: what the modes become when h d/dh acts on s."""
+def _neighbours(node: tuple[int, int], segments: int) -> list[tuple[int, int]]:
+    """Return the segments at knot k and the place of derivative i in their data s, for node (k, i)."""
+    k, i = node
+    return [(s, place) for s, place in ((k - 1, 3 + i), (k, 1 + i)) if 0 <= s < segments]
+
+
+def _modes(data: list[Floats], degree: int) -> list[Floats]:
+    """Return P E^degree s, the modes after `degree` applications of h d/dh."""
     modes = []
     for row in _MODES:
-        total: Any = None
-        for place, weight in row.items():
-            if power and not _DEGREES[place]:
-                continue
-            term = (weight * _DEGREES[place] ** power) * data[place]
-            total = term if total is None else total + term
-        modes.append(total)
+        terms = [(w * _DEGREES[n] ** degree) * data[n] for n, w in row.items() if _DEGREES[n] or not degree]
+        modes.append(ordered_sum(terms))
     return modes
 
 
 def _segment_derivatives(
     h: Floats, q0: list[Floats], q1: list[Floats], q2: list[Floats]
 ) -> tuple[Floats, Floats, Floats]:
-    """J (N,) and the first two derivatives (S, N) of phi_s with respect to h_s at fixed states."""
+    """Return J (N,) and the first two derivatives (S, N) of phi_s with respect to h_s at fixed states.
+
+    From Eq. 1 with q1 = h dq/dh and q2 = (h d/dh)^2 q,
+
+        h phi_h = h^-5 (q.q1 - 5/2 q.q),   h^2 phi_hh = h^-5 (q1.q1 + q.q2 - 11 q.q1 + 15 q.q).
+    """
     zero, one = _product(q0, q0), _product(q0, q1)
     curve = _product(q1, q1) + _product(q0, q2)
     inverse = 1.0 / h
-    fifth = inverse * inverse * inverse * inverse * inverse
+    fifth = power(inverse, 5)
     phi = 0.5 * fifth * zero
     first = fifth * inverse * (one - 2.5 * zero)
     second = fifth * inverse * inverse * (curve - 11.0 * one + 15.0 * zero)
-    total = phi[0]
-    for row in phi[1:]:
-        total = total + row
-    return total, first, second
+    return ordered_sum(phi), first, second
 
 
-def _mixed_rows(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floats]:
-    """Return J (N,) and the first two derivatives (S, N) of phi_s by h_s at fixed states."""
+def _mixed_derivatives(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floats]:
+    """Return d2 phi_s / dh dy (S, D, N) for the places 1 to 4 of s.
+
+    For an entry of degree e, dq/dy = h^e P column, so it is h^(e - 6) sum_i w_i P_i (q1_i + (e - 5) q_i).
+    """
     inverse = (1.0 / h)[:, None]
-    fourth = inverse * inverse * inverse * inverse
+    fourth = power(inverse, 4)
     rows: dict[int, Floats] = {}
     for place in (1, 2, 3, 4):
         degree = _DEGREES[place]
-        total: Any = None
-        for weight, row, zero, one in zip(_WEIGHTS, _MODES, q0, q1, strict=True):
-            if place in row:
-                term = (weight * row[place]) * (one + (degree - 5.0) * zero)
-                total = term if total is None else total + term
-        rows[place] = (fourth * inverse if degree == 1 else fourth) * total
+        terms = [
+            (weight * row[place]) * (one + (degree - 5.0) * zero)
+            for weight, row, zero, one in zip(_WEIGHTS, _MODES, q0, q1, strict=True)
+            if place in row
+        ]
+        rows[place] = (fourth * inverse if degree == 1 else fourth) * ordered_sum(terms)
     return rows
 
 
 def _product(p: list[Floats], q: list[Floats]) -> Floats:
-    """Sum over modes and dimensions, (S, N)."""
-    total = _sum_dimensions(p[0] * q[0])
-    for weight, x, y in zip(_WEIGHTS[1:], p[1:], q[1:], strict=True):
-        total = total + weight * _sum_dimensions(x * y)
-    return total
-
-
-def _sum_dimensions(array: Floats) -> Floats:
-    """Sum over the axis before the last, in its order."""
-    total: Floats = array[..., 0, :]
-    for d in range(1, array.shape[-2]):
-        total = total + array[..., d, :]
-    return total
-
-
-def _total(array: Floats) -> Floats:
-    """Sum over everything but the last axis, in its order."""
-    rows = _sum_dimensions(array)
-    total: Floats = rows[0]
-    for row in rows[1:]:
-        total = total + row
+    """Return the weighted scalar product sum_i w_i p_i . q_i over modes and dimensions, (S, N)."""
+    terms = [w * ordered_sum(x * y, -2) for w, x, y in zip(_WEIGHTS, p, q, strict=True)]
+    total: Floats = ordered_sum(terms)
     return total

@@ -1,8 +1,11 @@
-"""Free passage times of any number of via-points: damped Newton on the logarithm of the reduced jerk cost.
+"""Free passage times of any number of via-points: damped Newton steps on the log of the reduced jerk cost.
 
-The durations are h_i = exp(z_i) / sum_j exp(z_j) in unit total time, positive by construction; the logarithm
-of the cost spans few units where the cost spans decades. Rest to rest only one minimum has ever been seen;
-with moving ends there can be several, so that case starts from several points and compares.
+The durations are h_i = exp(z_i) / sum_j exp(z_j) in unit total time, positive by construction. The logarithm
+of the cost spans few units where the cost spans decades. From rest to rest only one minimum was ever seen
+(a conjecture, not a theorem). With moving ends there can be several, so the search starts from several points.
+
+Many problems are solved side by side, each with its own steps. The problems are the last axis of all arrays,
+and every operation works element by element, so that a result does not depend on the batch.
 """
 
 from __future__ import annotations
@@ -13,11 +16,20 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ..array_api import Floats, ordered_sum
 from .cost import PassageCost
 
-Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 Evaluate: TypeAlias = Callable[[Floats, Any], tuple[Floats, Floats, Floats]]
 """(z (n, M), items (M,)) -> value (M,), gradient (n, M), Hessian (n, n, M) of the problems `items` at z."""
+
+_STARTS = 10
+"""Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution."""
+
+_SHORT = 0.03
+"""Fraction of the duration below which a segment's cost loses digits, like 1e-16 / h^2.
+
+Movements with such a segment are finished in extended precision.
+"""
 
 _LONGEST_STEP = 1.5
 _NOISE = 1e-13
@@ -28,18 +40,100 @@ _HALVINGS = 12
 
 @dataclass(frozen=True)
 class Minima:
-    """Where the iterations ended: z (n, N), value (N,), and whether each converged (N,)."""
+    """Results of the iterations: z (n, N), value (N,), and True where one converged (N,)."""
 
     z: Floats
     value: Floats
     converged: Any
 
 
-def minimise(evaluate: Evaluate, z: Floats) -> Minima:
-    """Local minima from the given starts.
+def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
+    """Return fractions of the duration (N, S), and True where the iteration converged (N,).
 
-    A step of the Newton iteration whose length is below 1e-8 is taken and is the last one: its successor
-    would be of the order of its square.
+    Args:
+        cost: the movements.
+        several: search from several starts.
+    """
+    first, *others = _starts(cost.steps, several)
+    best = _minimise_cost(cost, first)
+    for start in others:
+        found = _minimise_cost(cost, start)
+        # A later start must be better by more than rounding, or noise would decide ties.
+        better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
+        pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
+        best = Minima(*(np.where(better, new, old) for new, old in pairs))
+    lost = ~np.isfinite(best.z).all(axis=0)
+    h = np.where(lost, 1.0 / len(best.z), _softmax(np.where(lost, 0.0, best.z)))
+    hard = np.flatnonzero(~best.converged | (h.min(axis=0) < _SHORT))
+    if hard.size:
+        refined = _minimise_cost(cost.chosen(hard, np.longdouble), h[:, hard].astype(np.longdouble))
+        good = np.isfinite(refined.z).all(axis=0)
+        h[:, hard[good]] = _softmax(refined.z[:, good])
+        best.converged[hard] = refined.converged & good
+    return np.ascontiguousarray(h.T), best.converged
+
+
+def _starts(steps: Floats, several: bool) -> list[Floats]:
+    """Return durations to start from, each (S, N): proportional to the cube root of the chord, and others."""
+    chord = np.cbrt(np.sqrt(ordered_sum(steps * steps, 1)))
+    starts = [np.maximum(chord / chord.max(axis=0), 1e-3)]
+    if several:
+        segments, count = chord.shape
+        starts.append(np.ones_like(chord))
+        drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
+        starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
+    return [start / start.sum(axis=0) for start in starts]
+
+
+def _minimise_cost(cost: PassageCost, start: Floats) -> Minima:
+    """Minimise log(J + reference) from durations (S, N)."""
+    reference = cost.reference()
+
+    def evaluate(z: Floats, items: Any) -> tuple[Floats, Floats, Floats]:
+        return log_cost(cost.chosen(items), z, reference[items])
+
+    return _minimise(evaluate, np.log(start))
+
+
+def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return log(J + reference), its gradient and its Hessian with respect to z.
+
+    With c = 1 / (J + reference) and M = dh/dz = diag(h) - h h^T,
+
+        gradient = c M J_h,   Hessian = c (M J_hh M + sum_i J_i d2h_i/dz2) - gradient gradient^T.
+
+    The cost does not change if all z shift, so 1 1^T makes the Hessian regular and changes no step.
+    """
+    h = _softmax(z)
+    j, first, second = cost.derivatives(h)
+    scale = 1.0 / (j + reference)
+    first = first * h * scale
+    mean = ordered_sum(first)
+    gradient = first - h * mean
+    curved = scale * second * h * h[:, None]
+    along = ordered_sum(curved)
+    hessian = curved - _outer(h, along) - _outer(along, h) + ordered_sum(along) * _outer(h, h)
+    hessian = hessian - _outer(h, first) - _outer(first, h) + 2.0 * mean * _outer(h, h)
+    for i in range(len(h)):
+        hessian[i, i] += first[i] - h[i] * mean
+    return np.log(j + reference), gradient, hessian - _outer(gradient, gradient) + 1.0
+
+
+def _outer(p: Floats, q: Floats) -> Floats:
+    return p[:, None] * q[None, :]
+
+
+def _softmax(z: Floats) -> Floats:
+    h = np.exp(z - z.max(axis=0))
+    shares: Floats = h / ordered_sum(h)
+    return shares
+
+
+def _minimise(evaluate: Evaluate, z: Floats) -> Minima:
+    """Return local minima from the starts z (n, N).
+
+    A Newton step shorter than 1e-8 is the last one: by quadratic convergence its successor would be of the
+    order of its square.
     """
     z = z.copy()
     active = np.arange(z.shape[1])
@@ -65,8 +159,12 @@ def minimise(evaluate: Evaluate, z: Floats) -> Minima:
 def _search(
     evaluate: Evaluate, z: Floats, items: Any, step: Floats, value: Floats, gradient: Floats, hessian: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Halve each step until its value falls enough; a problem that cannot fall any more stays where it is."""
-    slope = _sum(gradient * step)
+    """Return z after a backtracking line search, with value, gradient and Hessian there.
+
+    A step is accepted by the Armijo condition (Nocedal & Wright 2006, Eq. 3.4), up to rounding. A problem
+    whose value cannot fall any more stays where it is.
+    """
+    slope = ordered_sum(gradient * step)
     z, value, gradient, hessian = z.copy(), value.copy(), gradient.copy(), hessian.copy()
     waiting = np.arange(len(items))
     length = 1.0
@@ -86,7 +184,7 @@ def _search(
 
 
 def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
-    """-H^-1 g with the pivots of L D L^T made positive, and no component longer than 1.5."""
+    """Return the modified Newton step -H^-1 g, shortened so that no component is longer than 1.5."""
     step = -solve_positive(hessian, gradient)
     longest = np.abs(step).max(axis=0)
     shortened: Floats = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
@@ -94,7 +192,11 @@ def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
 
 
 def solve_positive(matrix: Floats, right: Floats) -> Floats:
-    """Solve with L |D| L^T instead of L D L^T: a descent direction even where the cost is not convex."""
+    """Solve L |D| L^T x = right, where the matrix is L D L^T.
+
+    The absolute pivots give a descent direction where the cost is not convex (modified factorisation, Nocedal
+    & Wright 2006, section 3.4).
+    """
     size = len(matrix)
     work, solution = matrix.copy(), right.copy()
     scale = np.abs(np.stack([matrix[i, i] for i in range(size)])).max(axis=0)
@@ -111,104 +213,3 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
             solution[j] -= work[j, i] * solution[i]
         solution[j] /= pivots[j]
     return solution
-
-
-def _sum(array: Floats) -> Floats:
-    """Sum over the first axis in its order, whatever the memory layout."""
-    total: Floats = array[0].copy()
-    for row in array[1:]:
-        total += row
-    return total
-
-
-_STARTS = 10
-"""Starts with moving ends: even, by chord, and eight drawn from the flat Dirichlet distribution with a fixed
-seed."""
-
-_SHORT = 0.03
-"""Fraction of the duration below which a segment's cost suffers from cancellation, like 1e-16 / h^2:
-movements with such a segment are finished in extended precision."""
-
-
-def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
-    """Fractions of the duration per segment, (N, S), and whether the iteration converged, (N,)."""
-    first, *others = _starts(cost.steps, several)
-    best = _from_start(cost, first)
-    for start in others:
-        found = _from_start(cost, start)
-        # A later start must be better by more than rounding, else ties would be decided by noise.
-        better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
-        pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
-        best = Minima(*(np.where(better, new, old) for new, old in pairs))
-    lost = ~np.isfinite(best.z).all(axis=0)
-    h = np.where(lost, 1.0 / len(best.z), _softmax(np.where(lost, 0.0, best.z)))
-    hard = np.flatnonzero(~best.converged | (h.min(axis=0) < _SHORT))
-    if hard.size:
-        refined = _from_start(cost.refined(hard), h[:, hard].astype(np.longdouble))
-        good = np.isfinite(refined.z).all(axis=0)
-        h[:, hard[good]] = _softmax(refined.z[:, good])
-        best.converged[hard] = refined.converged & good
-    return np.ascontiguousarray(h.T), best.converged
-
-
-def _from_start(cost: PassageCost, start: Floats) -> Minima:
-    reference = 1e-3 * cost.scale()
-
-    def evaluate(z: Floats, items: Any) -> tuple[Floats, Floats, Floats]:
-        return log_cost(cost.chosen(items), z, reference[items])
-
-    return minimise(evaluate, np.log(start))
-
-
-def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return log(J + reference), gradient and Hessian with respect to z."""
-    h = _softmax(z)
-    j, first, second = cost.derivatives(h)
-    scale = 1.0 / (j + reference)
-    first = first * h * scale
-    mean = first[0]
-    for row in first[1:]:
-        mean = mean + row
-    gradient = first - h * mean
-    # d2J/dz2 = M^T J_hh M + sum_i J_i d2h_i/dz2 with M = diag(h) - h h^T, written out.
-    curved = scale * second * h * h[:, None]
-    along = curved[0]
-    for row in curved[1:]:
-        along = along + row
-    both = along[0]
-    for entry in along[1:]:
-        both = both + entry
-    hessian = curved - _outer(h, along) - _outer(along, h) + both * _outer(h, h)
-    hessian = hessian - _outer(h, first) - _outer(first, h) + 2.0 * mean * _outer(h, h)
-    for i in range(len(h)):
-        hessian[i, i] += first[i] - h[i] * mean
-    return np.log(j + reference), gradient, hessian - _outer(gradient, gradient) + 1.0
-
-
-def _outer(p: Floats, q: Floats) -> Floats:
-    return p[:, None] * q[None, :]
-
-
-def _softmax(z: Floats) -> Floats:
-    largest = z.max(axis=0)
-    h = np.exp(z - largest)
-    total: Floats = h[0]
-    for row in h[1:]:
-        total = total + row
-    shares: Floats = h / total
-    return shares
-
-
-def _starts(steps: Floats, several: bool) -> list[Floats]:
-    """Durations to start from, each (S, N)."""
-    square = steps[:, 0] * steps[:, 0]
-    for d in range(1, steps.shape[1]):
-        square = square + steps[:, d] * steps[:, d]
-    chord = np.cbrt(np.sqrt(square))
-    starts = [np.maximum(chord / chord.max(axis=0), 1e-3)]
-    if several:
-        segments, count = chord.shape
-        starts.append(np.ones_like(chord))
-        drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
-        starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
-    return [start / start.sum(axis=0) for start in starts]

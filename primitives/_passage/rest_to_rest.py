@@ -1,13 +1,16 @@
-"""The free passage time of one via-point, rest to rest: the root of a polynomial that has exactly one.
+"""Free passage time of one via-point, rest to rest: the only root of a polynomial in (0, 1).
 
-Substituting the movement into Flash & Hogan's Eq. C16, pi . v(t1) = 0, gives with E = x1 - x0, D = xf - x0
-and
+Substituting the movement into pi . v(t1) = 0 (Flash & Hogan 1985, Eq. C16) gives with t = t1 / duration,
+E = x1 - x0, D = xf - x0 and
 
-    a = E.D,   b = D.D,   c = E.E,   q = 10 t^3 - 15 t^4 + 6 t^5,   w = t^3 (2 - t)
+    a = E.D,   b = D.D,   c = E.E,   s = 1 - 2t,   q = 10 t^3 - 15 t^4 + 6 t^5,   w = t^3 (2 - t)
 
-the equation F(t) = (E - D q).(E (1 - 2t) + D w) = c (1 - 2t) + a w - q (a (1 - 2t) + b w) = 0, of degree 9.
-It has one root in (0, 1), simple, the global minimum of the jerk cost; it lies below 1/2 exactly if x1 is
-nearer to x0 than to xf.
+the polynomial of degree 9
+
+    F(t) = (E - D q).(E s + D w) = c s + a w - q (a s + b w) = 0.                                   (1)
+
+Its root in (0, 1) is simple and the global minimum of the jerk cost. It lies below 1/2 exactly if x1 is
+nearer to x0 than to xf. Only a/b and c/b matter, in any dimension of space.
 """
 
 from __future__ import annotations
@@ -21,26 +24,29 @@ import numpy as np
 from ..array_api import Array, Namespace, like, to_numpy
 
 Number: TypeAlias = Any
-"""A float, or an array with one entry per movement: the same operations, the same bits."""
+"""A float, or an array with one entry per movement; both give the same bits."""
+
+SHORTEST = 1e-50
+"""Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
 _STEPS = 5
-"""Newton steps: the start is within 34 % everywhere, after five the error is 2e-16 (measured over all
-cases)."""
+"""Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
 
 _FLOOR = 1e-5
-"""Distance of the via-point from an end point, relative to the movement's extent, below which the gradient is
-clipped."""
+"""Distance of the via-point from an end, relative to the movement's extent, that clips the gradient."""
 
 
-class _Functions(NamedTuple):
+class Functions(NamedTuple):
+    """Elementary functions of arrays or of floats."""
+
     where: Callable[[Any, Any, Any], Any]
     sqrt: Callable[[Any], Any]
     cube_root: Callable[[Any], Any]
     clip: Callable[[Any, Any, Any], Any]
 
 
-_ARRAYS = _Functions(np.where, np.sqrt, np.cbrt, lambda x, low, high: np.minimum(np.maximum(x, low), high))
-_FLOATS = _Functions(
+ARRAYS = Functions(np.where, np.sqrt, np.cbrt, lambda x, low, high: np.minimum(np.maximum(x, low), high))
+_FLOATS = Functions(
     lambda condition, yes, no: yes if condition else no,
     math.sqrt,
     lambda x: float(np.cbrt(x)),
@@ -48,12 +54,8 @@ _FLOATS = _Functions(
 )
 
 
-_SHORTEST = 1e-50
-"""Least fraction that a via-point apart from its neighbour may get: a higher power of it must not underflow."""
-
-
 def fractions_at_rest(points: Any) -> Any:
-    """Fractions of the duration before and after the via-point.
+    """Return the fractions of the duration before and after the via-point.
 
     Args:
         points: (N, 3, D) NumPy float64: start, via-point, goal [m].
@@ -62,35 +64,36 @@ def fractions_at_rest(points: Any) -> Any:
         (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start
         or goal has fraction 0 there.
     """
-    if len(points) == 1:  # Python floats spare a batch of one the overhead of 200 array operations
-        rows, math_functions = points[0].tolist(), _FLOATS
+    if (
+        len(points) == 1
+    ):  # Python floats: a batch of one would spend its time in the overhead of 200 array operations
+        rows, f = points[0].tolist(), _FLOATS
     else:
-        rows, math_functions = np.ascontiguousarray(points.transpose(1, 2, 0)), _ARRAYS
+        rows, f = np.ascontiguousarray(points.transpose(1, 2, 0)), ARRAYS
     start, via, goal = rows
-    a, b, c, is_late, apart = _invariants(start, via, goal, math_functions)
-    smaller = _root(a, b, c, math_functions)
-    smaller = math_functions.where(apart & (smaller < _SHORTEST), _SHORTEST, smaller)
+    a, b, c, is_late, apart = _invariants(start, via, goal, f)
+    smaller = nearer_fraction(a, b, c, f)
+    smaller = f.where(apart & (smaller < SHORTEST), SHORTEST, smaller)
     larger = 1.0 - smaller
-    before = math_functions.where(is_late, larger, smaller)
-    after = math_functions.where(is_late, smaller, larger)
+    before, after = f.where(is_late, larger, smaller), f.where(is_late, smaller, larger)
     return np.array([[before, after]]) if len(points) == 1 else np.stack([before, after], axis=-1)
 
 
 def _invariants(
-    start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: _Functions
+    start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: Functions
 ) -> tuple[Number, ...]:
-    """Return a, b, c as seen from the nearer end, whether that is the goal, and whether the via-point is apart."""
+    """Return a, b, c with E from the nearer end, True if that is the goal, and True if the via-point is apart."""
     first = [x1 - x0 for x0, x1 in zip(start, via, strict=True)]
     second = [x1 - x0 for x0, x1 in zip(via, goal, strict=True)]
     whole = [x1 - x0 for x0, x1 in zip(start, goal, strict=True)]
-    c_first, c_second = dot(first, first), dot(second, second)
+    c_first, c_second = _dot(first, first), _dot(second, second)
     is_late = c_second < c_first
-    a = f.where(is_late, dot(second, whole), dot(first, whole))
+    a = f.where(is_late, _dot(second, whole), _dot(first, whole))
     apart = f.where(is_late, _longest(second, f), _longest(first, f)) > 0
-    return a, dot(whole, whole), f.where(is_late, c_second, c_first), is_late, apart
+    return a, _dot(whole, whole), f.where(is_late, c_second, c_first), is_late, apart
 
 
-def _longest(vector: Sequence[Number], f: _Functions) -> Number:
+def _longest(vector: Sequence[Number], f: Functions) -> Number:
     """Return the largest component, which unlike a square does not underflow."""
     largest = abs(vector[0])
     for component in vector[1:]:
@@ -98,46 +101,52 @@ def _longest(vector: Sequence[Number], f: _Functions) -> Number:
     return largest
 
 
-def dot(x: Sequence[Number], y: Sequence[Number]) -> Number:
-    """Sum over the dimensions of space in a fixed order (NumPy's own order depends on the memory layout)."""
+def _dot(x: Sequence[Number], y: Sequence[Number]) -> Number:
+    """Return the scalar product, summed in a fixed order (NumPy's depends on the memory layout)."""
     total = x[0] * y[0]
     for p, q in zip(x[1:], y[1:], strict=True):
         total = total + p * q
     return total
 
 
-def _root(a: Number, b: Number, c: Number, f: _Functions) -> Number:
-    """Return the root of F in (0, 1/2]."""
-    # For small t, c = 4 a z + 10 b z^2 + ... with z = t^3; t = 1/2 for far via-points.
+def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> Number:
+    """Return the root of F (Eq. 1) in [0, 1/2], for E from the nearer end, so that a <= b / 2.
+
+    Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
+    The term 8 c brings the start to 1/2 for distant via-points.
+    """
     root = f.sqrt(4.0 * a * a + 5.0 * b * c)
-    top = f.where(a >= 0, c, root - 2.0 * a)
+    top = f.where(a >= 0, c, root - 2.0 * a)  # the form of the quadratic formula without cancellation
     bottom = f.where(a >= 0, 4.0 * a + 2.0 * root + 8.0 * c, 10.0 * b + 8.0 * top)
     t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
     t = f.clip(t, 0.0, 0.5)
     for _ in range(_STEPS):
-        value, slope = residual(t, a, b, c)
+        value, slope = _residual(t, a, b, c)
         t = f.clip(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t, 0.5)
     return t
 
 
-def residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number]:
-    """F and dF/dt."""
+def _residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number]:
+    """Return F of Eq. 1 and dF/dt."""
     square = t * t
-    cube = square * t
-    s = 1.0 - 2.0 * t
-    w = cube * (2.0 - t)
-    q = cube * (10.0 + t * (6.0 * t - 15.0))
+    s, q, w = _basis(t, square)
     dw = square * (6.0 - 4.0 * t)
     dq = 30.0 * square * ((1.0 - t) * (1.0 - t))
     m = a * s + b * w
     return c * s + a * w - q * m, a * dw - 2.0 * c - dq * m - q * (b * dw - 2.0 * a)
 
 
-def attach_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> Array:
-    """Make the fractions differentiable by the implicit function theorem, dt/dp = -(dF/dp) / (dF/dt).
+def _basis(t: Number, square: Number) -> tuple[Number, Number, Number]:
+    """Return s, q and w."""
+    cube = square * t
+    return 1.0 - 2.0 * t, cube * (10.0 + t * (6.0 * t - 15.0)), cube * (2.0 - t)
 
-    The gradient grows without bound, like |E|^(-2/3), as the via-point meets an end point; it is clipped
-    there, and stays finite when all points coincide.
+
+def attach_root_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> Array:
+    """Return differentiable fractions, by the implicit function theorem dt/dp = -(dF/dp) / (dF/dt).
+
+    The gradient grows without bound, like |E|^(-2/3), as the via-point approaches an end. It is clipped there,
+    and stays finite when all points coincide.
     """
     rates, is_late = _root_rates(
         to_numpy(waypoints).astype(np.float64), to_numpy(fractions).astype(np.float64)
@@ -146,24 +155,23 @@ def attach_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> Array:
     near = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     near = (near * like(xp, np.stack([~is_late, is_late], axis=-1)[..., None], near)).sum(-2)
     by_a, by_b, by_c = (like(xp, rate, near)[..., None] for rate in rates)
-    # The sum over dimensions of by_a a + by_b b + by_c c; only its gradient is wanted, the value is exact.
+    # Only the gradient of by_a a + by_b b + by_c c counts: its value is subtracted again.
     change = (near * (by_a * whole + by_c * near) + by_b * (whole * whole)).sum(-1)
     change = change - change.detach()
     return fractions + xp.stack([change, -change], axis=-1)
 
 
 def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]:
-    """Return d(first fraction) / d(a, b, c), each (...,), and whether the via-point is nearer to the goal."""
+    """Return d(first fraction) / d(a, b, c), each (...,), and True where the via-point is nearer to the goal."""
     start, via, goal = (np.moveaxis(points[..., k, :], -1, 0) for k in range(3))
     is_late = fractions[..., 1] < fractions[..., 0]
     t = fractions.min(axis=-1)
     near = np.where(is_late, goal - via, via - start)
     whole = goal - start
-    a, b, c = dot(near, whole), dot(whole, whole), dot(near, near)
-    _, slope = residual(t, a, b, c)
+    a, b, c = _dot(near, whole), _dot(whole, whole), _dot(near, near)
+    _, slope = _residual(t, a, b, c)
     extent = b + c
     floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
     sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
-    cube, s = t * t * t, 1.0 - 2.0 * t
-    w, q = cube * (2.0 - t), cube * (10.0 + t * (6.0 * t - 15.0))
+    s, q, w = _basis(t, t * t)
     return (sign * (w - q * s), -sign * q * w, sign * s), is_late
