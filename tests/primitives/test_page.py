@@ -30,6 +30,8 @@ def test_the_table_of_speed_is_the_measured_file():
     for row in rows:
         verdict = "" if row["holds"] else " (missed)"
         limit = "" if row["limit"] is None else f"{row['limit']:.3g}{verdict}"
-        line = f"| {row['name']} | {row['microseconds']:.2f} | {row['value']:.3g} | {row['measure']} | {limit} |"
+        line = (
+            f"| {row['name']} | {row['microseconds']:.2f} | {row['value']:.3g} | {row['measure']} | {limit} |"
+        )
         assert line in PAGE
     assert PAGE.count("| K=") == len(rows)
