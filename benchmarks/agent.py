@@ -30,17 +30,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.training.baselines import SEARCHES, agent_method, make_method
-from viapoint.training.candidates import candidate_actions
-from viapoint.training.evaluate import evaluate
-from viapoint.training.files import read_json, write_json
-from viapoint.training.frozen_scenes import load, shipped_path
-from viapoint.training.geometry_checks import CLEARANCE_MARGIN, REACH_MARGIN
-from viapoint.training.geometry_search import GeometrySearch, worth_of_plans
-from viapoint.training.model_files import untrained
-from viapoint.training.online_trial import new_trial
-from viapoint.training.runs import load_model
-from viapoint.training.train import one_thread
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.io.files import read_json, write_json
+from viapoint.training.planners.baselines import SEARCHES, agent_method, make_method
+from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.runs.model_io import untrained
+from viapoint.training.runs.run_dir import load_model
+from viapoint.training.runs.trainer import one_thread
+from viapoint.training.scene_sets.scene_set import load, shipped_path
+from viapoint.training.search.candidates import candidate_actions
+from viapoint.training.search.geometry_search import GeometrySearch, worth_of_plans
+from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 CHECKS = (0, 4, 16, 64)
 """Checks of an agent's proposals."""

@@ -30,11 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.training.baselines import SEARCHES
-from viapoint.training.frozen_scenes import load
-from viapoint.training.geometry_checks import NODES, check_plans
-from viapoint.training.geometry_search import GeometrySearch
-from viapoint.training.online_trial import new_trial
+from viapoint.training.planners.baselines import SEARCHES
+from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.search.geometry_search import GeometrySearch
+from viapoint.training.search.plan_checks import NODES, check_plans
 
 REPEATS = 9
 BATCH = 250

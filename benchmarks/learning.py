@@ -29,7 +29,7 @@ from study.figures import draw
 from study.merge import check_conditions, merged
 from study.plan import Study
 
-from viapoint.training.files import read_json, write_bytes, write_json
+from viapoint.training.io.files import read_json, write_bytes, write_json
 
 Answer = tuple[bool, str]
 """Whether a job went well, and what it told."""

@@ -25,7 +25,7 @@ import gymnasium as gym
 import numpy as np
 
 import viapoint.envs
-from viapoint.envs import rendering
+from viapoint.envs.rendering import renderer
 
 MEGABYTE = 1 << 20
 LEAST = 10
@@ -83,7 +83,7 @@ def speeds(curve: list[dict[str, float]]) -> dict[str, float]:
 def cycles(number: int, size: int = 64) -> Iterator[dict[str, Any]]:
     """Environments of every id made, used and closed: single ones, every fifth rendered, every fifth a vector."""
     what = f"environments made, used and closed, one in {RENDERED} rendered"
-    rendering.STILL_SUPERSAMPLING = 1  # it is contexts that could leak, not the size of one picture
+    renderer.STILL_SUPERSAMPLING = 1  # it is contexts that could leak, not the size of one picture
     ids, curve, began = sorted(viapoint.envs.TASKS), [], time.process_time()
     every = max(1, number // SAMPLES)
     for cycle in range(number + 1):

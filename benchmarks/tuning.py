@@ -33,12 +33,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from viapoint.training.baselines import agent_method
-from viapoint.training.evaluate import evaluate
-from viapoint.training.frozen_scenes import load
-from viapoint.training.model_files import build
-from viapoint.training.train import one_thread
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.planners.baselines import agent_method
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.model_io import build
+from viapoint.training.runs.trainer import one_thread
+from viapoint.training.scene_sets.scene_set import load
 
 ENV_ID, STEP_ID = "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0"
 SET = {"features_extractor_class": {"kind": "extractor", "name": "SceneExtractor"}}

@@ -3,7 +3,7 @@
 See :data:`viapoint.envs.registration.TASKS` for the ids.
 """
 
-from viapoint.envs import _mujoco as _mujoco
+from viapoint.envs.common import mujoco_check as mujoco_check
 from viapoint.envs.registration import TASKS, register_all
 
 register_all()

@@ -23,7 +23,7 @@ TASKS: dict[str, dict[str, Any]] = {
         "duration_range": (1.0, 2.0),
     },
 }
-"""Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.reach.ReachVectorEnv`."""
+"""Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.vector_env.ReachVectorEnv`."""
 
 OWN_ARM_TASKS: dict[str, str] = {
     "viapoint/Reach-v0": "viapoint/PandaReach-v0",
@@ -38,7 +38,7 @@ STEP_TASKS: dict[str, str] = {
 }
 """Every id of a task with an action in every control step, and its twin, whose keyword arguments it sets.
 
-They are :class:`~viapoint.envs.reach_step.StepReachVectorEnv`.
+They are :class:`~viapoint.envs.velocity_env.StepReachVectorEnv`.
 """
 
 ONLINE_TASKS: dict[str, dict[str, Any]] = {
@@ -55,7 +55,7 @@ ONLINE_TASKS: dict[str, dict[str, Any]] = {
 }
 """Every id of a task whose plans are revised on the way, with what it sets of the keyword arguments.
 
-They are those of :class:`~viapoint.envs.reach_online.OnlineReachVectorEnv`.
+They are those of :class:`~viapoint.envs.replanning_env.OnlineReachVectorEnv`.
 """
 
 ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
@@ -65,14 +65,18 @@ ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
 def register_all() -> None:
     """Make every id known to Gymnasium; a second call changes nothing."""
     for name, kwargs in TASKS.items():
-        _register(name, "viapoint.envs.reach:ReachEnv", "viapoint.envs.reach:ReachVectorEnv", kwargs)
+        _register(
+            name, "viapoint.envs.single_env:ReachEnv", "viapoint.envs.vector_env:ReachVectorEnv", kwargs
+        )
     for name, like in OWN_ARM_TASKS.items():
-        _register(name, "viapoint.envs.reach:ReachEnv", "viapoint.envs.reach:ReachVectorEnv", TASKS[like])
+        _register(
+            name, "viapoint.envs.single_env:ReachEnv", "viapoint.envs.vector_env:ReachVectorEnv", TASKS[like]
+        )
     for name, twin in STEP_TASKS.items():
-        module = "viapoint.envs.reach_step"
+        module = "viapoint.envs.velocity_env"
         _register(name, f"{module}:StepReachEnv", f"{module}:StepReachVectorEnv", TASKS[twin])
     for name, kwargs in ONLINE_TASKS.items():
-        module = "viapoint.envs.reach_online"
+        module = "viapoint.envs.replanning_env"
         _register(name, f"{module}:OnlineReachEnv", f"{module}:OnlineReachVectorEnv", kwargs)
 
 

@@ -55,7 +55,7 @@ def test_everything_is_inside(wheel, suffixes):
 
 def test_there_is_something_of_each_kind(wheel):
     names = wheel.namelist()
-    for ending in ("cli.py", "planar.xml", "envs/py.typed", "primitives/py.typed", "training/py.typed"):
+    for ending in ("cli/main.py", "planar.xml", "envs/py.typed", "primitives/py.typed", "training/py.typed"):
         assert any(name.endswith(ending) for name in names), ending
     assert any(name.startswith("viapoint/training/scenes/") and name.endswith(".npz") for name in names)
 
@@ -68,4 +68,4 @@ def test_nothing_else_is_inside(wheel):
 
 def test_the_console_script_is_declared(wheel):
     (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
-    assert "viapoint = viapoint.training.entry:main" in wheel.read(name).decode()
+    assert "viapoint = viapoint.training.cli.entry:main" in wheel.read(name).decode()

@@ -17,10 +17,10 @@ from PIL import Image
 from study.page import figure_name
 from study.plan import short
 from study.work import ALONE, CHECKED, UNTRAINED, WAYS
-from viapoint.training.files import write_bytes
-from viapoint.training.frozen_scenes import BANDS
-from viapoint.training.plots import AXES
-from viapoint.training.statistics import interquartile_mean
+from viapoint.training.evaluation.statistics import interquartile_mean
+from viapoint.training.io.files import write_bytes
+from viapoint.training.plotting.plots import AXES
+from viapoint.training.scene_sets.scene_set import BANDS
 
 Numbers = Mapping[str, Any]
 COLOURS = {

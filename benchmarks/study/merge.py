@@ -13,7 +13,7 @@ from typing import Any
 from study.gather import conditions, improvement
 from study.plan import ABLATIONS, FREEDOM, METHODS, WHOLE, Study, Variant
 from viapoint.envs.registration import TASKS
-from viapoint.training.baselines import METHODS as BASELINE_METHODS
+from viapoint.training.planners.baselines import METHODS as BASELINE_METHODS
 
 Numbers = dict[str, Any]
 

@@ -9,8 +9,8 @@ from typing import Any
 from study.plan import FREEDOM_LABELS, WHOLE, short
 from study.prose import FAILURES, FREEDOM, INTRODUCTION, KNOWLEDGE, TAGS
 from study.work import ALONE, CHECKED, PLANNED, WAYS
-from viapoint.training import monitor
-from viapoint.training.frozen_scenes import BANDS
+from viapoint.training.runs import callback
+from viapoint.training.scene_sets.scene_set import BANDS
 
 Numbers = Mapping[str, Any]
 Rows = list[list[str]]
@@ -251,7 +251,7 @@ def _answer(entries: Sequence[Numbers], name: str) -> str:
 def _tags() -> str:
     """What a training logs."""
     rows = [["tag", "meaning"], *([f"`{tag}`", words] for tag, words in TAGS.items())]
-    known = {*monitor.OUTCOMES, *monitor.VALIDATED}
+    known = {*callback.OUTCOMES, *callback.VALIDATED}
     assert known <= set(TAGS), known - set(TAGS)
     head = "## What TensorBoard shows\n\n`tensorboard --logdir runs/study` (or any run folder), besides `train/*`:"
     return f"{head}\n\n{_table(rows).replace('---:', '---')}"

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from viapoint.envs.registration import STEP_TASKS, TASKS
-from viapoint.training.baselines import METHODS as BASELINE_METHODS
-from viapoint.training.config import TrainConfig
-from viapoint.training.config_checks import DEFAULT_ENV
-from viapoint.training.frozen_scenes import SETS, shipped_path
-from viapoint.training.presets import PRESETS, STEP_PRESETS, Algorithm
-from viapoint.training.viaq import ViaQ
-from viapoint.training.viaq_policy import ViaQPolicy
+from viapoint.training.algorithms.policy import ViaQPolicy
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.config.checks import DEFAULT_ENV
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.presets import PRESETS, STEP_PRESETS, Algorithm
+from viapoint.training.planners.baselines import METHODS as BASELINE_METHODS
+from viapoint.training.scene_sets.scene_set import SETS, shipped_path
 
 Table = Literal["results", "ablations", "freedom"]
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
@@ -26,7 +26,7 @@ BASELINES = (
     "stored", "straight", "constant", "random", "random16", "random80", "search16", "search64", "search512",
     "search4096", "ompl",
 )  # fmt: skip
-"""Of the results: names of viapoint.training.baselines, and the planner's solutions that are stored with the scenes."""
+"""Baselines of the results by their names; `planner` are the solutions that are stored with the scenes."""
 VALIDATIONS, CHECKPOINTS = 8, 2
 """Of each training, however long it is."""
 

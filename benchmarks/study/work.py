@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from study.plan import FREEDOM, Cell, Study, Variant, sets_of, short
-from viapoint.training.baselines import SEARCHES, Method, agent_method, make_method
-from viapoint.training.config import TrainConfig
-from viapoint.training.config_json import as_json
-from viapoint.training.demo import Certified
-from viapoint.training.evaluate import MethodResult, evaluate
-from viapoint.training.failures import sort_out
-from viapoint.training.files import read_json, write_json
-from viapoint.training.frozen_scenes import FrozenScenes, load
-from viapoint.training.model_files import untrained
-from viapoint.training.runs import Run, load_model
-from viapoint.training.train import one_thread, resolved, train
+from viapoint.training.cli.demo import StoredSolutions
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.evaluation.evaluator import MethodResult, evaluate
+from viapoint.training.io.config_json import as_json
+from viapoint.training.io.files import read_json, write_json
+from viapoint.training.planners.baselines import SEARCHES, Method, agent_method, make_method
+from viapoint.training.plotting.failure_report import sort_out
+from viapoint.training.runs.model_io import untrained
+from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.trainer import one_thread, resolved, train
+from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
 KEPT = ("is_success", "collision", "jerk_ratio", "duration")
 """Outcomes that are kept scene by scene."""
@@ -187,7 +187,7 @@ def baseline(env: str, name: str, study: Study) -> str:
         record = kept(path, {"scenes": frozen.sha256})
         if record is None:
             if name == "stored":
-                method = Certified(frozen)
+                method = StoredSolutions(frozen)
             elif method is None:
                 method = make_method(name, env)
             record = _measure_baseline(method, frozen, env, path, {})

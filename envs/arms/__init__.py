@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.base import Arm
 from viapoint.envs.arms.panda import PANDA
 from viapoint.envs.arms.planar import ADULT
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from viapoint.envs._arrays import Array, clamp, cosine_and_sine, namespace_of
-from viapoint.envs.arms.mjcf import serial_arm
+from viapoint.envs.arms.serial_arm import serial_arm
+from viapoint.envs.common.arrays import Array, clamp, cosine_and_sine, namespace_of
 
 SHOULDER, UPPER, FORE, ELBOW, WRIST = 0.333, 0.316, 0.384, 0.0825, 0.088
 """Height of the shoulder, length of upper arm and forearm, and how far the axes of elbow and wrist stand off, [m]."""
@@ -43,7 +43,7 @@ TURN = 1.4
 
 @dataclass(frozen=True)
 class PandaPosture:
-    """See :class:`~viapoint.envs.arms.serial.Posture`."""
+    """See :class:`~viapoint.envs.arms.serial_arm.Posture`."""
 
     def __call__(self, hand: Array) -> Array:
         """Joint angles, shape (..., 7), [rad], for hand positions of shape (..., 3), [m]."""

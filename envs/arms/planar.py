@@ -10,13 +10,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs._arrays import Array, clamp, last, namespace_of
-from viapoint.envs.arms.obstacles import add_obstacles
+from viapoint.envs.arms.mjcf import add_obstacles
+from viapoint.envs.common.arrays import Array, clamp, last, namespace_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarArm:
-    """An arm of two links, described by numbers; see :class:`~viapoint.envs.arms.arm.Arm` for the functions.
+    """An arm of two links, described by numbers; see :class:`~viapoint.envs.arms.base.Arm` for the functions.
 
     The elbow bends one way only, so a hand position has one posture.
     Every number is read from the MJCF file, where its source stands.
@@ -95,7 +95,7 @@ class PlanarArm:
         return float(near), float(far)
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
-        """See :meth:`viapoint.envs.arms.arm.Arm.compile`."""
+        """See :meth:`viapoint.envs.arms.base.Arm.compile`."""
         spec = _read(self.model_file)
         if whole_arm:
             _lower_into_plane(spec)
@@ -106,8 +106,8 @@ class PlanarArm:
         add_obstacles(spec, n_obstacles)
         return spec.compile()
 
-    def hand(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.arm.Arm.hand`."""
+    def hand_position(self, joints: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
         xp = namespace_of(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
@@ -116,16 +116,16 @@ class PlanarArm:
         )
 
     def links(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.arm.Arm.links`."""
+        """See :meth:`viapoint.envs.arms.base.Arm.links`."""
         xp = namespace_of(joints)
-        upper, hand = joints[..., 0], self.hand(joints)
+        upper, hand = joints[..., 0], self.hand_position(joints)
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
         zero = xp.zeros_like(upper)
         ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
         return last(xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
-        """Both ends of each link in the :meth:`posture` at `hand`, shape (..., 2), [m]: quick, as without angles.
+        """Return both ends of each link for the hand at `hand`, shape (..., 2), [m], without computing angles.
 
         But for rounding they are those of :meth:`links`; out of reach, the forearm is drawn out to the hand.
         """
@@ -138,12 +138,12 @@ class PlanarArm:
         elbow = last(xp.stack((c1 * upper, s1 * upper)))
         return (xp.zeros_like(elbow), elbow), (elbow, hand)
 
-    def posture(self, hand: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.arm.Arm.posture`; out of reach, the elbow is as straight or bent as it goes."""
+    def inverse_kinematics(self, hand: Array) -> Array:
+        """Return joint angles, see :class:`Arm`; out of reach, the elbow is as straight or bent as it goes."""
         return self._postures(hand)[0]
 
     def reach_margin(self, hand: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.arm.Arm.reach_margin`.
+        """See :meth:`viapoint.envs.arms.base.Arm.reach_margin`.
 
         The least of the distances to the inner and outer circle of the reach and, as arcs, to the shoulder's limits.
         """
@@ -156,8 +156,8 @@ class PlanarArm:
         arc = xp.minimum(shoulder - low, high - shoulder) * distance
         return xp.minimum(xp.minimum(distance - near, far - distance), arc)
 
-    def pace(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.arm.Arm.pace`: 1, as people's joints have no limits of speed.
+    def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """See :meth:`viapoint.envs.arms.base.Arm.required_time_scale`: 1, as people's joints have no limits of speed.
 
         Those of torque act in the physics; random movements reach them twice in ten thousand.
         """
@@ -165,7 +165,7 @@ class PlanarArm:
         return xp.ones_like(position[..., 0, 0])
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Computed torque: see :meth:`viapoint.envs.arms.arm.Arm.controls`.
+        """Computed torque: see :meth:`viapoint.envs.arms.base.Arm.controls`.
 
         The actuator's torque is control - stiffness x angle - damping x velocity, limited to `torque_limit`. So the
         control carries the torque of the inverse dynamics plus stiffness and damping times the references, [N m].

@@ -14,8 +14,8 @@ from PIL import Image
 from study import gather, page, work
 from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, placed
 
-from viapoint.training.files import read_json
-from viapoint.training.runs import Run
+from viapoint.training.io.files import read_json
+from viapoint.training.runs.run_dir import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
 DOCS = Path(__file__).parents[2] / "docs"
@@ -113,7 +113,7 @@ def test_what_is_interrupted_is_not_kept(monkeypatch, tmp_path):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work.Certified, "decide", interrupted)
+    monkeypatch.setattr(work.StoredSolutions, "decide", interrupted)
     with pytest.raises(KeyboardInterrupt):
         work.baseline(ENV, "stored", study_of(tmp_path))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -9,7 +9,7 @@ from study import gather
 from study.merge import merged
 from study.plan import METHODS, WHOLE
 
-from viapoint.training.files import read_json
+from viapoint.training.io.files import read_json
 
 ENV = "viapoint/PlanarObstacles-v0"
 DOCS = Path(__file__).parents[2] / "docs"

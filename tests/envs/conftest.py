@@ -6,8 +6,8 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-from viapoint.envs import rendering
-from viapoint.envs.rendering import GLUnavailableError
+from viapoint.envs.rendering import renderer
+from viapoint.envs.rendering.renderer import GLUnavailableError
 
 sys.path.append(str(Path(__file__).parent))
 
@@ -17,7 +17,7 @@ OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 @pytest.fixture
 def quick_pictures(monkeypatch):
     """Pictures without supersampling: what is tested here does not need to look good."""
-    monkeypatch.setattr(rendering, "STILL_SUPERSAMPLING", 1)
+    monkeypatch.setattr(renderer, "STILL_SUPERSAMPLING", 1)
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from viapoint.envs.arms import Arm
+from viapoint.envs.arm_import.loader import load_arm
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -12,7 +12,7 @@ HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
 
 
 def ur5e(**changes):
-    return Arm.from_mjcf(**{"path": UR5E, "hand_site": "hand", "joints": JOINTS, "home": HOME, **changes})
+    return load_arm(**{"path": UR5E, "hand_site": "hand", "joints": JOINTS, "home": HOME, **changes})
 
 
 def written(path, *changes):

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.decision_ends import Event
+from viapoint.envs.sim.replan_triggers import Event
 
 JUMP, MOVING, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarTargetJump", "PlanarMovingObstacles", "PandaMovingObstacles")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.envs.action import ActionLayout, Plan, frame
+from viapoint.envs.actions.via_points import ActionLayout, Plan, frame
 from viapoint.primitives import point_to_point
 
 LAYOUTS = [

@@ -6,11 +6,11 @@ import pytest
 from gymnasium.wrappers.vector import FlattenObservation, NormalizeObservation
 
 import viapoint.envs
-from viapoint.envs.action import Plan
-from viapoint.envs.arguments import reset_options
-from viapoint.envs.recording import RecordMovements
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.validation import reset_options
+from viapoint.envs.mdp.rewards import StepRewardWeights
+from viapoint.envs.record_video import RecordMovements
 from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.envs.step_episodes import StepRewardWeights
 
 PLANAR = (
     "viapoint/PlanarObstacles-v0",
@@ -132,8 +132,10 @@ def test_a_plan_begins_where_the_hand_is(change, reason):
     scenes = env.scenes
     waypoints, durations = np.stack((scenes.start, scenes.goal), axis=1), np.full((2, 1), 0.8)
     with pytest.raises(ValueError, match=reason):
-        env.perform(Plan(*change(waypoints, durations)))
-    assert (env.perform(Plan(waypoints.tolist(), durations.tolist())).info["jerk_ratio"] < 1.0 + 1e-9).all()
+        env.execute_plan(Plan(*change(waypoints, durations)))
+    assert (
+        env.execute_plan(Plan(waypoints.tolist(), durations.tolist())).info["jerk_ratio"] < 1.0 + 1e-9
+    ).all()
     env.close()
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ADULT, ARMS
-from viapoint.envs.scenes import TARGETS
-from viapoint.envs.simulator import Simulator
+from viapoint.envs.scenes.scene import TARGETS
+from viapoint.envs.sim.simulator import Simulator
 from viapoint.primitives import point_to_point
 
 
@@ -33,15 +33,15 @@ def places(arm, number=500, seed=0):
 def test_posture_puts_the_hand_there_within_the_joints_ranges(arm):
     hand = places(arm)
     assert len(hand) == 500
-    joints = arm.posture(hand)
-    np.testing.assert_allclose(arm.hand(joints), hand, atol=2e-5)
+    joints = arm.inverse_kinematics(hand)
+    np.testing.assert_allclose(arm.hand_position(joints), hand, atol=2e-5)
     low, high = np.array(arm.joint_range).T
     assert ((joints >= low) & (joints <= high)).all()
 
 
 def test_posture_inverts_hand_where_there_is_one_only():
     joints = postures(ADULT)
-    np.testing.assert_allclose(ADULT.posture(ADULT.hand(joints)), joints, atol=1e-9)
+    np.testing.assert_allclose(ADULT.inverse_kinematics(ADULT.hand_position(joints)), joints, atol=1e-9)
 
 
 def test_kinematics_agree_with_mujoco(arm):
@@ -50,11 +50,13 @@ def test_kinematics_agree_with_mujoco(arm):
     for joints in postures(arm, 20):
         data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.site("hand").xpos[: arm.dimension], arm.hand(joints), atol=1e-12)
-        np.testing.assert_allclose(arm.links(joints)[-1, 1], arm.hand(joints), atol=1e-12)
+        np.testing.assert_allclose(
+            data.site("hand").xpos[: arm.dimension], arm.hand_position(joints), atol=1e-12
+        )
+        np.testing.assert_allclose(arm.links(joints)[-1, 1], arm.hand_position(joints), atol=1e-12)
         traced = np.array([data.site(name).xpos for name in arm.traced])
         if len(traced):
-            np.testing.assert_allclose(traced[0], arm.hand(joints), atol=1e-12)
+            np.testing.assert_allclose(traced[0], arm.hand_position(joints), atol=1e-12)
             np.testing.assert_allclose(traced[1:], arm.links(joints).reshape(-1, 3), atol=1e-12)
 
 
@@ -63,7 +65,7 @@ def test_links_are_known_without_angles(library):
     """Beyond the reach, too, where the forearm is drawn out to the hand instead of pointing at it."""
     hand = np.random.default_rng(0).uniform(-0.9, 0.9, (50, 8, 2))
     (shoulder, elbow), (joint, end) = (np.stack(link) for link in ADULT.links_at(library(hand)))
-    exact, distance = ADULT.links(ADULT.posture(hand)), np.linalg.norm(hand, axis=-1)
+    exact, distance = ADULT.links(ADULT.inverse_kinematics(hand)), np.linalg.norm(hand, axis=-1)
     np.testing.assert_array_equal(shoulder, 0.0)
     np.testing.assert_array_equal(elbow, joint)
     np.testing.assert_allclose(elbow, exact[..., 0, 1, :], atol=1e-14)
@@ -78,7 +80,9 @@ def test_links_are_known_with_the_hand_in_the_shoulder(library):
     """Where no posture puts it and any direction would do; a straight movement may pass there."""
     hand = np.zeros((2, 2))
     for link, exact in zip(
-        ADULT.links_at(library(hand)), ADULT.links(ADULT.posture(hand))[:, :, 0].swapaxes(0, 1), strict=False
+        ADULT.links_at(library(hand)),
+        ADULT.links(ADULT.inverse_kinematics(hand))[:, :, 0].swapaxes(0, 1),
+        strict=False,
     ):
         np.testing.assert_allclose(np.asarray(link[0]), exact, atol=1e-14)
 
@@ -101,15 +105,15 @@ def test_links_hang_together_and_have_their_lengths():
 def test_reach_margin_is_positive_exactly_where_a_posture_gets_there():
     """Inside the ranges of the joints it is positive, just beyond each of their limits negative."""
     low, high = np.array(ADULT.joint_range).T
-    assert (ADULT.reach_margin(ADULT.hand(postures(ADULT))) > 0.0).all()
+    assert (ADULT.reach_margin(ADULT.hand_position(postures(ADULT))) > 0.0).all()
     middle = 0.5 * (low + high)
     for joint in range(2):
         for limit, step in ((low, -0.02), (high, 0.02)):
             beyond = middle.copy()
             beyond[joint] = limit[joint] + step
-            assert ADULT.reach_margin(ADULT.hand(beyond)) < 0.0 or joint == 1
-    far = ADULT.hand(np.array([middle[0], low[1]]))
-    near = ADULT.hand(np.array([middle[0], high[1]]))
+            assert ADULT.reach_margin(ADULT.hand_position(beyond)) < 0.0 or joint == 1
+    far = ADULT.hand_position(np.array([middle[0], low[1]]))
+    near = ADULT.hand_position(np.array([middle[0], high[1]]))
     assert ADULT.reach_margin(1.001 * far) < 0.0 < ADULT.reach_margin(0.999 * far)
     assert ADULT.reach_margin(0.999 * near) < 0.0 < ADULT.reach_margin(1.001 * near)
 
@@ -120,14 +124,16 @@ def test_controls_are_the_inverse_dynamics_of_mujoco():
     data = mujoco.MjData(model)
     rng = np.random.default_rng(1)
     for _ in range(20):
-        goal, start = (ADULT.hand(postures(ADULT, 1, int(rng.integers(1 << 30)))[0]) for _ in range(2))
+        goal, start = (
+            ADULT.hand_position(postures(ADULT, 1, int(rng.integers(1 << 30)))[0]) for _ in range(2)
+        )
         time = np.array([0.37])
         path = point_to_point(start, goal, np.asarray(0.9))
         position, velocity, acceleration = (path(time, nu) for nu in range(3))
         if ADULT.reach_margin(position) < 0.02:
             continue
         step = 1e-4
-        around = ADULT.posture(path(time + step * np.array([-1.0, 0.0, 1.0])))
+        around = ADULT.inverse_kinematics(path(time + step * np.array([-1.0, 0.0, 1.0])))
         data.qpos[:], data.qvel[:] = around[1], (around[2] - around[0]) / (2 * step)
         data.qacc[:] = (around[2] - 2 * around[1] + around[0]) / step**2
         mujoco.mj_inverse(model, data)
@@ -147,11 +153,11 @@ def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
         )
         times = simulator.timestep * np.arange(451)
         position, velocity, acceleration = (path(times, nu) for nu in range(3))
-        simulator.place(np.array([0]), ADULT.posture(start)[None], *none)
+        simulator.place(np.array([0]), ADULT.inverse_kinematics(start)[None], *none)
         record = simulator.rollout(
             np.array([0]), ADULT.controls(position[:-1], velocity[:-1], acceleration[:-1])[None]
         )
-        error = np.linalg.norm(ADULT.hand(record.joints[0]) - position[1:], axis=-1)
+        error = np.linalg.norm(ADULT.hand_position(record.joints[0]) - position[1:], axis=-1)
         assert np.sqrt((error**2).mean()) < 2e-3
         assert error[-1] < 1e-4
 
@@ -159,11 +165,11 @@ def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
 def test_torch_and_numpy_give_the_same(arm):
     hand = places(arm, 50)
     for function in (
-        arm.posture,
+        arm.inverse_kinematics,
         arm.reach_margin,
-        lambda h: arm.links(arm.posture(h)),
+        lambda h: arm.links(arm.inverse_kinematics(h)),
         lambda h: arm.controls(h, h, h),
-        lambda h: arm.pace(h, h, h),
+        lambda h: arm.required_time_scale(h, h, h),
     ):
         np.testing.assert_allclose(
             function(torch.as_tensor(hand)).numpy(), function(hand), rtol=1e-9, atol=1e-9

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, events, make, play
 
-from viapoint.envs.change_sampling import ChangeSampler
 from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.scenes.motion import ChangeSampler
 
 
 def test_what_lies_in_the_future_is_hidden():

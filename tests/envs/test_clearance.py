@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ADULT
-from viapoint.envs.clearance import (
-    FAR,
+from viapoint.envs.geometry.distance import (
+    MAX_CLEARANCE,
     arm_clearance,
     clearance_profile,
     hand_clearance,
     links_profile,
     segment_distance_squared,
 )
-from viapoint.envs.simulator import Simulator
+from viapoint.envs.sim.simulator import Simulator
 
 
 def rows(dimension, shape, seed=0):
@@ -58,7 +58,7 @@ def test_contact_exactly_where_clearance_is_negative(whole_arm):
     simulator = Simulator(ADULT, n_obstacles=3, whole_arm=whole_arm, num_envs=number, threads=2)
     simulator.place(np.arange(number), joints, obstacles, present)
     contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 2))).contact[:, 0]
-    clearance = hand_clearance(ADULT.hand(joints)[:, None], ADULT.hand_radius, obstacles, present)
+    clearance = hand_clearance(ADULT.hand_position(joints)[:, None], ADULT.hand_radius, obstacles, present)
     if whole_arm:
         links = ADULT.links(joints)[:, None]
         clearance = np.minimum(clearance, arm_clearance(links, ADULT.link_radii, obstacles, present))
@@ -70,7 +70,7 @@ def test_the_profile_has_the_clearance_as_its_least_value():
     rng = np.random.default_rng(3)
     joints = np.cumsum(rng.uniform(-0.05, 0.05, (10, 40, 2)), axis=1) + 1.0
     obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
-    hand, links = ADULT.hand(joints), ADULT.links(joints)
+    hand, links = ADULT.hand_position(joints), ADULT.links(joints)
     profile = clearance_profile(hand, ADULT.hand_radius, obstacles, present, links, ADULT.link_radii)
     least = np.minimum(
         hand_clearance(hand, ADULT.hand_radius, obstacles, present),
@@ -84,7 +84,7 @@ def test_a_hand_no_thicker_than_the_forearm_is_inside_its_end():
     low, high = np.array(ADULT.joint_range).T
     joints = rng.uniform(low, high, (10, 40, 2))
     obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
-    hand, links, radii = ADULT.hand(joints), ADULT.links(joints), ADULT.link_radii
+    hand, links, radii = ADULT.hand_position(joints), ADULT.links(joints), ADULT.link_radii
     pairs = [(links[..., i, 0, :], links[..., i, 1, :]) for i in (0, 1)]
     alone = links_profile(pairs, radii, obstacles, present)
     for radius in (ADULT.hand_radius, radii[-1]):
@@ -98,7 +98,7 @@ def test_absent_obstacles_are_far_and_order_is_irrelevant():
     rng = np.random.default_rng(4)
     points, obstacles = rng.uniform(-0.5, 0.5, (5, 30, 2)), rows(2, (5, 4))
     nothing = hand_clearance(points, 0.015, obstacles, np.zeros((5, 4), dtype=bool))
-    np.testing.assert_array_equal(nothing, FAR)
+    np.testing.assert_array_equal(nothing, MAX_CLEARANCE)
     there = np.ones((5, 4), dtype=bool)
     forwards = hand_clearance(points, 0.015, obstacles, there)
     np.testing.assert_array_equal(hand_clearance(points, 0.015, obstacles[:, ::-1], there), forwards[:, ::-1])

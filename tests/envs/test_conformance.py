@@ -15,8 +15,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs import TASKS
+from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
-from viapoint.envs.reward import RewardTerms
 
 IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
 INFO = {

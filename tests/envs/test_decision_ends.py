@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from revised import DT, GOAL, MOVING, OTHER, events, make, play
 
-from viapoint.envs.decision_ends import FORESIGHT, LOOK, SAMPLED, Event
-from viapoint.envs.execution import SETTLING
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.replan_triggers import FORESIGHT, LOOK, SAMPLED, Event
 
 
 def test_decisions_end_when_their_horizon_has_passed():

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import ADULT
-from viapoint.envs.clearance import segment_distance_squared
-from viapoint.envs.scene_families import FAMILIES, ROWS, family_sampler
-from viapoint.envs.scenes import check_scenes
-from viapoint.envs.space_distribution import FAMILIES as SPACE_FAMILIES
+from viapoint.envs.geometry.distance import segment_distance_squared
+from viapoint.envs.mdp.task import family_sampler
+from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
+from viapoint.envs.scenes.planar_hard import FAMILIES, ROWS
+from viapoint.envs.scenes.scene import check_scenes
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"

@@ -9,9 +9,9 @@ import pytest
 from foreign_arms import HOME, JOINTS, UR5E, ur5e, written
 
 import viapoint.envs
-from viapoint.envs.arms import mapped
-from viapoint.envs.arms.mapped import _bad
-from viapoint.envs.arms.models import principal
+from viapoint.envs.arm_import import reachability
+from viapoint.envs.arm_import.reachability import _bad
+from viapoint.envs.arms.mjcf import principal
 
 assert viapoint.envs, "importing it registers the environments"
 
@@ -40,7 +40,7 @@ def test_joints_that_are_left_out_stay_where_the_keyframe_has_them(tmp_path, lif
     end = "</body></body>" + ("</frame>" if frame else "") + keyframe
     path = written(tmp_path / "lift.xml", (SHOULDER, frame + carriage), ("</body>\n  </worldbody>", end))
     arm = ur5e(path=path, home=HOME, origin=(0.0, 0.0, 0.0))
-    np.testing.assert_allclose(arm.hand(np.array(HOME)), hand_of(path, qpos), atol=1e-9)
+    np.testing.assert_allclose(arm.hand_position(np.array(HOME)), hand_of(path, qpos), atol=1e-9)
 
 
 def test_where_they_cannot_they_are_named(tmp_path):
@@ -180,20 +180,22 @@ def test_postures_are_good_everywhere_in_the_reach_and_follow_the_hand(changes):
     low, high = np.array(arm.place.box)
     rng = np.random.default_rng(0)
     places = rng.uniform(low, high, (5000, 3))
-    joints = arm.posture(places)
-    np.testing.assert_allclose(arm.hand(joints), places, atol=1e-6)
+    joints = arm.inverse_kinematics(places)
+    np.testing.assert_allclose(arm.hand_position(joints), places, atol=1e-6)
     least, most = np.array(arm.joint_range).T
     assert (np.minimum(joints - least, most - joints) > 0.02).all()
     step = 1e-4 * rng.normal(size=(5000, 3))
     near = np.clip(places + step, low, high)
-    turned = np.abs(arm.posture(near) - joints).max(axis=-1)
+    turned = np.abs(arm.inverse_kinematics(near) - joints).max(axis=-1)
     assert (turned <= 30.0 * np.linalg.norm(near - places, axis=-1) + 1e-12).all()
 
 
 def test_maps_that_turn_the_hand_or_crowd_the_links_are_seen(monkeypatch):
     seen = []
     monkeypatch.setattr(
-        mapped, "_bad", lambda place, reachable: seen.append((place, reachable)) or _bad(place, reachable)
+        reachability,
+        "_bad",
+        lambda place, reachable: seen.append((place, reachable)) or _bad(place, reachable),
     )
     arm = ur5e()
     place, reachable = seen[-1]

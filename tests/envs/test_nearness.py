@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from viapoint.envs import space_numbers, space_sampling
 from viapoint.envs.arms import PANDA
-from viapoint.envs.clearance import point_distance_squared, segment_distance_squared
-from viapoint.envs.nearness import ball_bounds, raised
-from viapoint.envs.space_bodies import Swept
-from viapoint.envs.space_distribution import SpaceDistribution
-from viapoint.envs.space_sampling import SpaceSampler
+from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
+from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
+from viapoint.envs.scenes import spatial, spatial_draws
+from viapoint.envs.scenes.config import SpaceDistribution
+from viapoint.envs.scenes.spatial import SpaceSampler
+from viapoint.envs.scenes.swept_volume import Swept
 
 N, TIMES, ROWS = 40, 16, 12
 
@@ -60,7 +60,7 @@ def test_balls_are_bounded_from_below_and_closely(generator):
     radii = generator.uniform(0.0, 0.2, 50).astype(np.float32)
     distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows)) - radii
     clearance = np.where(rows[..., -1:] > 0.0, distance - rows[..., -1:], np.inf)
-    bounds = ball_bounds(raised(centres), radii, rows)
+    bounds = ball_bounds(lift_quadratic(centres), radii, rows)
     assert (bounds <= clearance + 1e-6).all()
     assert (bounds >= clearance - 1e-4)[distance > 0.1].all()
 
@@ -69,7 +69,7 @@ def test_balls_far_from_the_origin_are_bounded_from_below(generator):
     rows, centres = obstacles(generator), generator.uniform(49.0, 51.0, (N, 3, 50)).astype(np.float32)
     rows[..., :3] += 50.0
     distance = np.sqrt(point_distance_squared(np.moveaxis(centres, 1, -1).astype(float), rows))
-    bounds = ball_bounds(raised(centres), np.zeros(50, np.float32), rows)
+    bounds = ball_bounds(lift_quadratic(centres), np.zeros(50, np.float32), rows)
     assert (bounds <= distance - rows[..., -1:] + 1e-6)[rows[..., -1] > 0.0].all()
 
 
@@ -94,7 +94,7 @@ def test_rows_that_belong_together_have_one_clearance(generator, bodies):
 def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
     sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
     for together in (1, 30, 10_000):
-        monkeypatch.setattr(space_sampling, "TOGETHER", together)
+        monkeypatch.setattr(spatial, "TOGETHER", together)
         found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
     for other in found[1:]:
         assert all((mine == theirs).all() for mine, theirs in zip(found[0], other, strict=True))
@@ -104,7 +104,7 @@ def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkey
 def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(monkeypatch, shared):
     sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
     for ahead in (0, 30, 1_000):
-        monkeypatch.setattr(space_numbers, "AHEAD", ahead)
+        monkeypatch.setattr(spatial_draws, "AHEAD", ahead)
         generators = [np.random.default_rng(0 if shared else seed) for seed in range(8)]
         generators = generators[:1] * 8 if shared else generators
         for _ in range(2):

@@ -8,11 +8,11 @@ import pytest
 from revised import DT, GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, make, play
 
 from viapoint import primitives
-from viapoint.envs.action import Plan
-from viapoint.envs.decision_ends import Event
-from viapoint.envs.online_episodes import jerk_cost_between
-from viapoint.envs.online_execution import SIMILAR, SLACK, groups_of
+from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.sim.replan_triggers import Event
+from viapoint.envs.sim.replanning_episodes import jerk_cost_between
+from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK, groups_of
 
 
 @pytest.mark.parametrize("env_id", ONLINE_TASKS)
@@ -193,7 +193,7 @@ def test_going_on_from_a_stored_state_is_the_same(env_id):
 
 def test_pictures_show_the_episode_so_far():
     pytest.importorskip("mujoco")
-    from viapoint.envs.rendering import GLUnavailableError
+    from viapoint.envs.rendering.renderer import GLUnavailableError
 
     env, _ = make(jumps=[[0.2, *OTHER]], render_mode="rgb_array_list", width=64, height=64)
     try:
@@ -212,14 +212,14 @@ def test_a_plan_in_metres_and_seconds_can_be_performed_on_the_way():
     env.step(np.zeros(3))
     default, batch = env.batch.default, env.batch
     waypoints = np.stack((default.state.position, default.vias[:, 0] + 0.02, default.goal), axis=1)
-    batch.perform(Plan(waypoints, np.array([[0.3, 0.4]])))
+    batch.execute_plan(Plan(waypoints, np.array([[0.3, 0.4]])))
     (_, before), (time, after) = env.last_plans
     np.testing.assert_array_equal(after.waypoints, waypoints)
     np.testing.assert_allclose(before.states(np.array([time])).acceleration, after.acceleration, atol=1e-9)
     waypoints[:, 0] = batch.default.state.position
     with pytest.raises(ValueError, match=r"waypoints of shape \(1, 3, 2\)"):
-        batch.perform(Plan(waypoints[:, ::2], np.array([[0.7]])))
+        batch.execute_plan(Plan(waypoints[:, ::2], np.array([[0.7]])))
     with pytest.raises(ValueError, match=r"durations of shape \(1, 2\)"):
-        batch.perform(Plan(waypoints, np.array([0.3, 0.4])))
+        batch.execute_plan(Plan(waypoints, np.array([0.3, 0.4])))
     with pytest.raises(ValueError, match="must begin where the hand is"):
-        batch.perform(Plan(waypoints + 0.1, np.array([[0.3, 0.4]])))
+        batch.execute_plan(Plan(waypoints + 0.1, np.array([[0.3, 0.4]])))

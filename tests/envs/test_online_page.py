@@ -8,15 +8,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.change_sampling import ChangeDistribution
-from viapoint.envs.courses import FASTEST, MOST_JUMPS
-from viapoint.envs.decision_ends import FORESIGHT, LOOK, SAMPLED, Event
-from viapoint.envs.execution import SETTLING
-from viapoint.envs.online_execution import SIMILAR, SLACK
-from viapoint.envs.online_reward import OnlineRewardWeights
-from viapoint.envs.reach_online import OnlineReachVectorEnv
+from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
+from viapoint.envs.mdp.rewards import OnlineRewardWeights
 from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.envs.scenes import SHORTEST
+from viapoint.envs.replanning_env import OnlineReachVectorEnv
+from viapoint.envs.scenes.dynamic_scene import FASTEST, MOST_JUMPS
+from viapoint.envs.scenes.motion import ChangeDistribution
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.replan_triggers import FORESIGHT, LOOK, SAMPLED, Event
+from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-online.md").read_text(encoding="utf-8")
 WORDS = " ".join(PAGE.split())
@@ -59,7 +59,7 @@ def test_action_space(env):
     panda = gym.make("viapoint/PandaMovingObstacles-v0").unwrapped
     least = f"{env.reviser.least_remaining:g} s ({panda.reviser.least_remaining:g} s"
     assert WORDS.count(least) == 2
-    assert f"within {SHORTEST} m of it" in WORDS
+    assert f"within {MIN_GOAL_DISTANCE} m of it" in WORDS
     assert f"centre duration ({layout.centre_duration:.4g} s)" in WORDS
     assert f"at most {SIMILAR} times the steps of its shortest, and {SLACK} more" in WORDS
 

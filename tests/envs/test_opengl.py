@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from drawn import OBSTACLES, STRAIGHT
 
-from viapoint.envs import _gl
-from viapoint.envs.rendering import GLUnavailableError
+from viapoint.envs.rendering import gl
+from viapoint.envs.rendering.renderer import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("quick_pictures")
 @pytest.mark.usefixtures("opengl")
 def test_a_context_is_opened_with_the_first_picture_and_given_back(monkeypatch):
     opened, freed = [], []
-    real = _gl._open
+    real = gl._open
 
     class Context:
         def __init__(self, context):
@@ -33,7 +33,7 @@ def test_a_context_is_opened_with_the_first_picture_and_given_back(monkeypatch):
         opened.append(context)
         return Context(context), mjr
 
-    monkeypatch.setattr(_gl, "_open", counting)
+    monkeypatch.setattr(gl, "_open", counting)
     for number in range(1, 7):
         env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
         env.reset(seed=0)
@@ -71,7 +71,7 @@ def failing(*names):
 
 def test_a_missing_library_is_named_with_the_package_to_install(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(_gl.importlib, "import_module", failing("mujoco.egl", "mujoco.glfw", "mujoco.cgl"))
+    monkeypatch.setattr(gl.importlib, "import_module", failing("mujoco.egl", "mujoco.glfw", "mujoco.cgl"))
     env = gym.make(OBSTACLES, render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(GLUnavailableError, match=r"library not found.*apt-get install libegl1 libgl1"):
@@ -108,8 +108,8 @@ def test_a_window_without_a_display_names_the_other_modes(monkeypatch):
 )
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the choice")
 def test_egl_is_chosen_without_a_display_and_a_wish_is_respected(monkeypatch, wish, display, platforms):
-    monkeypatch.setattr(_gl, "_has_display", lambda: display)
-    assert _gl._platforms(wish) == platforms
+    monkeypatch.setattr(gl, "_has_display", lambda: display)
+    assert gl._platforms(wish) == platforms
 
 
 def test_nothing_of_opengl_is_loaded_before_the_first_picture():

@@ -14,8 +14,9 @@ from foreign_arms import HOME, JOINTS, UR5E, ur5e
 from gymnasium.envs.registration import EnvSpec
 
 import viapoint.envs
+from viapoint.envs.arm_import.capsule_fit import around_points, surface
+from viapoint.envs.arm_import.loader import load_arm
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
-from viapoint.envs.arms.capsule_fit import around_points, surface
 from viapoint.envs.registration import OWN_ARM_TASKS
 
 assert viapoint.envs, "importing it registers the environments"
@@ -52,7 +53,7 @@ def test_it_is_the_arm_of_the_file(arm):
     for joints in rng.uniform(-3.0, 3.0, (20, 6)):
         data.qpos[:], data.qvel[:], data.qacc[:] = joints, 0.0, rng.uniform(-1, 1, 6)
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(arm.hand(joints), data.site("hand").xpos, atol=1e-5)
+        np.testing.assert_allclose(arm.hand_position(joints), data.site("hand").xpos, atol=1e-5)
         mujoco.mj_fullM(model, data, full)
         gain = rng.uniform(-1.0, 1.0, 6)
         moving, holding = arm.chain.torques(joints, 0.0 * joints, gain)
@@ -62,8 +63,8 @@ def test_it_is_the_arm_of_the_file(arm):
 
 def test_everywhere_in_its_reach_the_hand_gets_there_turned_as_at_home(arm):
     hand = places(arm)
-    joints = arm.posture(hand)
-    np.testing.assert_allclose(arm.hand(joints), hand, atol=1e-6)
+    joints = arm.inverse_kinematics(hand)
+    np.testing.assert_allclose(arm.hand_position(joints), hand, atol=1e-6)
     low, high = np.array(arm.joint_range).T
     assert ((joints > low) & (joints < high)).all()
     model = arm.compile(0, whole_arm=True)
@@ -98,7 +99,7 @@ def test_environments_take_it_and_it_moves_as_planned(arm, env_id):
     env.reset(seed=0)
     inner = pickle.loads(pickle.dumps(env.unwrapped))
     inner.reset(seed=0)
-    _, _, info = inner.decide(np.zeros((24, 4)))
+    _, _, info = inner.execute_actions(np.zeros((24, 4)))
     free = env_id == "viapoint/Reach-v0"
     assert (info["is_success"] if free else info["collision"]).all()
     if free:
@@ -130,9 +131,9 @@ def test_without_one_they_are_the_pandas(env_id, like):
 
 def test_posture_in_torch_is_the_same_and_differentiable(arm):
     hand = torch.as_tensor(places(arm, 40)).requires_grad_()
-    joints = arm.posture(hand)
-    np.testing.assert_allclose(joints.detach().numpy(), arm.posture(places(arm, 40)), atol=1e-9)
-    jacobian = torch.autograd.grad(arm.hand(joints).sum(), hand)[0]
+    joints = arm.inverse_kinematics(hand)
+    np.testing.assert_allclose(joints.detach().numpy(), arm.inverse_kinematics(places(arm, 40)), atol=1e-9)
+    jacobian = torch.autograd.grad(arm.hand_position(joints).sum(), hand)[0]
     np.testing.assert_allclose(jacobian.numpy(), 1.0, atol=1e-4)  # the hand goes where it is sent
 
 
@@ -209,9 +210,9 @@ def test_joints_need_limits_and_torques(tmp_path):
         path = tmp_path / "arm.xml"
         path.write_text(change(text), encoding="utf-8")
         with pytest.raises(ValueError, match=message):
-            Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
+            load_arm(path, hand_site="hand", joints=JOINTS, home=HOME)
     with pytest.raises(ValueError, match="no file"):
-        Arm.from_mjcf(tmp_path / "none.xml", hand_site="hand", joints=JOINTS)
+        load_arm(tmp_path / "none.xml", hand_site="hand", joints=JOINTS)
 
 
 def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
@@ -243,7 +244,7 @@ def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
     path = tmp_path / "arm.xml"
     path.write_text(change(UR5E.read_text(encoding="utf-8")), encoding="utf-8")
     with pytest.raises(ValueError, match=message):
-        Arm.from_mjcf(path, hand_site="hand", joints=JOINTS, home=HOME)
+        load_arm(path, hand_site="hand", joints=JOINTS, home=HOME)
 
 
 def test_joints_may_have_any_names(tmp_path):
@@ -256,7 +257,7 @@ def test_joints_may_have_any_names(tmp_path):
         text = text.replace(f'joint name="{joint}"', f'joint name="{name}"')
     path = tmp_path / "arm.xml"
     path.write_text(text, encoding="utf-8")
-    arm = Arm.from_mjcf(path, hand_site="hand", joints=names, home=HOME, velocity_limit=np.pi)
+    arm = load_arm(path, hand_site="hand", joints=names, home=HOME, velocity_limit=np.pi)
     mine, other = (
         gym.make("viapoint/Obstacles-v0", arm=each).unwrapped for each in (arm, ur5e(velocity_limit=np.pi))
     )
@@ -299,17 +300,17 @@ def test_the_fetch_of_gymnasium_robotics():
     assets = Path(find_spec("gymnasium_robotics").submodule_search_locations[0]) / "envs" / "assets"
     path = assets / "fetch" / "reach.xml"
     with pytest.raises(ValueError, match="'robot0:upperarm_roll_joint' has no limits"):
-        Arm.from_mjcf(path, **{**FETCH, "joint_range": None})
+        load_arm(path, **{**FETCH, "joint_range": None})
     with pytest.raises(ValueError, match="no actuator with a limited force drives robot0:shoulder_pan_joint"):
-        Arm.from_mjcf(path, **{**FETCH, "torque_limit": None})
-    fetch = Arm.from_mjcf(path, **FETCH)
+        load_arm(path, **{**FETCH, "torque_limit": None})
+    fetch = load_arm(path, **FETCH)
     env = gym.make_vec("viapoint/Obstacles-v0", num_envs=16, arm=fetch, threads=1)
     env.reset(seed=0)
-    _, _, info = env.unwrapped.decide(np.zeros((16, 4)))
+    _, _, info = env.unwrapped.execute_actions(np.zeros((16, 4)))
     assert info["collision"].all()
     env = gym.make_vec("viapoint/Reach-v0", num_envs=16, arm=fetch, threads=1)
     env.reset(seed=0)
-    _, _, info = env.unwrapped.decide(np.zeros((16, 4)))
+    _, _, info = env.unwrapped.execute_actions(np.zeros((16, 4)))
     assert info["is_success"].all()
     assert info["tracking_error"].max() < 2e-3
 

@@ -4,11 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.action import ActionLayout
+from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import ADULT
 from viapoint.envs.arms.panda import PANDA
-from viapoint.envs.decision_ends import Event
-from viapoint.envs.pacing import pace_of
+from viapoint.envs.sim.replan_triggers import Event
+from viapoint.envs.sim.time_scaling import pace_of
 
 REACH = "viapoint.envs:viapoint/PandaReach-v0"
 SPACE = {"dimension": 3, "duration_range": (0.6, 1.2)}
@@ -36,7 +36,7 @@ def test_limits_hold_between_the_looks_and_no_movement_is_slower_than_that_takes
     plan = plans(ActionLayout(n_via=n_via, timing=timing, **SPACE), 300, 0.4)
     stretch, within = pace_of(PANDA, plan)
     some = np.flatnonzero(within)
-    needed = PANDA.pace(*everywhere(plan.take(some)))
+    needed = PANDA.required_time_scale(*everywhere(plan.take(some)))
     assert (needed > 1.0).mean() > 0.1
     np.testing.assert_allclose(stretch[some], needed, rtol=5e-3)
 
@@ -45,7 +45,7 @@ def test_a_movement_that_is_too_fast_between_the_looks_alone_is_slowed_down():
     plan = plans(ActionLayout(**SPACE), 150, 0.4)
     plan = plan.take(np.flatnonzero(pace_of(PANDA, plan).within))
     faster = plan._replace(durations=plan.durations / 4.0)
-    needed = PANDA.pace(*everywhere(faster)) / 1.002
+    needed = PANDA.required_time_scale(*everywhere(faster)) / 1.002
     just_above = faster._replace(durations=faster.durations * needed[:, None])
     assert (pace_of(PANDA, just_above).stretch > 1.0).all()
 
@@ -66,7 +66,7 @@ def test_a_short_plan_that_leaves_the_reach_is_seen_and_the_others_are_slowed_do
     env = gym.make_vec(REACH, num_envs=200, duration_range=(0.05, 0.06)).unwrapped
     env.reset(seed=5)
     actions = np.random.default_rng(5).uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-    info = env.decide(actions).info
+    info = env.execute_actions(actions).info
     ran = info["reachable"]
     assert 0.3 < ran.mean() < 1.0
     assert (info["stretch"][ran] > 1.0).all()

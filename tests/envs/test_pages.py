@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from viapoint.envs import TASKS
-from viapoint.envs.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome
-from viapoint.envs.reach import ReachVectorEnv
-from viapoint.envs.reward import RewardWeights
+from viapoint.envs.mdp.rewards import RewardWeights
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome
+from viapoint.envs.single_env import ReachVectorEnv
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.envs.action import ActionLayout
-from viapoint.envs.approach import ends_of, nearest_approach
+from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import PANDA
-from viapoint.envs.arms.serial import RESERVE
-from viapoint.envs.clearance import FAR, arm_clearance
-from viapoint.envs.reach import ReachVectorEnv
-from viapoint.envs.simulator import Simulator
+from viapoint.envs.arms.serial_arm import RESERVE
+from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
+from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
+from viapoint.envs.sim.simulator import Simulator
+from viapoint.envs.single_env import ReachVectorEnv
 
 LAYOUT = ActionLayout(dimension=3, duration_range=(1.0, 2.0))
 
@@ -36,8 +36,10 @@ def looked_at(plan, times=200):
 
 def test_the_file_has_the_published_dimensions():
     """At zero the arm stands upright, its hand pointing down: sums of the Denavit-Hartenberg table."""
-    assert PANDA.hand(np.zeros(7)) == pytest.approx([0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107 - 0.1034])
-    assert PANDA.hand(np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, 0])) == pytest.approx(
+    assert PANDA.hand_position(np.zeros(7)) == pytest.approx(
+        [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107 - 0.1034]
+    )
+    assert PANDA.hand_position(np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, 0])) == pytest.approx(
         [0.0825 + 0.384 + 0.088, 0.0, 0.333 + 0.316 + 0.0825 - 0.107 - 0.1034]
     )
     assert PANDA.torque_limit == (87.0,) * 4 + (12.0,) * 3
@@ -63,7 +65,7 @@ def test_the_hand_points_down_and_keeps_its_heading_and_nothing_touches_itself_o
     model = PANDA.compile(0, whole_arm=True)
     data, rng = mujoco.MjData(model), np.random.default_rng(2)
     places = rng.uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (8000, 3))
-    for joints in PANDA.posture(places[PANDA.reach_margin(places) >= 0.0])[:800]:
+    for joints in PANDA.inverse_kinematics(places[PANDA.reach_margin(places) >= 0.0])[:800]:
         data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
@@ -100,12 +102,16 @@ def test_postures_are_differentiable_and_change_smoothly():
     plan = movements(40)
     position, velocity, _ = looked_at(plan)
     hand = torch.as_tensor(position).requires_grad_()
-    joints = PANDA.posture(hand)
+    joints = PANDA.inverse_kinematics(hand)
     jacobian = torch.stack(
         [torch.autograd.grad(joints[..., k].sum(), hand, retain_graph=True)[0] for k in range(7)]
     )
     rates = (jacobian.numpy() * velocity).sum(axis=-1)
-    along = np.moveaxis((PANDA.posture(position + 1e-6 * velocity) - PANDA.posture(position)) / 1e-6, -1, 0)
+    along = np.moveaxis(
+        (PANDA.inverse_kinematics(position + 1e-6 * velocity) - PANDA.inverse_kinematics(position)) / 1e-6,
+        -1,
+        0,
+    )
     np.testing.assert_allclose(rates, along, atol=1e-3)
 
 
@@ -113,21 +119,21 @@ def test_movements_of_the_centre_duration_are_tracked_and_links_are_where_they_w
     """Hand within 1 mm rms and 2 mm at worst, links within 5 mm."""
     plan = movements()
     position, velocity, acceleration = looked_at(plan)
-    factor = PANDA.pace(position, velocity, acceleration)
+    factor = PANDA.required_time_scale(position, velocity, acceleration)
     steps = np.arange(0.0, 1.6 * LAYOUT.centre_duration * factor.max(), 0.004)
     trajectory = plan._replace(durations=plan.durations * factor[:, None]).trajectory()
     position, velocity, acceleration = trajectory.sample(steps)
     number = len(position)
     simulator = Simulator(PANDA, n_obstacles=0, whole_arm=True, num_envs=number, threads=1)
     none = np.zeros((number, 0, 7)), np.zeros((number, 0), dtype=bool)
-    simulator.place(np.arange(number), PANDA.posture(position[:, 0]), *none)
+    simulator.place(np.arange(number), PANDA.inverse_kinematics(position[:, 0]), *none)
     record = simulator.rollout(
         np.arange(number), PANDA.controls(*(part[:, :-1] for part in (position, velocity, acceleration)))
     )
-    error = np.linalg.norm(PANDA.hand(record.joints) - position[:, 1:], axis=-1)
+    error = np.linalg.norm(PANDA.hand_position(record.joints) - position[:, 1:], axis=-1)
     assert np.sqrt((error**2).mean(axis=-1)).max() < 1e-3
     assert error.max() < 2e-3
-    foreseen = PANDA.links(PANDA.posture(position[:, 1:]))
+    foreseen = PANDA.links(PANDA.inverse_kinematics(position[:, 1:]))
     assert np.linalg.norm(PANDA.links(record.joints) - foreseen, axis=-1).max() < 5e-3
     assert not record.contact.any()
     assert not record.unstable.any()
@@ -137,12 +143,12 @@ def test_a_movement_too_fast_is_slowed_down_just_enough():
     plan = movements(60, seed=5)
     plan = plan._replace(durations=plan.durations * 0.3)
     position, velocity, acceleration = looked_at(plan)
-    factor = PANDA.pace(position, velocity, acceleration)
+    factor = PANDA.required_time_scale(position, velocity, acceleration)
     assert (factor > 1.0).all()
     slower = plan._replace(durations=plan.durations * factor[:, None])
     position, velocity, acceleration = looked_at(slower)
-    np.testing.assert_allclose(PANDA.pace(position, velocity, acceleration), 1.0, atol=1e-4)
-    joints, time = PANDA.posture(position), slower.durations.sum(axis=-1)[:, None, None] / 199
+    np.testing.assert_allclose(PANDA.required_time_scale(position, velocity, acceleration), 1.0, atol=1e-4)
+    joints, time = PANDA.inverse_kinematics(position), slower.durations.sum(axis=-1)[:, None, None] / 199
     rates = np.abs(np.diff(joints, axis=1) / time).max(axis=1) / np.array(PANDA.velocity_limit)
     moving, holding = PANDA.chain.torques(
         joints[:, 1:-1],
@@ -161,7 +167,7 @@ def test_torque_limits_act():
     model = PANDA.compile(0, whole_arm=True)
     data = mujoco.MjData(model)
     position, velocity, acceleration = path.sample(np.arange(60) * 0.004)
-    data.qpos[:] = PANDA.posture(position[0, 0])
+    data.qpos[:] = PANDA.inverse_kinematics(position[0, 0])
     greatest = np.zeros(7)
     for control in PANDA.controls(position, velocity, acceleration)[0]:
         data.ctrl[:] = control
@@ -179,7 +185,7 @@ def test_contact_exactly_where_a_link_reaches_into_an_obstacle():
     obstacles = np.concatenate((centre, axis, rng.uniform(0.01, 0.05, (number, 3, 1))), axis=-1)
     present = rng.random((number, 3)) < 0.6
     simulator = Simulator(PANDA, n_obstacles=3, whole_arm=True, num_envs=number, threads=1)
-    joints = PANDA.posture(places)
+    joints = PANDA.inverse_kinematics(places)
     simulator.place(np.arange(number), joints, obstacles, present)
     contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 10))).contact[:, 0]
     clearance = arm_clearance(PANDA.links(joints)[:, None], PANDA.link_radii, obstacles, present).min(axis=-1)
@@ -203,7 +209,7 @@ def test_the_arm_collides_with_itself_and_with_the_table():
 def test_the_nearest_approach_is_the_least_of_all_times():
     rng, plan = np.random.default_rng(6), movements(30)
     position, *_ = looked_at(plan, 160)
-    links = PANDA.links(PANDA.posture(position))
+    links = PANDA.links(PANDA.inverse_kinematics(position))
     middle = position[:, 80, None] + rng.uniform(-0.3, 0.3, (30, 5, 3))
     axis = rng.uniform(-0.1, 0.1, (30, 5, 3))
     obstacles = np.concatenate((middle, axis, rng.uniform(0.01, 0.05, (30, 5, 1))), axis=-1)
@@ -215,7 +221,7 @@ def test_the_nearest_approach_is_the_least_of_all_times():
     brute = arm_clearance(links[:, :80], PANDA.link_radii, obstacles, present).min(axis=-1)
     np.testing.assert_allclose(half, brute, atol=1e-9)
     nothing = nearest_approach(ends_of(links), PANDA.link_radii, obstacles, np.zeros((30, 5), dtype=bool))
-    np.testing.assert_array_equal(nothing, FAR)
+    np.testing.assert_array_equal(nothing, MAX_CLEARANCE)
 
 
 def test_info_tells_how_much_slower_a_movement_was_made():
@@ -223,11 +229,11 @@ def test_info_tells_how_much_slower_a_movement_was_made():
     env.reset(seed=0)
     slow, fast = np.zeros((16, 4)), np.zeros((16, 4))
     slow[:, 3], fast[:, 3] = 1.0, -1.0
-    _, _, info = env.decide(slow)
+    _, _, info = env.execute_actions(slow)
     np.testing.assert_array_equal(info["stretch"], 1.0)
     assert info["is_success"].all()
     env.reset(seed=0)
-    _, _, info = env.decide(fast)
+    _, _, info = env.execute_actions(fast)
     assert (info["stretch"] > 1.0).all()
     np.testing.assert_allclose(info["duration"], 0.3 * info["stretch"])
     assert info["is_success"].all()

@@ -10,8 +10,8 @@ import pytest
 from viapoint.envs import TASKS
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.panda import SHARE, TABLE
-from viapoint.envs.arms.serial import RESERVE
-from viapoint.envs.space_distribution import FAMILIES, SpaceDistribution
+from viapoint.envs.arms.serial_arm import RESERVE
+from viapoint.envs.scenes.config import FAMILIES, SpaceDistribution
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-panda.md").read_text(encoding="utf-8")
 WORDS = {1: "one", 2: "two", 6: "six", 8: "eight"}

@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.action import Plan
-from viapoint.envs.outcome import GOAL_TOLERANCE
-from viapoint.envs.reward import RewardWeights
-from viapoint.envs.scenes import Scenes
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.mdp.rewards import RewardWeights
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE
 
 START, GOAL = np.array([-0.3, 0.4]), np.array([0.1, 0.4])
 

@@ -8,14 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs.actions.velocity import Motion, Steering
 from viapoint.envs.arms import ADULT, PANDA
-from viapoint.envs.execution import SETTLING
-from viapoint.envs.outcome import Outcome
+from viapoint.envs.mdp.rewards import RewardTerms, RewardWeights, StepRewardWeights, reward_terms
 from viapoint.envs.registration import STEP_TASKS, twin_of
-from viapoint.envs.rendering import GLUnavailableError
-from viapoint.envs.reward import RewardTerms, RewardWeights, reward_terms
-from viapoint.envs.steering import Motion, Steering
-from viapoint.envs.step_episodes import StepRewardWeights
+from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import Outcome
 
 STEP = "viapoint/PlanarObstaclesStep-v0"
 START, GOAL = np.array([-0.3, 0.4]), np.array([0.1, 0.4])
@@ -251,7 +250,7 @@ def test_plans_are_for_the_twin():
     envs = gym.make_vec(STEP, num_envs=2).unwrapped
     envs.reset(seed=0)
     with pytest.raises(TypeError, match="carried out by the twin"):
-        envs.perform(envs.last_plan)
+        envs.execute_plan(envs.last_plan)
     envs.close()
 
 

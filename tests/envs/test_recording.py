@@ -21,7 +21,7 @@ def test_gymnasium_records_videos(make, tmp_path, mode):
 
 def test_whole_movements_are_recorded(make, tmp_path):
     pytest.importorskip("moviepy")
-    from viapoint.envs.recording import RecordMovements
+    from viapoint.envs.record_video import RecordMovements
 
     made = make(mode="rgb_array_list", side=64)
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
@@ -35,7 +35,7 @@ def test_whole_movements_are_recorded(make, tmp_path):
 @pytest.mark.parametrize("name", ["PlanarObstaclesStep", "PlanarTargetJump"])
 def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(name, tmp_path):
     pytest.importorskip("moviepy")
-    from viapoint.envs.recording import RecordMovements
+    from viapoint.envs.record_video import RecordMovements
 
     made = gym.make(f"viapoint.envs:viapoint/{name}-v0", render_mode="rgb_array_list", width=64, height=64)
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)

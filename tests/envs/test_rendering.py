@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from drawn import AROUND, OBSTACLES, SCENE, STRAIGHT, moved
 
-from viapoint.envs import _stage, rendering
-from viapoint.envs._movement import Movement, first_touch
-from viapoint.envs.rendering import check_render_mode, frame_steps
+from viapoint.envs.rendering import renderer, scene_view
+from viapoint.envs.rendering.overlay import Movement, first_touch
+from viapoint.envs.rendering.renderer import check_render_mode, frame_steps
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
 
@@ -156,7 +156,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
         def close(self):
             shown.append("closed")
 
-    monkeypatch.setattr(rendering, "Window", Window)
+    monkeypatch.setattr(renderer, "Window", Window)
     env = gym.make(OBSTACLES, render_mode="human")
     env.reset(seed=0)
     assert len(shown) == 1
@@ -167,7 +167,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
 
 
 def test_a_full_scene_is_drawn_in_part_and_not_refused(make, monkeypatch):
-    monkeypatch.setattr(_stage, "ROOM", 12)
+    monkeypatch.setattr(scene_view, "ROOM", 12)
     env = make(side=16)
     moved(env, AROUND)
     assert env.render().shape == (16, 16, 3)
@@ -196,6 +196,6 @@ def test_a_contact_that_is_with_no_obstacle_is_drawn_as_such():
     env = gym.make("viapoint.envs:viapoint/PandaReach-v0").unwrapped
     env.reset(seed=0)
     scene = env.batch.scenes
-    joints = np.repeat(env.task.arm.posture(scene.start), 3, axis=0)
+    joints = np.repeat(env.task.arm.inverse_kinematics(scene.start), 3, axis=0)
     touch = first_touch(env.task.arm, scene, joints, np.array([False, True, True]), whole_arm=True)
     assert (touch.step, touch.obstacle, touch.link) == (1, -1, None)

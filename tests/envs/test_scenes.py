@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import ADULT
-from viapoint.envs.clearance import segment_distance_squared
-from viapoint.envs.scene_distribution import SceneDistribution
-from viapoint.envs.scene_sampling import SceneSampler
-from viapoint.envs.scenes import TARGETS, Scenes, check_scenes, rows_of_lights
+from viapoint.envs.geometry.distance import segment_distance_squared
+from viapoint.envs.scenes.config import SceneDistribution
+from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.scene import TARGETS, Scenes, check_scenes, rows_of_lights
 
 NUMBER = 300
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import PANDA
-from viapoint.envs.outcome import least_clearance
-from viapoint.envs.reach import ReachVectorEnv
-from viapoint.envs.scenes import check_scenes
-from viapoint.envs.space_distribution import BEAMS, FAMILIES, SpaceDistribution
-from viapoint.envs.space_sampling import SpaceSampler
-from viapoint.envs.task import Task
+from viapoint.envs.mdp.task import Task
+from viapoint.envs.scenes.config import BEAMS, FAMILIES, SpaceDistribution
+from viapoint.envs.scenes.scene import check_scenes
+from viapoint.envs.scenes.spatial import SpaceSampler
+from viapoint.envs.sim.outcome import least_clearance
+from viapoint.envs.single_env import ReachVectorEnv
 
 NUMBER = 60
 
@@ -74,12 +74,12 @@ def test_the_straight_movement_fails_and_random_ones_solve_most_scenes(scenes):
     """Physics agrees with the construction: straight collides everywhere, and there is a way round."""
     env = gym.make_vec("viapoint/PandaObstacles-v0", num_envs=NUMBER, threads=1)
     env.reset(options=scenes.as_options())
-    _, _, info = env.unwrapped.decide(np.zeros((NUMBER, 4)))
+    _, _, info = env.unwrapped.execute_actions(np.zeros((NUMBER, 4)))
     assert info["collision"].all()
     rng, solved = np.random.default_rng(0), np.zeros(NUMBER, dtype=bool)
     for _ in range(16):
         env.reset(options=scenes.as_options())
-        _, _, info = env.unwrapped.decide(rng.uniform(-1.0, 1.0, (NUMBER, 4)))
+        _, _, info = env.unwrapped.execute_actions(rng.uniform(-1.0, 1.0, (NUMBER, 4)))
         solved |= info["is_success"]
         agree = info["collision"] == (info["min_clearance"] < 0.0)
         assert agree[info["reachable"]].all()
@@ -92,14 +92,14 @@ def test_more_via_points(n_via):
     env.reset(seed=0)
     size = env.single_action_space.shape[0]
     assert size == 3 * n_via + 1
-    _, _, info = env.decide(np.zeros((4, size)))
+    _, _, info = env.execute_actions(np.zeros((4, size)))
     np.testing.assert_allclose(info["jerk_ratio"], 1.0, atol=1e-9)
 
 
 def test_the_hand_alone_may_be_what_must_clear():
     env = ReachVectorEnv(32, arm="panda", n_obstacles=(1, 3), duration_range=(1.0, 2.0), threads=1)
     env.reset(seed=0)
-    _, _, info = env.decide(np.zeros((32, 4)))
+    _, _, info = env.execute_actions(np.zeros((32, 4)))
     assert info["collision"].all()
     assert not env.model.geom("forearm").contype
 

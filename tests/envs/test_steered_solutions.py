@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.action import Plan
-from viapoint.envs.pacing import pace_of
+from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.training.frozen_scenes import load
+from viapoint.envs.sim.time_scaling import pace_of
+from viapoint.training.scene_sets.scene_set import load
 
 SCENES, CORRECTION = 40, 4.0
 

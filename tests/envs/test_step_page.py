@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.execution import SETTLING
-from viapoint.envs.outcome import GOAL_TOLERANCE, REST_SPEED
-from viapoint.envs.reach_step import StepReachVectorEnv
+from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.envs.step_episodes import StepRewardWeights
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED
+from viapoint.envs.velocity_env import StepReachVectorEnv
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-step.md").read_text(encoding="utf-8")
 WORDS = " ".join(PAGE.split())

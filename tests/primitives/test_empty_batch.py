@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.envs.action import ActionLayout
+from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.primitives import (
     FREE,
     cost_gradient,

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training import drawn_scenes, frozen_scenes
-from viapoint.training.frozen_scenes import FrozenScenes
-from viapoint.training.trial import Trial
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets import scene_set
+from viapoint.training.scene_sets.scene_set import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).parents[2] / "docs" / "figures"))
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -46,7 +47,7 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     """The small scenes in place of every shipped set."""
     path = tmp_path / "shipped.npz"
     small_scenes.save(path)
-    for module in (frozen_scenes, drawn_scenes):
+    for module in (scene_set, scene_set):
         monkeypatch.setattr(module, "shipped_path", lambda name, env_id: path)
     return small_scenes
 

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ARMS
-from viapoint.envs.scenes import Scenes
-from viapoint.envs.task import Task
-from viapoint.training import viaq_policy
-from viapoint.training.candidates import sobol_actions
-from viapoint.training.geometry_checks import best_plan, check_plans
-from viapoint.training.trial import Trial
-from viapoint.training.vec_env import ViaVecEnv
-from viapoint.training.viaq import ViaQ
-from viapoint.training.viaq_policy import ViaQPolicy, seen_from_line
+from viapoint.envs.mdp.task import Task
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.algorithms import policy as viaq_policy
+from viapoint.training.algorithms.policy import ViaQPolicy, seen_from_line
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.search.candidates import sobol_actions
+from viapoint.training.search.plan_checks import best_plan, check_plans
 
 IDS = (
     "viapoint/PlanarReach-v0",

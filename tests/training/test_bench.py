@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from viapoint.training import bench
-from viapoint.training.config import BenchConfig
+from viapoint.training.cli import bench
+from viapoint.training.config.configs import BenchConfig
 
 
 def test_measurements_take_turns():

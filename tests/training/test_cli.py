@@ -8,10 +8,10 @@ import shlex
 import pytest
 
 from viapoint.envs.registration import ENV_IDS
-from viapoint.training import cli
-from viapoint.training.commands import pretrained_folder
-from viapoint.training.config import EvaluateConfig, TrainConfig
-from viapoint.training.frozen_scenes import load
+from viapoint.training.cli import main as cli
+from viapoint.training.config.configs import EvaluateConfig, TrainConfig
+from viapoint.training.runs.agents import pretrained_folder
+from viapoint.training.scene_sets.scene_set import load
 
 ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
 

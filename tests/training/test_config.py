@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from viapoint.training import config as configs
-from viapoint.training.baselines import METHODS, ONLINE_METHODS
-from viapoint.training.config import (
+from viapoint.training.config import configs
+from viapoint.training.config.checks import ELSEWHERE
+from viapoint.training.config.checks import METHODS as MEASURABLE
+from viapoint.training.config.configs import (
     BenchConfig,
     DemoConfig,
     EvaluateConfig,
@@ -17,11 +18,10 @@ from viapoint.training.config import (
     PlayConfig,
     TrainConfig,
 )
-from viapoint.training.config_checks import ELSEWHERE
-from viapoint.training.config_checks import METHODS as MEASURABLE
-from viapoint.training.config_json import as_json, from_json
-from viapoint.training.model_files import ALGORITHMS
-from viapoint.training.presets import PRESETS
+from viapoint.training.config.presets import PRESETS
+from viapoint.training.io.config_json import as_json, from_json
+from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS
+from viapoint.training.runs.model_io import ALGORITHMS
 
 EXAMPLES = [
     TrainConfig(),

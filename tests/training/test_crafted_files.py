@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save, save_file
 
-from viapoint.envs.action import MOST_VIAS
-from viapoint.envs.scene_distribution import MOST
-from viapoint.training.checkpoints import _digest, read_checkpoint, write_checkpoint
-from viapoint.training.files import BadFileError
-from viapoint.training.model_files import build, load_model, save_model
-from viapoint.training.presets import PRESETS
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.envs.actions.via_points import MOST_VIAS
+from viapoint.envs.scenes.config import MOST_OBSTACLES
+from viapoint.training.config.presets import PRESETS
+from viapoint.training.io.files import BadFileError
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.checkpoints import _digest, read_checkpoint, write_checkpoint
+from viapoint.training.runs.model_io import build, load_model, save_model
 
 ENV = "viapoint/PlanarObstacles-v0"
 MEGABYTE = 1 << 20
@@ -188,7 +188,7 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
     load_model(model)  # to decide, it needs no buffer
     for kwargs in (
         {"n_obstacles": 10**9},
-        {"n_obstacles": [1, MOST + 1]},
+        {"n_obstacles": [1, MOST_OBSTACLES + 1]},
         {"n_via": MOST_VIAS + 1},
         {"threads": 10**6},
     ):

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from viapoint.training import demo
-from viapoint.training.config import DemoConfig
-from viapoint.training.files import BadFileError
-from viapoint.training.monitor import Monitor, TrainingStoppedError
+from viapoint.training.cli import demo
+from viapoint.training.config.configs import DemoConfig
+from viapoint.training.io.files import BadFileError
+from viapoint.training.runs.callback import Monitor, TrainingStoppedError
 
 FILES = (
     "table.md",

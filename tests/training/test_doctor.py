@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from viapoint.training import cli, doctor
+from viapoint.training.cli import doctor
+from viapoint.training.cli import main as cli
 
 GOOD, GONE = "print('fine')", "import no_such_module"
 
@@ -125,7 +126,7 @@ def broken(tmp_path):
 
 def test_an_upgrade_in_place_is_recognised_even_if_nothing_can_be_imported(broken):
     env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(broken), os.environ.get("PYTHONPATH", "")))}
-    script = "import sys; sys.argv[1:] = WORDS; from viapoint.training.entry import main; main()"
+    script = "import sys; sys.argv[1:] = WORDS; from viapoint.training.cli.entry import main; main()"
     told = subprocess.run(
         [sys.executable, "-c", script.replace("WORDS", "['doctor', '--json']")],
         capture_output=True,
@@ -175,7 +176,7 @@ def without_extra(tmp_path):
 
 @pytest.mark.parametrize("words", [["train"], [], ["--help"], ["evaluate", "--env", "viapoint/Nothing-v0"]])
 def test_without_the_extra_the_command_says_in_one_line_what_to_install(without_extra, words):
-    script = f"import sys; sys.argv[1:] = {words}; from viapoint.training.entry import main; main()"
+    script = f"import sys; sys.argv[1:] = {words}; from viapoint.training.cli.entry import main; main()"
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)
     assert told.returncode == 2
     (line,) = told.stderr.splitlines()
@@ -184,9 +185,7 @@ def test_without_the_extra_the_command_says_in_one_line_what_to_install(without_
 
 
 def test_without_the_extra_the_report_advises_the_extra_and_no_new_installation(without_extra):
-    script = (
-        "import sys; sys.argv[1:] = ['doctor', '--json']; from viapoint.training.entry import main; main()"
-    )
+    script = "import sys; sys.argv[1:] = ['doctor', '--json']; from viapoint.training.cli.entry import main; main()"
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)
     assert told.returncode == 1, told.stderr
     failed = [each for each in json.loads(told.stdout)["findings"] if each["needed"] and not each["works"]]

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from viapoint.training import drawn_scenes
-from viapoint.training.drawn_scenes import scenes_for
-from viapoint.training.frozen_scenes import load, shipped_path
+from viapoint.training.scene_sets import scene_set
+from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
 
 ENV = "viapoint/PlanarObstacles-v0"
 
 
 @pytest.fixture(autouse=True)
 def _few(monkeypatch):
-    monkeypatch.setattr(drawn_scenes, "NUMBERS", {"validation": 12, "test": 20})
+    monkeypatch.setattr(scene_set, "NUMBERS", {"validation": 12, "test": 20})
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"n_via": 2, "threads": 1}, {"duration_range": [0.7, 1.3]}])

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from viapoint.training.baselines import make_method
-from viapoint.training.demo import Certified
-from viapoint.training.evaluate import SLOW_DECISION, MethodResult, evaluate
-from viapoint.training.frozen_scenes import BANDS
-from viapoint.training.trial import Trial
+from viapoint.training.cli.demo import StoredSolutions
+from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate
+from viapoint.training.planners.baselines import make_method
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets.scene_set import BANDS
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -52,13 +52,15 @@ def test_every_method_meets_the_same_scenes(small_scenes):
 
 
 def test_results_do_not_depend_on_the_batch(small_scenes):
-    one, other = (run([Certified(small_scenes)], small_scenes, batch=batch).results[0] for batch in (7, 40))
+    one, other = (
+        run([StoredSolutions(small_scenes)], small_scenes, batch=batch).results[0] for batch in (7, 40)
+    )
     for name, values in one.outcomes.items():
         np.testing.assert_array_equal(values, other.outcomes[name], err_msg=name)
 
 
 def test_certified_solutions_solve_what_has_been_solved(small_scenes):
-    result = run([Certified(small_scenes)], small_scenes).results[0]
+    result = run([StoredSolutions(small_scenes)], small_scenes).results[0]
     np.testing.assert_array_equal(result.success, small_scenes.share > 0.0)
 
 
@@ -159,7 +161,7 @@ def test_an_evaluation_interrupted_before_its_first_scene_can_be_written(small_s
 
 
 def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes, monkeypatch):
-    import viapoint.training.evaluate as module
+    import viapoint.training.evaluation.evaluator as module
 
     class Timed(Given):
         cost = 0.001
@@ -182,7 +184,7 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
 
 def test_comparisons_are_with_the_first(small_scenes):
     zeros = np.zeros(small_scenes.solution.shape)
-    record = run([Given("straight", zeros), Certified(small_scenes)], small_scenes).as_json()
+    record = run([Given("straight", zeros), StoredSolutions(small_scenes)], small_scenes).as_json()
     comparison = record["compared_with_first"]["planner (stored)"]
     solved = int((small_scenes.share > 0).sum())
     assert (comparison["only_first"], comparison["only_second"]) == (solved, 0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training.extractors import SceneExtractor
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.algorithms.extractors import SceneExtractor
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0")
 

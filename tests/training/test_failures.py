@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from viapoint.training import failures as module
-from viapoint.training.config import TrainConfig
-from viapoint.training.evaluate import evaluate
-from viapoint.training.failures import KINDS, kinds, markdown, proposals, sort_out, write
-from viapoint.training.train import new_model, resolved
-from viapoint.training.trial import Trial
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.plotting import failure_report as module
+from viapoint.training.plotting.failure_report import KINDS, kinds, markdown, proposals, sort_out, write
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.trainer import new_model, resolved
 
 ENV = "viapoint/PlanarObstacles-v0"
 NAMES = [kind.name for kind in KINDS]

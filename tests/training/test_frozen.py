@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.envs.scene_families import FAMILIES
-from viapoint.envs.scenes import check_scenes
-from viapoint.training import frozen_scenes
-from viapoint.training.baselines import METHODS, make_method
-from viapoint.training.difficulty import planned_share, solution_share
-from viapoint.training.frozen_scenes import BANDS, FrozenScenes, bands, load, shipped_path
-from viapoint.training.make_scenes import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake
-from viapoint.training.planner import Planner, PlannerBudget
-from viapoint.training.scene_search import Kinds, Source, redrawn, search
-from viapoint.training.screening import screen
-from viapoint.training.trial import Trial
+from viapoint.envs.scenes.planar_hard import FAMILIES
+from viapoint.envs.scenes.scene import check_scenes
+from viapoint.training.planners.baselines import METHODS, make_method
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planners.difficulty import planned_share, screen, solution_share
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets import scene_set
+from viapoint.training.scene_sets.generate import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake
+from viapoint.training.scene_sets.scene_search import Kinds, Source, redrawn, search
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, load, shipped_path
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
@@ -200,7 +199,7 @@ def test_a_file_comes_back_as_it_was_and_damage_is_noticed(frozen, tmp_path):
 def test_a_small_archive_that_claims_a_huge_array_is_refused(frozen, tmp_path, monkeypatch):
     path = tmp_path / "bomb.npz"
     np.savez_compressed(path, start=np.zeros((1_000_000, 2)))
-    monkeypatch.setattr(frozen_scenes, "LARGEST", 1_000_000)
+    monkeypatch.setattr(scene_set, "LARGEST", 1_000_000)
     with pytest.raises(
         ValueError, match=r"bomb.npz is not a file of scenes: its arrays would take 16000128 bytes"
     ):

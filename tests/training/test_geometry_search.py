@@ -4,14 +4,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.courses import clearance_over_time
-from viapoint.envs.outcome import least_clearance
+from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.envs.scenes import SHORTEST
-from viapoint.training import geometry_search
-from viapoint.training.baselines import METHODS, ONLINE_METHODS, make_method
-from viapoint.training.frozen_scenes import load
-from viapoint.training.geometry_checks import (
+from viapoint.envs.scenes.dynamic_scene import clearance_over_time
+from viapoint.envs.sim.outcome import least_clearance
+from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS, make_method
+from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.search import geometry_search
+from viapoint.training.search.geometry_search import GeometrySearch
+from viapoint.training.search.plan_checks import (
     CLOSE,
     DEEP,
     NODES,
@@ -20,9 +22,7 @@ from viapoint.training.geometry_checks import (
     merit,
     worth_of_best,
 )
-from viapoint.training.geometry_search import GeometrySearch
-from viapoint.training.online_trial import new_trial
-from viapoint.training.planned import planned
+from viapoint.training.search.planned_movements import planned
 
 PLANE, WHOLE_ARM, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")
@@ -48,7 +48,7 @@ def under_way(env_id, number=24, decisions=2):
     for each in range(decisions):
         observation, *_ = env.step(0.3 * random_actions(env.task, number, seed=each))
     default = env.default
-    far = np.linalg.norm(default.goal - default.state.position, axis=-1) > SHORTEST
+    far = np.linalg.norm(default.goal - default.state.position, axis=-1) > MIN_GOAL_DISTANCE
     free = default.changed | ~default.begun | (default.remaining >= env.reviser.least_remaining)
     return env, observation, far & free
 
@@ -173,7 +173,7 @@ def test_the_reward_is_that_of_executed_movements(env_id, kwargs):
     actions = GeometrySearch(task, 128).decide(observation)
     actions[::4] = random_actions(task, 16)  # some that touch or leave the reach
     checks = check_plans(observation, actions[:, None], task)
-    _, reward, info = env.decide(actions)
+    _, reward, info = env.execute_actions(actions)
     as_planned = (info["stretch"] == 1.0) & (info["is_success"] | ~info["reachable"])
     assert info["is_success"].sum() > 20
     np.testing.assert_allclose(checks.reward[as_planned, 0], reward[as_planned], atol=0.03)

@@ -12,11 +12,12 @@ import time
 import numpy as np
 import pytest
 
-from viapoint.training import cli, runs
-from viapoint.training.config import TrainConfig
-from viapoint.training.files import BadFileError, read_arrays
-from viapoint.training.runs import Run, load_model
-from viapoint.training.train import TrainingFailedError, train
+from viapoint.training.cli import main as cli
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.runs import run_dir
+from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.trainer import TrainingFailedError, train
 
 ENV = "viapoint/PlanarObstacles-v0"
 TINY = {"learning_starts": 32, "gradient_steps": 1, "batch_size": 16, "buffer_size": 4000}
@@ -39,7 +40,7 @@ def start():
     processes = []
 
     def start(*words):
-        script = "from viapoint.training.cli import main; main()"
+        script = "from viapoint.training.cli.main import main; main()"
         process = subprocess.Popen(
             [sys.executable, "-c", script, *map(str, words)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -116,7 +117,7 @@ def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipp
     def interrupted(self, observation, scenes):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("viapoint.training.baselines.RandomVias.decide", interrupted)
+    monkeypatch.setattr("viapoint.training.planners.baselines.RandomVias.decide", interrupted)
     with pytest.raises(SystemExit) as end:
         cli.main(words)
     assert end.value.code == 130
@@ -159,8 +160,8 @@ def test_a_full_disk_stops_training_with_the_reason_and_keeps_what_was_there(ful
 
 
 def runs_model(run):
-    from viapoint.training.train import new_model
-    from viapoint.training.vec_env import ViaVecEnv
+    from viapoint.training.rollouts.vec_env import ViaVecEnv
+    from viapoint.training.runs.trainer import new_model
 
     return new_model(run.config, ViaVecEnv(run.config.env, run.config.copies, threads=1))
 
@@ -187,14 +188,14 @@ def test_a_start_that_got_no_further_can_be_repeated(tmp_path):
 
 def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
     """The second finds a free folder, but the first is faster."""
-    folder, check = tmp_path / "run", runs.check_free
+    folder, check = tmp_path / "run", run_dir.check_free
 
     def slow(path):
         check(path)
-        monkeypatch.setattr(runs, "check_free", check)
+        monkeypatch.setattr(run_dir, "check_free", check)
         Run.create(config(path, seed=1))
 
-    monkeypatch.setattr(runs, "check_free", slow)
+    monkeypatch.setattr(run_dir, "check_free", slow)
     with pytest.raises(BadFileError, match="holds a run already"):
         Run.create(config(folder, seed=2))
     assert Run(folder).config.seed == 1

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from viapoint.training import monitor
-from viapoint.training.config import TrainConfig
-from viapoint.training.frozen_scenes import BANDS
-from viapoint.training.runs import Run
-from viapoint.training.train import train
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.runs import callback
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import train
+from viapoint.training.scene_sets.scene_set import BANDS
 
 STANDARD = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "time/fps")
 """Stable-Baselines3's own."""
@@ -38,19 +38,19 @@ def log(run):
 
 
 def test_every_tag_is_in_the_event_file(log):
-    tags = (*STANDARD, *monitor.OUTCOMES, *monitor.VALIDATED, *monitor.BAND_TAGS.values())
+    tags = (*STANDARD, *callback.OUTCOMES, *callback.VALIDATED, *callback.BAND_TAGS.values())
     assert [tag for tag in tags if tag not in log] == []
     assert {"train/clearance_loss", "train/arrival_loss", "time/simulated_seconds"} <= set(log)
 
 
 def test_the_log_says_what_the_learning_curve_says(run, log):
     assert [event.step for event in log["validation/success_rate"]] == [0, 64, 128]
-    for tag, name in monitor.VALIDATED.items():
+    for tag, name in callback.VALIDATED.items():
         for event, record in zip(log[tag], run.curve, strict=True):
             value = record[name]["rate"] if isinstance(record[name], dict) else record[name]
             assert event.value == pytest.approx(value, rel=1e-6)
     for band in BANDS:
-        shown = [event.value for event in log[monitor.BAND_TAGS[band]]]
+        shown = [event.value for event in log[callback.BAND_TAGS[band]]]
         assert shown == pytest.approx([record["success_by_band"][band]["rate"] for record in run.curve])
 
 
@@ -75,7 +75,7 @@ def test_a_curve_has_decisions_simulated_seconds_and_wall_time(run):
 def test_arguments_of_the_action_leave_the_validation_scenes_as_they_are(shipped, tmp_path):
     for kwargs, same in (({"n_via": 2, "timing": "learned"}, True), ({"n_obstacles": 2}, False)):
         run = Run.create(TrainConfig(out=tmp_path / str(same), env_kwargs=kwargs, eval_scenes=8))
-        scenes = monitor.validation_scenes(run)
+        scenes = callback.validation_scenes(run)
         assert (scenes.sha256 == shipped.take(slice(0, 8)).sha256) == same
 
 

@@ -5,13 +5,13 @@ import sys
 import numpy as np
 import pytest
 
-from viapoint.envs.scenes import Scenes
-from viapoint.training import motion_planner
-from viapoint.training.baselines import make_method
-from viapoint.training.evaluate import evaluate
-from viapoint.training.frozen_scenes import load
-from viapoint.training.motion_planner import points_on
-from viapoint.training.trial import Trial
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.planners import ompl_planner
+from viapoint.training.planners.baselines import make_method
+from viapoint.training.planners.ompl_planner import points_on
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets.scene_set import load
 
 WHOLE = "viapoint/PlanarObstacles-v0"
 
@@ -32,7 +32,7 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     assert summary["jerk_ratio"] < 50.0
     assert summary["collision"]["rate"] <= 0.1
     counts = result.actions[:, 0]
-    assert set(counts) <= set(motion_planner.DENSE)
+    assert set(counts) <= set(ompl_planner.DENSE)
     assert len(set(counts)) > 1
     np.testing.assert_allclose(result.outcomes["duration"], result.actions[:, 1])
 
@@ -42,7 +42,7 @@ def test_every_link_of_the_whole_arm_clears():
     trial = Trial("viapoint/PlanarWholeArm-v0", 6)
     scenes = trial.task.sampler()([np.random.default_rng(0)] * 6)
     method = make_method("ompl", "viapoint/PlanarWholeArm-v0")
-    done = method.carry_out(scenes, method.decide({}, scenes))
+    done = method.execute(scenes, method.decide({}, scenes))
     assert done.success.mean() > 0.5
     assert not (done.success & (done.info["min_clearance"] <= 0.0)).any()
 
@@ -55,9 +55,9 @@ def test_where_there_is_no_way_it_gives_up():
     rows = np.array([[*(start + bar[:2]), *bar[2:], 0.01] for bar in ring])
     trial = Trial(WHOLE, 1)
     scenes = Scenes(start[None], goal[None], np.concatenate((rows, np.zeros((1, 5))))[None])
-    budget = motion_planner.MotionPlannerBudget(attempts=1, seconds=0.05)
-    method = motion_planner.MotionPlannerMethod(trial, budget=budget)
-    done = method.carry_out(scenes, method.decide({}, scenes))
+    budget = ompl_planner.MotionPlannerBudget(attempts=1, seconds=0.05)
+    method = ompl_planner.MotionPlannerMethod(trial, budget=budget)
+    done = method.execute(scenes, method.decide({}, scenes))
     assert not done.success.any()
 
 
@@ -73,7 +73,7 @@ def test_lines_are_near_capsules_when_their_closest_points_are():
             other = centre + (2.0 * share[:, None] - 1.0) * half
             distance = np.sqrt(((one[:, None] - other) ** 2).sum(axis=-1)).min()
             near, far = (
-                motion_planner._nearer(tuple(p), tuple(q), tuple(centre), tuple(half), max(distance + d, 0.0))
+                ompl_planner._nearer(tuple(p), tuple(q), tuple(centre), tuple(half), max(distance + d, 0.0))
                 for d in (1e-3, -0.02)
             )
             assert near

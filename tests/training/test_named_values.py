@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from viapoint.training.named_values import from_words
+from viapoint.training.config.key_values import from_words
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from viapoint.training.baselines import make_method
-from viapoint.training.config import TrainConfig
-from viapoint.training.evaluate import evaluate
-from viapoint.training.files import read_json
-from viapoint.training.frozen_scenes import FrozenScenes, load
-from viapoint.training.make_online_scenes import SIZES, shares
-from viapoint.training.online_trial import OnlineTrial, new_trial
-from viapoint.training.runs import Run, load_model
-from viapoint.training.train import train
-from viapoint.training.trial import Trial
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.io.files import read_json
+from viapoint.training.planners.baselines import make_method
+from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
+from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.trainer import train
+from viapoint.training.scene_sets.generate_replanning import SIZES, shares
+from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
 

@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.training import cli
-from viapoint.training.paper import command, obstacles
-from viapoint.training.paper.claims import SUBJECTS, Claim, at_least, at_most, near
-from viapoint.training.paper.double_step import double_step, excess
-from viapoint.training.paper.movements import construction, via_waypoints
-from viapoint.training.paper.passage import count_roots, passage_polynomial, root_of
+from viapoint.training.cli import main as cli
+from viapoint.training.paper import run
+from viapoint.training.paper.claim import SUBJECTS, Claim, at_least, at_most, near
+from viapoint.training.paper.passage_polynomial import count_roots, passage_polynomial, root_of
 from viapoint.training.paper.profiles import Profile
-from viapoint.training.paper.reproduce import DRAWINGS, ROWS
+from viapoint.training.paper.reference_movements import construction, via_waypoints
+from viapoint.training.paper.rows import obstacles
+from viapoint.training.paper.rows.double_step import double_step, excess
+from viapoint.training.paper.run import DRAWINGS, ROWS
 
 GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"
 FEWER = 9
@@ -93,7 +94,7 @@ def test_the_files_are_complete(made):
     table = (made / "table.md").read_text()
     assert table.count("| holds |") == len(claims_of(made))
     small = list((made / "guide").glob("paper_*.png"))
-    assert {path.stem for path in small} == {f"paper_{name}" for name in command.IN_THE_GUIDE}
+    assert {path.stem for path in small} == {f"paper_{name}" for name in run.IN_THE_GUIDE}
     assert sum(path.stat().st_size for path in small) < 600_000
 
 
@@ -113,7 +114,7 @@ def test_the_guide_says_what_the_command_computes(made):
 
 def test_the_pictures_of_the_guide_are_there_and_small():
     shown = re.findall(r"!\[.+?\]\((images/paper_\w+\.png)\)", GUIDE.read_text())
-    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in command.IN_THE_GUIDE}
+    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in run.IN_THE_GUIDE}
     assert sum((GUIDE.parent / path).stat().st_size for path in shown) < 600_000
 
 
@@ -141,7 +142,7 @@ def test_a_claim_fails_where_a_number_is_not_as_promised():
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
     claims = [Claim(row=1, claim="too much", model=2.0, promise=at_most(1.0))]
-    monkeypatch.setattr(command, "reproduce", lambda *_: command.Reproduction(claims, []))
+    monkeypatch.setattr(run, "reproduce", lambda *_: run.Reproduction(claims, []))
     with pytest.raises(SystemExit) as end:
         cli.main(["paper", "--out", str(tmp_path)])
     assert end.value.code == 1

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from viapoint.training import make_online_scenes, make_scenes, remade_scenes
-from viapoint.training.frozen_scenes import load, shipped_path
+from viapoint.training.scene_sets import generate, generate_replanning, scene_set_diff
+from viapoint.training.scene_sets.scene_set import load, shipped_path
 
 ENV = "viapoint/PlanarReach-v0"
 ONLINE = "viapoint/PlanarTargetJump-v0"
@@ -15,7 +15,7 @@ ONLINE = "viapoint/PlanarTargetJump-v0"
 
 def parsed(*words):
     parser = argparse.ArgumentParser()
-    remade_scenes.add_arguments(parser)
+    scene_set_diff.add_arguments(parser)
     return parser.parse_args(words)
 
 
@@ -24,7 +24,7 @@ def changed(frozen):
 
 
 @pytest.mark.parametrize("same", [True, False])
-@pytest.mark.parametrize(("module", "env_id"), [(make_scenes, ENV), (make_online_scenes, ONLINE)])
+@pytest.mark.parametrize(("module", "env_id"), [(generate, ENV), (generate_replanning, ONLINE)])
 def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(
     module, env_id, same, monkeypatch, capsys
 ):
@@ -42,10 +42,10 @@ def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(
 
 def test_scenes_go_where_one_says(tmp_path, monkeypatch):
     frozen = load("test", ENV)
-    assert remade_scenes.settle([frozen], parsed("--out", str(tmp_path / "new")))
+    assert scene_set_diff.compare_with_shipped([frozen], parsed("--out", str(tmp_path / "new")))
     assert load(tmp_path / "new" / "planar_reach_test.npz", ENV).sha256 == frozen.sha256
-    monkeypatch.setattr(remade_scenes, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
-    assert not remade_scenes.settle([changed(frozen)], parsed("--write"))
+    monkeypatch.setattr(scene_set_diff, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
+    assert not scene_set_diff.compare_with_shipped([changed(frozen)], parsed("--write"))
     assert load(tmp_path / "test.npz", ENV).sha256 == changed(frozen).sha256
 
 

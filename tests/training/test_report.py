@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from viapoint.training import plots, report
-from viapoint.training.demo import Certified
-from viapoint.training.evaluate import evaluate
+from viapoint.training.cli.demo import StoredSolutions
+from viapoint.training.evaluation import report
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.plotting import plots
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -26,7 +27,7 @@ class Still:
 
 @pytest.fixture(scope="module")
 def record(small_scenes):
-    evaluation = evaluate([Still(), Certified(small_scenes)], small_scenes, ENV, time_decisions=False)
+    evaluation = evaluate([Still(), StoredSolutions(small_scenes)], small_scenes, ENV, time_decisions=False)
     return evaluation.as_json()
 
 

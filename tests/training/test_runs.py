@@ -11,14 +11,14 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from viapoint.envs.arms import ARMS, PANDA
-from viapoint.training import files
-from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
-from viapoint.training.config import TrainConfig
-from viapoint.training.files import BadFileError
-from viapoint.training.model_files import build, describe, load_model, save_model, weights
-from viapoint.training.presets import PRESETS
-from viapoint.training.runs import Run, find_model
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.presets import PRESETS
+from viapoint.training.io import files
+from viapoint.training.io.files import BadFileError
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
+from viapoint.training.runs.model_io import build, describe, load_model, save_model, weights
+from viapoint.training.runs.run_dir import Run, find_model
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -255,7 +255,7 @@ def test_what_is_no_run_is_refused_by_name(run, tmp_path):
 
 def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run):
     script = (
-        "import sys; from pathlib import Path; from viapoint.training.runs import Run\n"
+        "import sys; from pathlib import Path; from viapoint.training.runs.run_dir import Run\n"
         f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(

@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from viapoint.training import statistics
+from viapoint.training.evaluation import statistics
 
 
 def test_wilson_equals_published_values():

@@ -6,18 +6,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.training.baselines import Straight, agent_method
-from viapoint.training.config import TrainConfig
-from viapoint.training.evaluate import evaluate
-from viapoint.training.frozen_scenes import load
-from viapoint.training.model_files import build
-from viapoint.training.monitor import validation_scenes
-from viapoint.training.presets import STEP_PRESETS
-from viapoint.training.runs import Run, load_model
-from viapoint.training.step_agent import StepAgentMethod, is_step_wise, whole_task
-from viapoint.training.train import train
-from viapoint.training.trial import Trial
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.presets import STEP_PRESETS
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.planners.baselines import Straight, agent_method
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise, whole_task
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.callback import validation_scenes
+from viapoint.training.runs.model_io import build
+from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.trainer import train
+from viapoint.training.scene_sets.scene_set import load
 
 STEP, WHOLE = "viapoint/PlanarObstaclesStep-v0", "viapoint/PlanarObstacles-v0"
 SMALL = {"learning_starts": 64, "gradient_steps": 1, "batch_size": 16, "buffer_size": 500}
@@ -59,7 +59,7 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does():
     frozen, model = load("validation", WHOLE).take(slice(0, 6)), Forwards()
     method = StepAgentMethod("forwards", model, STEP, {})
     trial = Trial(WHOLE, 6)
-    together = method.carry_out(frozen.scenes, method.decide(trial.observe(frozen.scenes), frozen.scenes))
+    together = method.execute(frozen.scenes, method.decide(trial.observe(frozen.scenes), frozen.scenes))
     env = gym.make(STEP)
     for i in range(6):
         observation, _ = env.reset(options=frozen.scenes.take([i]).as_options())

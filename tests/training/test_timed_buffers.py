@@ -14,14 +14,14 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from viapoint.training.discount import TimeDiscount
-from viapoint.training.timed_buffers import (
-    TellElapsed,
+from viapoint.training.algorithms.smdp_buffers import (
+    ElapsedTimeCallback,
     TimedDictReplayBuffer,
     TimedReplayBuffer,
     TimedRolloutBuffer,
     timed,
 )
+from viapoint.training.config.discount import TimeDiscount
 
 GAMMA, UNIT = 0.7, 0.2
 
@@ -206,7 +206,7 @@ def test_critics_converge_to_the_values_of_the_chain(kind):
 
 
 def test_ppo_converges_to_the_values_of_the_chain():
-    found = learned(PPO, 1024, callback=TellElapsed(), vf_coef=1.0, max_grad_norm=10.0, **ON)
+    found = learned(PPO, 1024, callback=ElapsedTimeCallback(), vf_coef=1.0, max_grad_norm=10.0, **ON)
     np.testing.assert_allclose(found, worth(), atol=0.05)
 
 
@@ -216,7 +216,7 @@ def test_what_an_episode_is_cut_off_from_is_discounted_by_time(gamma):
     env = DummyVecEnv([lambda: Chain(cut=3)])
     model = PPO("MlpPolicy", env, gamma=gamma, gae_lambda=1.0, n_steps=3, batch_size=3, n_epochs=1,
                 learning_rate=1e-12, **timed(PPO, env.observation_space, gamma=gamma, unit=UNIT))  # fmt: skip
-    model.learn(3, callback=TellElapsed())
+    model.learn(3, callback=ElapsedTimeCallback())
     with torch.no_grad():
         after = float(model.policy.predict_values(torch.eye(4)[3:4]))
     time = np.concatenate(([0.0], np.cumsum(SECONDS[:3])))
@@ -229,14 +229,14 @@ def test_what_an_episode_is_cut_off_from_is_discounted_by_time(gamma):
 
 
 def test_ppo_without_the_callback_is_told_so():
-    with pytest.raises(ValueError, match="TellElapsed"):
+    with pytest.raises(ValueError, match="ElapsedTimeCallback"):
         learned(PPO, 64, **ON)
 
 
 @pytest.mark.parametrize("kind", [SAC, PPO])
 def test_an_environment_that_does_not_tell_is_refused(kind):
     with pytest.raises(ValueError, match="environment 0 has"):
-        learned(kind, 64, key=None, callback=TellElapsed(), **(ON if kind is PPO else OFF))
+        learned(kind, 64, key=None, callback=ElapsedTimeCallback(), **(ON if kind is PPO else OFF))
 
 
 def test_the_example_of_the_page_runs():

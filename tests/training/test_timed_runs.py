@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from decision_chain import SECONDS, Chain
 
-from viapoint.envs.reach_step import StepReachVectorEnv
-from viapoint.training.config import TrainConfig
-from viapoint.training.files import BadFileError, read_arrays, read_json
-from viapoint.training.model_files import load_model
-from viapoint.training.runs import Run
-from viapoint.training.timed_buffers import unit_of
-from viapoint.training.train import train
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.envs.velocity_env import StepReachVectorEnv
+from viapoint.training.algorithms.smdp_buffers import unit_of
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.io.files import BadFileError, read_arrays, read_json
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.model_io import load_model
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import train
 
 STEP = "viapoint/PlanarObstaclesStep-v0"
 
@@ -20,8 +20,8 @@ STEP = "viapoint/PlanarObstaclesStep-v0"
 class Uneven(StepReachVectorEnv):
     """Steps that are said to have taken as long as the hand has moved."""
 
-    def decide(self, actions):
-        decision = super().decide(actions)
+    def execute_actions(self, actions):
+        decision = super().execute_actions(actions)
         return decision._replace(info={**decision.info, "elapsed": 0.04 + decision.info["path_length"]})
 
 

@@ -8,14 +8,14 @@ import signal
 import numpy as np
 import pytest
 
-from viapoint.training import monitor
-from viapoint.training.config import TrainConfig
-from viapoint.training.evaluate import evaluate
-from viapoint.training.files import BadFileError, read_arrays
-from viapoint.training.presets import PRESETS
-from viapoint.training.runs import Run, load_model
-from viapoint.training.train import TrainingStoppedError, train
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.presets import PRESETS
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs import callback
+from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.trainer import TrainingStoppedError, train
 
 TINY = {
     "viaq": {
@@ -120,8 +120,8 @@ def test_what_a_run_leaves(tmp_path):
     best = max(record["success"]["rate"] for record in run.curve)
     model = load_model(run.model_folder)
     assert run.model_folder.name == "best"
-    scenes = monitor.validation_scenes(run)
-    method = monitor.agent_method("agent", model)
+    scenes = callback.validation_scenes(run)
+    method = callback.agent_method("agent", model)
     again = evaluate([method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False)
     assert again.results[0].success.mean() == best
 
@@ -213,7 +213,7 @@ def test_a_run_is_resumed_with_its_own_settings_only(tmp_path):
 
 def test_shipped_validation_scenes_are_used(shipped, tmp_path):
     run = Run.create(dataclasses.replace(config(tmp_path / "run"), env_kwargs={}))
-    scenes = monitor.validation_scenes(run)
+    scenes = callback.validation_scenes(run)
     np.testing.assert_array_equal(scenes.scenes.goal, shipped.scenes.goal[:8])
     assert scenes.sha256 == shipped.take(slice(0, 8)).sha256
 

@@ -11,9 +11,9 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from viapoint.training.geometry_search import GeometrySearch
-from viapoint.training.trial import Trial
-from viapoint.training.vec_env import ViaVecEnv
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.search.geometry_search import GeometrySearch
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -259,10 +259,10 @@ def test_an_unknown_id_is_answered_with_those_that_there_are(make):
 @pytest.mark.parametrize(
     "line",
     [
-        "from viapoint.training.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
-        "from viapoint.training.geometry_search import GeometrySearch; GeometrySearch(ID)",
-        "from viapoint.training.trial import Trial; Trial(ID, 2)",
-        "from viapoint.training.commands import find_agent; find_agent(None, ID)",
+        "from viapoint.training.rollouts.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
+        "from viapoint.training.search.geometry_search import GeometrySearch; GeometrySearch(ID)",
+        "from viapoint.training.rollouts.rollout import Trial; Trial(ID, 2)",
+        "from viapoint.training.cli.commands import load_agent; load_agent(None, ID)",
     ],
 )
 def test_whoever_is_given_an_id_registers_it(line):

@@ -12,11 +12,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
-from viapoint.training.baselines import agent_method
-from viapoint.training.outcome_buffer import Outcomes, outcome_of
-from viapoint.training.vec_env import TERMS, ViaVecEnv
-from viapoint.training.viaq import ViaQ
-from viapoint.training.viaq_policy import ViaQPolicy
+from viapoint.training.algorithms.outcome_buffer import Outcomes, outcome_of
+from viapoint.training.algorithms.policy import ViaQPolicy
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.planners.baselines import agent_method
+from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 
 ENV, ONLINE = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}

@@ -11,22 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import SAC, TD3
 
-import viapoint.envs.approach
-import viapoint.envs.clearance
-import viapoint.envs.courses
-import viapoint.envs.nearness
-import viapoint.envs.outcome
-import viapoint.training.geometry_checks
-import viapoint.training.geometry_search
+import viapoint.envs.geometry.broad_phase
+import viapoint.envs.geometry.distance
+import viapoint.envs.geometry.narrow_phase
+import viapoint.envs.scenes.dynamic_scene
+import viapoint.envs.sim.outcome
+import viapoint.training.search.geometry_search
+import viapoint.training.search.plan_checks
 from viapoint.envs.registration import TASKS
-from viapoint.training import viaq_policy
-from viapoint.training.candidates import best_duration, candidate_actions
-from viapoint.training.minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
-from viapoint.training.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.vec_env import TERMS, ViaVecEnv
-from viapoint.training.viaq import ViaQ
-from viapoint.training.viaq_critic import PART, PairMinimum, Poses, cut_obstacles, pair_features
-from viapoint.training.viaq_policy import Values, _Saturated
+from viapoint.training.algorithms import policy as viaq_policy
+from viapoint.training.algorithms.critic import PART, PairMinimum, Poses, cut_obstacles, pair_features
+from viapoint.training.algorithms.minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
+from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
+from viapoint.training.algorithms.policy import Values, _Saturated
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
+from viapoint.training.search.candidates import best_duration, candidate_actions
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",
@@ -35,13 +35,13 @@ PLANE, WHOLE, SPACE = (
 )
 MOVING = "viapoint/PlanarMovingObstacles-v0"
 KNOW_OBSTACLES = (
-    viapoint.envs.approach,
-    viapoint.envs.clearance,
-    viapoint.envs.courses,
-    viapoint.envs.nearness,
-    viapoint.envs.outcome,
-    viapoint.training.geometry_checks,
-    viapoint.training.geometry_search,
+    viapoint.envs.geometry.narrow_phase,
+    viapoint.envs.geometry.distance,
+    viapoint.envs.scenes.dynamic_scene,
+    viapoint.envs.geometry.broad_phase,
+    viapoint.envs.sim.outcome,
+    viapoint.training.search.plan_checks,
+    viapoint.training.search.geometry_search,
 )
 FEW = {"candidates": 32, "refinements": 1, "per_refinement": 16, "width": 8}
 
@@ -63,7 +63,7 @@ def refuse_geometry(monkeypatch):
         for name, function in inspect.getmembers(module, inspect.isfunction):
             if function.__module__ == module.__name__:
                 monkeypatch.setattr(module, name, refuse)
-                for user in (viaq_policy, viapoint.training.viaq):
+                for user in (viaq_policy, viapoint.training.algorithms.viaq):
                     if getattr(user, name, None) is function:
                         monkeypatch.setattr(user, name, refuse)
 

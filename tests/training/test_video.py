@@ -4,16 +4,16 @@ import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import rendered
 from matplotlib.figure import Figure
 from PIL import Image
 
-from viapoint.envs import _gl
-from viapoint.envs.palette import PALETTE
-from viapoint.envs.rendering import GLUnavailableError
-from viapoint.training import pictures
-from viapoint.training.gallery import Entry, gallery
-from viapoint.training.top_view import capsule, draw_movement
-from viapoint.training.video import film, verdict
+from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.rendering import gl
+from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.plotting.top_view import capsule, draw_movement
+from viapoint.training.plotting.video import film, verdict
 
 OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 
@@ -31,7 +31,7 @@ def _no_opengl(monkeypatch):
         raise OSError("no such library")
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(_gl, "_open_on", missing)
+    monkeypatch.setattr(gl, "_open_on", missing)
 
 
 def scenes_of(env, number, seed=0):
@@ -182,10 +182,10 @@ def test_a_scene_is_drawn_without_plan_and_movement(env):
 
 
 def test_the_pictures_of_the_documentation(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "ATTEMPTS", 80)
+    monkeypatch.setattr(rendered, "ATTEMPTS", 80)
     try:
-        pictures.picture("PlanarReach", tmp_path / "reach.png")
-        pictures.flow(tmp_path / "flow.png")
+        rendered.picture("PlanarReach", tmp_path / "reach.png")
+        rendered.flow(tmp_path / "flow.png")
     except GLUnavailableError as error:
         pytest.skip(f"no picture can be rendered here: {error}")
     with Image.open(tmp_path / "reach.png") as image:
@@ -194,12 +194,12 @@ def test_the_pictures_of_the_documentation(tmp_path, monkeypatch):
         assert image.width > 1200
 
 
-@pytest.mark.parametrize("env_id", pictures.PASSAGES)
+@pytest.mark.parametrize("env_id", rendered.PASSAGES)
 def test_the_pictures_of_an_agent_show_that_it_passes_and_the_straight_movement_does_not(env_id):
     env = gym.make(env_id, render_mode="rgb_array_list", width=32, height=32)
     try:
-        row = pictures.PASSAGES[env_id][0]
-        passed, hit = (pictures.passage(env, env_id, row, straight=straight) for straight in (False, True))
+        row = rendered.PASSAGES[env_id][0]
+        passed, hit = (rendered.passage(env, env_id, row, straight=straight) for straight in (False, True))
     except GLUnavailableError as error:
         pytest.skip(str(error))
     finally:

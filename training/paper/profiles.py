@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.primitives import Trajectory
-from viapoint.training.paper.performed import Performed
+from viapoint.training.paper.simulated import Performed
 
 Float = NDArray[np.float64]
 

@@ -6,9 +6,8 @@ import base64
 import html
 from pathlib import Path
 
-from viapoint.training.files import write_bytes, write_json
-from viapoint.training.paper.claims import SUBJECTS, Claim
-from viapoint.training.paper.reproduce import Reproduction
+from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 
 TITLE = "Flash & Hogan 1985, reproduced"
 HEADINGS = (

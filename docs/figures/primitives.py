@@ -1,0 +1,114 @@
+"""Draw the figures of primitives.md: `python docs/figures/primitives.py` writes them to docs/images/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+from viapoint.primitives import curvature, passage_durations, point_to_point, speed, speed_valleys, through
+
+FOLDER = Path(__file__).parents[1] / "images"
+COLOURS = plt.get_cmap("viridis")
+
+
+def save(figure: plt.Figure, name: str) -> None:
+    """Write one figure as a small PNG."""
+    figure.tight_layout()
+    figure.savefig(FOLDER / f"primitives_{name}.png", dpi=90)
+    plt.close(figure)
+
+
+def reach() -> None:
+    """Position, speed, acceleration and jerk of a reach for the three orders."""
+    figure, axes = plt.subplots(1, 4, figsize=(12, 2.8))
+    time = np.linspace(0, 1, 301)
+    names = ("position [m]", "speed [m/s]", "acceleration [m/s²]", "jerk [m/s³]")
+    for order, label in ((2, "least acceleration"), (3, "least jerk"), (4, "least snap")):
+        movement = point_to_point([0.0], [1.0], 1.0, order=order)
+        for nu, axis in enumerate(axes):
+            axis.plot(time, movement(time, nu)[:, 0], label=label, lw=2 if order == 3 else 1)
+    for axis, name in zip(axes, names, strict=True):
+        axis.set(title=name, xlabel="time [s]")
+    axes[0].legend(fontsize=8)
+    save(figure, "reach")
+
+
+def family() -> None:
+    """Movements through via-points of growing height: paths, speeds, curvatures."""
+    figure, (paths, speeds, bends) = plt.subplots(1, 3, figsize=(12, 3.2))
+    time = np.linspace(0, 1, 401)
+    for height in np.linspace(0, 0.6, 7):
+        waypoints = np.array([[0.0, 0.0], [0.35, height], [1.0, 0.0]])
+        movement = through(waypoints, passage_durations(waypoints, 1.0))
+        colour = COLOURS(height / 0.65)
+        paths.plot(*movement(time).T, color=colour)
+        paths.plot(*waypoints[1], "o", color=colour, ms=4)
+        speeds.plot(time, speed(movement, time), color=colour)
+        valley = speed_valleys(movement)
+        speeds.plot(valley.time, valley.speed, "v", color=colour, ms=5)
+        inner = time[20:-20]
+        bends.plot(inner, -curvature(movement, inner), color=colour)
+    paths.set(title="path [m]", xlabel="along the straight line [m]")
+    speeds.set(title="speed [m/s], valleys marked", xlabel="time [s]")
+    bends.set(title="curvature [1/m]", xlabel="time [s]", ylim=(-1, 12))
+    save(figure, "family")
+
+
+def passage() -> None:
+    """Cost against passage time, and the passage time against the place of the via-point."""
+    figure, (costs, times) = plt.subplots(1, 2, figsize=(9, 3.2))
+    t = np.linspace(0.15, 0.85, 300)
+    for along, colour in ((0.15, "C0"), (0.35, "C1"), (0.5, "C2")):
+        waypoints = np.array([[0.0, 0.0], [along, 0.3], [1.0, 0.0]])
+        cost = through(waypoints[None], np.stack([t, 1 - t], axis=-1)).cost()
+        best = passage_durations(waypoints, 1.0)
+        costs.semilogy(t, cost / 360, color=colour, label=f"via-point at ({along}, 0.3)")
+        costs.semilogy(best[0], through(waypoints, best).cost() / 360, "o", color=colour)
+    costs.set(xlabel="passage time / duration", title="jerk cost / that of the straight reach")
+    costs.legend(fontsize=8)
+    along = np.linspace(0, 1, 401)
+    for height in (0.0, 0.1, 0.3, 1.0):
+        via = np.stack([along, np.full_like(along, height)], axis=-1)
+        ends = np.broadcast_to([[[0.0, 0.0]], [[1.0, 0.0]]], (2, 401, 2))
+        waypoints = np.stack([ends[0], via, ends[1]], axis=1)
+        times.plot(along, passage_durations(waypoints, 1.0)[:, 0], label=f"height {height}")
+    times.set(xlabel="d1 / (d1 + d2)", title="passage time / duration")
+    times.legend(fontsize=8)
+    save(figure, "passage")
+
+
+def online() -> None:
+    """Replanning from noisy states until the end, and with the last plan kept for the last 100 ms."""
+    figure, (positions, jerks) = plt.subplots(1, 2, figsize=(9, 3.0))
+    step, arrival, goal = 0.01, 0.8, np.array([0.3])
+    smooth = point_to_point(np.zeros(1), goal, arrival)
+    grid = np.arange(80) * step
+    for freeze, label in ((0.0, "replanned to the end"), (0.1, "kept for the last 0.1 s")):
+        rng = np.random.default_rng(1)
+        state = [np.zeros(1)] * 3
+        plan, begun, jerk, position = smooth, 0.0, [], []
+        for now in grid:
+            if arrival - now > freeze:
+                seen = [value + rng.normal(size=1) * 1e-4 for value in state]
+                ends = {"start_velocity": seen[1], "start_acceleration": seen[2]}
+                plan, begun = point_to_point(seen[0], goal, arrival - now, **ends), now
+            jerk.append(plan(now - begun, 3)[0])
+            state = [plan(now - begun + step, nu) for nu in range(3)]
+            position.append(state[0][0])
+        positions.plot(grid + step, position, label=label)
+        jerks.plot(grid, jerk, label=label)
+    jerks.plot(grid, smooth(grid, 3)[:, 0], "k:", label="without noise")
+    positions.set(title="position [m]", xlabel="time [s]")
+    jerks.set(title="jerk [m/s³]", xlabel="time [s]", yscale="symlog")
+    jerks.legend(fontsize=8)
+    save(figure, "online")
+
+
+if __name__ == "__main__":
+    for draw in (reach, family, passage, online):
+        draw()

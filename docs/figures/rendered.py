@@ -1,0 +1,188 @@
+"""The pictures of the documentation, rendered by the program: `python docs/figures/rendered.py`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from dataflow import draw_flow
+from numpy.typing import NDArray
+from PIL import Image
+
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.runs.agents import load_agent
+from viapoint.training.scene_sets.scene_set import load
+
+Float = NDArray[np.float64]
+Frame = NDArray[np.uint8]
+
+SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
+"""Scenes that show what a task is about."""
+FILES = {
+    "PlanarReach": "planar_reach.png",
+    "PlanarObstacles": "planar_obstacles.png",
+    "PlanarWholeArm": "planar_whole_arm.png",
+}
+IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
+PASSAGES = {IN_PLANE: (29, 4, 10, 37), IN_SPACE: (14, 21)}
+"""Scenes of their sets `test` that the shipped agents are shown in; in space a slot, and a shelf among spheres."""
+MOMENTS = (0.3, 0.45, 0.6, 1.0)
+"""Of a movement, as parts of its duration."""
+ATTEMPTS = 400
+"""Random movements in a scene."""
+SCENES = 10
+"""How many scenes are tried for one that can be shown."""
+SAFE = 0.012
+"""Least clearance of a movement that is shown, [m]."""
+SPEED = 0.5
+"""Of the animation, relative to real time."""
+GAP = 6
+"""Between frames side by side, [pixels]."""
+PAUSE = 700
+"""After each movement of the animation, [ms]."""
+
+
+class Solved(NamedTuple):
+    """A movement that succeeds."""
+
+    scene: Scenes
+    """One row."""
+    action: Float
+    """Shape (m,)."""
+
+
+def solve(env: gym.Env[Any, Any], seed: int) -> Solved:
+    """The smoothest of the successful movements among random ones, in the scene of a seed.
+
+    Where none succeeds, the scenes of the next seeds are tried.
+
+    Raises:
+        RuntimeError: None succeeds in any of them.
+    """
+    task: Any = env.unwrapped.task  # type: ignore[attr-defined]
+    for scene_seed in range(seed, seed + SCENES):
+        scene = task.sampler()([np.random.default_rng(scene_seed)])
+        generator = np.random.default_rng(seed)
+        best, least = None, np.inf
+        for _ in range(ATTEMPTS):
+            action = generator.uniform(-1.0, 1.0, task.action.size).astype(np.float32)
+            env.reset(options=scene.as_options())
+            info = env.step(action)[-1]
+            good = info["is_success"] and info["min_clearance"] > SAFE
+            if good and info["jerk_ratio"] < least:
+                best, least = action, info["jerk_ratio"]
+        if best is not None:
+            return Solved(scene, np.asarray(best))
+    raise RuntimeError(
+        f"none of {ATTEMPTS} random movements succeeds in the scenes of seeds {seed} and after"
+    )
+
+
+def perform(env: gym.Env[Any, Any], solved: Solved) -> Any:
+    """Carry a movement out; what the environment renders of it."""
+    env.reset(options=solved.scene.as_options())
+    env.step(solved.action)
+    return env.render()
+
+
+def picture(task: str, path: Path) -> None:
+    """One movement of a task."""
+    env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array")
+    frame = perform(env, solve(env, SEEDS[task]))
+    env.close()
+    Image.fromarray(frame).save(path, optimize=True)
+
+
+def animation(path: Path, *, size: int = 400) -> None:
+    """The shipped agent's movements in the plane, one after the other, for ever."""
+    env = gym.make(IN_PLANE, render_mode="rgb_array_list", width=size, height=size)
+    films = [passage(env, IN_PLANE, row) for row in PASSAGES[IN_PLANE]]
+    env.close()
+    _animate(path, films, env.metadata["render_fps"])
+
+
+def _animate(path: Path, films: list[list[Frame]], fps: float) -> None:
+    """Save films as one animation that never ends."""
+    images = [Image.fromarray(frame) for frames in films for frame in frames]
+    each = round(1000.0 / (fps * SPEED))
+    durations = [time for frames in films for time in (*[each] * (len(frames) - 1), PAUSE)]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=durations, loop=0, quality=80, method=4
+    )
+
+
+def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = False) -> list[Frame]:
+    """The frames of the shipped agent's movement in a test scene, or those of the straight one until it hits.
+
+    Raises:
+        RuntimeError: The agent's does not succeed, or the straight one does.
+    """
+    scene, agent = load("test", env_id).scenes.take([row]), load_agent(None, env_id)
+    observation, _ = env.reset(options=scene.as_options())
+    task: Any = env.unwrapped.task  # type: ignore[attr-defined]
+    batch = {name: part[None] for name, part in observation.items()}
+    action = np.zeros(task.action.size) if straight else agent.method(16).decide(batch, scene)[0]
+    info = env.step(action.astype(np.float32))[-1]
+    if info["is_success"] is straight:
+        raise RuntimeError(f"scene {row} shows nothing: is_success is {info['is_success']}")
+    frames: list[Frame] = env.render()  # type: ignore[assignment]
+    if straight:
+        frames = frames[: 1 + round(info["first_contact_time"] / info["duration"] * (len(frames) - 1))]
+    return frames
+
+
+def side_by_side(frames: Sequence[Frame]) -> Frame:
+    """Frames in one line with white gaps between them."""
+    gap = np.full((len(frames[0]), GAP, 3), 255, np.uint8)
+    return np.concatenate([part for frame in frames for part in (gap, frame)][1:], axis=1)
+
+
+def passages(strip: Path, pair: Path, film: Path) -> None:
+    """The shipped agent of an arm in space: moments of a movement, the straight one beside them, and a film."""
+    sides = {strip: 300, pair: 480, film: 300}
+    for path, side in sides.items():
+        env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
+        if path == film:
+            _animate(
+                path, [passage(env, IN_SPACE, row) for row in PASSAGES[IN_SPACE]], env.metadata["render_fps"]
+            )
+        else:
+            row = PASSAGES[IN_SPACE][0]
+            frames, hit = passage(env, IN_SPACE, row), passage(env, IN_SPACE, row, straight=True)[-1]
+            moments = MOMENTS if path == strip else MOMENTS[1:2]
+            shown = [frames[round(moment * (len(frames) - 1))] for moment in moments]
+            Image.fromarray(side_by_side((*shown, hit))).save(path, optimize=True)
+        env.close()
+
+
+def flow(path: Path) -> None:
+    """The flow from action to observation, in real numbers."""
+    env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0", render_mode="rgb_array")
+    solved = solve(env, SEEDS["PlanarObstacles"])
+    observation, _ = env.reset(options=solved.scene.as_options())
+    info = env.step(solved.action)[-1]
+    draw_flow(path, env, solved.scene, solved.action, observation, info)
+    env.close()
+
+
+def main() -> None:
+    """Make all pictures."""
+    parser = argparse.ArgumentParser(description="Render the pictures of the documentation.")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
+    out: Path = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    for task, name in FILES.items():
+        picture(task, out / name)
+    animation(out / "reaching.webp")
+    passages(out / "panda_agent.png", out / "panda_obstacles.png", out / "panda.webp")
+    flow(out / "flow.png")
+    for path in sorted(out.iterdir()):
+        print(f"{path}  {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

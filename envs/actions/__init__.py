@@ -1,0 +1,1 @@
+"""Decoding of actions into plans and references."""

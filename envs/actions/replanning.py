@@ -1,0 +1,212 @@
+"""Plans that are revised on the way: from what is commanded at present, without a jump of it.
+
+An action says how the *default* plan is changed: the rest of the plan under way while its goal is the present one, else
+the smoothest movement to the new goal. By the principle of optimality the rest of a minimum-jerk movement, made again
+through its own via-points, is itself, so a zero action changes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint import primitives
+from viapoint.envs.actions.velocity import Motion
+from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, ActionLayout, Plan, frame
+from viapoint.envs.common.arrays import norm
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+class MovingPlan(NamedTuple):
+    """N movements that may begin in motion."""
+
+    waypoints: Float
+    """Present place, via-points and goal, shape (N, K + 2, D), [m]."""
+    durations: Float
+    """Of the segments between them, shape (N, K + 1), [s]."""
+    velocity: Float
+    """At the beginning, shape (N, D), [m/s]."""
+    acceleration: Float
+    """At the beginning, shape (N, D), [m/s^2]."""
+
+    @classmethod
+    def of(cls, plan: Plan) -> MovingPlan:
+        """A plan that begins at rest."""
+        start = np.asarray(plan.waypoints[..., 0, :])
+        return cls(plan.waypoints, plan.durations, np.zeros_like(start), np.zeros_like(start))
+
+    @property
+    def plan(self) -> Plan:
+        """Via-points and durations alone."""
+        return Plan(self.waypoints, self.durations)
+
+    @property
+    def duration(self) -> Float:
+        """Shape (N,), [s]."""
+        return np.asarray(self.durations.sum(axis=-1))
+
+    def take(self, rows: Any) -> MovingPlan:
+        """The movements at `rows`, an index, slice or mask."""
+        return MovingPlan(*(field[rows] for field in self))
+
+    def put(self, rows: Any, other: MovingPlan) -> None:
+        """Overwrite the movements at `rows`."""
+        for mine, theirs in zip(self, other, strict=True):
+            mine[rows] = theirs
+
+    def trajectory(self) -> primitives.Trajectory:
+        """The minimum-jerk movement through the waypoints."""
+        return primitives.through(
+            self.waypoints, self.durations, start_velocity=self.velocity, start_acceleration=self.acceleration
+        )
+
+    def states(self, time: Float) -> Motion:
+        """What is commanded at a time for each, shape (N,), [s]."""
+        return Motion(*(part[:, 0] for part in self.trajectory().sample(time[:, None])))
+
+
+class NominalPlan(NamedTuple):
+    """What N hands do if the agent wants nothing else."""
+
+    begun: Bool
+    """Whether a movement is under way; if not, the default is the straight one, as in one-decision episodes."""
+    changed: Bool
+    """Whether the goal is not that of the plan under way."""
+    state: Motion
+    """Commanded at present."""
+    start: Float
+    """Of the episode, shape (N, D), [m]."""
+    goal: Float
+    """The present one, shape (N, D), [m]."""
+    vias: Float
+    """Via-points, shape (N, K, D), [m]."""
+    remaining: Float
+    """Time left of it, shape (N,), [s]; 0 where the hand rests at its goal."""
+
+
+class Reviser:
+    """Makes plans of actions on the way.
+
+    Args:
+        layout: Of the actions.
+    """
+
+    def __init__(self, layout: ActionLayout) -> None:
+        self.layout = layout
+        self.least_remaining = 0.5 * layout.duration_range[0]
+        """A revision takes no less time, and a plan that has less left to its goal is not revised, [s]."""
+
+    def default(self, plan: MovingPlan, time: Float, begun: Bool, start: Float, goal: Float) -> NominalPlan:
+        """What happens if the agent wants nothing else.
+
+        Args:
+            plan: N movements under way.
+            time: Since they began, shape (N,), [s].
+            begun: Whether they have, shape (N,).
+            start: Of the episodes, shape (N, D), [m].
+            goal: The present one, shape (N, D), [m].
+        """
+        trajectory, end, number = plan.trajectory(), plan.duration, self.layout.n_via
+        changed = (plan.waypoints[:, -1] != goal).any(axis=-1)
+        state = Motion(*(part[:, 0] for part in trajectory.sample(time[:, None])))
+        at_rest = Motion.at_rest(start)
+        state = Motion(*(np.where(begun[:, None], a, b) for a, b in zip(state, at_rest, strict=True)))
+        centre = np.full(len(goal), self.layout.centre_duration)
+        shares = np.arange(1, number + 1) / (number + 1)
+        straight = start[:, None] + (goal - start)[:, None] * shares[:, None]
+        rest = trajectory(self._passages(plan, time))
+        anew = primitives.point_to_point(
+            state.position, goal, centre, start_velocity=state.velocity, start_acceleration=state.acceleration
+        )(centre[:, None] * shares)
+        vias = np.where(changed[:, None, None], anew, rest)
+        remaining = np.where(changed | ~begun, centre, np.maximum(end - time, 0.0))
+        return NominalPlan(
+            begun,
+            changed & begun,
+            state,
+            start,
+            goal,
+            np.where(begun[:, None, None], vias, straight),
+            remaining,
+        )
+
+    def _passages(self, plan: MovingPlan, time: Float) -> Float:
+        """When the rest of a plan passes its via-points, and points of the last leg for those that it has passed.
+
+        Shape (N, K), [s], in order.
+        """
+        number = self.layout.n_via
+        knots = np.cumsum(plan.durations, axis=-1)
+        inner, end = knots[:, :-1], knots[:, -1:]
+        index = np.arange(number)
+        ahead = (inner > time[:, None]).sum(axis=-1, keepdims=True)
+        kept = np.take_along_axis(inner, np.minimum(index + number - ahead, number - 1), axis=-1)
+        since = np.minimum(np.maximum(time[:, None], inner[:, -1:] if number else 0.0), end)
+        filled = since + (end - since) * (index - ahead + 1) / (number - ahead + 1)
+        return np.where(index < ahead, kept, filled)
+
+    def revise(self, default: NominalPlan, plan: MovingPlan, actions: Float) -> tuple[MovingPlan, Bool]:
+        """Plans for actions, and where the one under way is kept: on a zero action, or shortly before its goal.
+
+        Args:
+            default: What the actions change.
+            plan: Under way.
+            actions: Shape (N, m), in [-1, 1].
+        """
+        zero = (actions == 0.0).all(axis=-1)
+        near = (default.remaining > 0.0) & (default.remaining < self.least_remaining)
+        keep = default.begun & ~default.changed & (zero | near)
+        revised = MovingPlan(*(part.copy() for part in plan))
+        first, later = np.flatnonzero(~default.begun), np.flatnonzero(default.begun & ~keep)
+        if first.size:
+            place, goal = default.state.position[first], default.goal[first]
+            revised.put(first, MovingPlan.of(self.layout.decode(actions[first], place, goal)))
+        if later.size:
+            revised.put(later, self._revised(NominalPlan(*_taken(default, later)), actions[later]))
+        return revised, keep
+
+    def _revised(self, default: NominalPlan, actions: Float) -> MovingPlan:
+        layout, state = self.layout, default.state
+        d, number = layout.dimension, layout.n_via
+        axes = frame(self._line(default))
+        scale = np.array(layout.via_scale[:d])
+        offsets = actions[:, : number * d].reshape(len(actions), number, d) * scale
+        vias = default.vias + sum(offsets[..., i : i + 1] * axis[:, None] for i, axis in enumerate(axes))
+        low, high = layout.duration_range
+        factor = (high / low) ** (0.5 * actions[:, number * d])
+        remaining = np.maximum(default.remaining, self.least_remaining)
+        duration = np.clip(remaining * factor, self.least_remaining, np.maximum(remaining, high))
+        points = np.concatenate((state.position[:, None], vias, default.goal[:, None]), axis=1)
+        plan = timed(points, duration, state)
+        zero = (actions == 0.0).all(axis=-1)[
+            :, None
+        ]  # the default itself: its via-points are evenly spaced in time
+        even = np.broadcast_to(duration[:, None] / (number + 1), plan.durations.shape)
+        return plan._replace(durations=np.where(zero, even, plan.durations))
+
+    @staticmethod
+    def _line(default: NominalPlan) -> Float:
+        """Along which offsets are measured: from the hand to the goal; where it is there, from the start."""
+        line = default.goal - default.state.position
+        for other in (default.goal - default.start, np.eye(1, line.shape[-1])):
+            line = np.where((norm(line) < MIN_GOAL_DISTANCE)[:, None], other, line)
+        return line
+
+
+def timed(waypoints: Float, duration: Float, state: Motion) -> MovingPlan:
+    """The plan through waypoints, from a state, with the passage times of least jerk."""
+    durations = primitives.passage_durations(
+        waypoints, duration, start_velocity=state.velocity, start_acceleration=state.acceleration
+    )
+    return MovingPlan(waypoints, durations, state.velocity, state.acceleration)
+
+
+def _taken(default: NominalPlan, rows: NDArray[np.int64]) -> list[Any]:
+    return [
+        Motion(*(part[rows] for part in field)) if isinstance(field, Motion) else field[rows]
+        for field in default
+    ]

@@ -1,0 +1,178 @@
+"""From an action of every control step to the reference that the hand follows.
+
+The action is a velocity. A critically damped filter of the second order makes a smooth reference of it: position,
+velocity and acceleration are continuous, so jerk is finite and its cost can be compared with that of planned movements.
+
+    v'' = w^2 (u - v) - 2 w v'
+
+With u held over a control step the solution is known, so one step of N references is a few multiplications.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.via_points import frame
+
+Float = NDArray[np.float64]
+
+AXES = ("along", "across", "above")
+STEP_TOLERANCE = 1e-6
+"""Relative difference that numbers of single precision may make."""
+
+
+class Motion(NamedTuple):
+    """Where N references are, shape (N, ..., D) each."""
+
+    position: Float
+    """[m]."""
+    velocity: Float
+    """[m/s]."""
+    acceleration: Float
+    """[m/s^2]."""
+
+    @classmethod
+    def at_rest(cls, position: Float) -> Motion:
+        """References that rest at `position`, shape (N, D), [m]."""
+        return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
+
+    def put(self, rows: Any, other: Motion) -> None:
+        """Overwrite the references at `rows`."""
+        for mine, theirs in zip(self, other, strict=True):
+            mine[rows] = theirs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steering:
+    """What the components of a step-wise action mean, and what becomes of them.
+
+    An action is the velocity wanted of the hand, in the frame of start and goal, as a fraction of `top_speed`. The zero
+    action brings the hand to rest.
+    """
+
+    dimension: int = 2
+    """Spatial dimension D."""
+    control_step: float = 0.04
+    """Time for which an action holds, [s]."""
+    timestep: float = 0.002
+    """Of the physics, [s]."""
+    top_speed: float = 1.5
+    """Velocity that an action of 1 stands for, [m/s]."""
+    bandwidth: float = 25.0
+    """Of the filter, w, [rad/s]: a new velocity is nine tenths there after 0.16 s."""
+
+    def __post_init__(self) -> None:
+        """Refuse a control step that is no multiple of the physics step."""
+        given: Any = self.control_step
+        number = isinstance(given, Real) and not isinstance(given, bool)
+        value = float(given) if number else 0.0
+        steps = value / self.timestep
+        if not (
+            1.0 - STEP_TOLERANCE <= steps <= 500.0 * (1.0 + STEP_TOLERANCE)
+            and abs(steps - round(steps)) < STEP_TOLERANCE * steps
+        ):
+            raise ValueError(
+                f"control_step must be 1 to 500 physics steps of {self.timestep} s, got {given!r}"
+            )
+        exact = round(steps) * self.timestep
+        # A number of single precision stands for the multiple that it is nearest to.
+        object.__setattr__(self, "control_step", value if abs(value - exact) < 1e-12 else exact)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the components, in order."""
+        return AXES[: self.dimension]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """What an action of 1 in each component stands for."""
+        return (f"{self.top_speed:g} m/s",) * self.dimension
+
+    @property
+    def size(self) -> int:
+        """Number of components, D."""
+        return self.dimension
+
+    @property
+    def physics_steps(self) -> int:
+        """Of a control step, S."""
+        return round(self.control_step / self.timestep)
+
+    @property
+    def greatest(self) -> tuple[float, float]:
+        """Bounds of the reference's speed [m/s] and acceleration [m/s^2] along any axis of the world.
+
+        The filter's response to a short push never changes sign, so no component exceeds `top_speed`; that of its
+        rate is up to w / e twice.
+        """
+        speed = self.top_speed * float(np.sqrt(self.dimension))
+        return speed, 2.0 * speed * self.bandwidth / float(np.e)
+
+    def decode(self, action: Float, start: Float, goal: Float) -> Float:
+        """The velocity that an action stands for, shape (N, D), [m/s]."""
+        axes = frame(goal - start)
+        return np.asarray(
+            self.top_speed * sum(action[..., i : i + 1] * axis for i, axis in enumerate(axes)), dtype=float
+        )
+
+    def encode(self, velocity: Float, start: Float, goal: Float) -> Float:
+        """The action that stands for a velocity: the inverse of :meth:`decode`."""
+        axes = frame(goal - start)
+        return np.stack([(velocity * axis).sum(axis=-1) for axis in axes], axis=-1) / self.top_speed
+
+    def follow(self, motion: Motion, wanted: Float) -> Motion:
+        """References over one control step, shape (N, S + 1, D): at its beginning and after each physics step.
+
+        Args:
+            motion: At the beginning, shape (N, D) each.
+            wanted: Velocity, shape (N, D), [m/s].
+        """
+        return Motion(*(_combined(table, motion, wanted) for table in self._tables))
+
+    def jerk_cost(self, motion: Motion, wanted: Float) -> Float:
+        """Half the integral of the squared jerk over one control step, exact, shape (N,), [m^2/s^5]."""
+        jerk = _combined(self._jerk_table, motion, wanted)
+        each = (jerk * jerk).sum(axis=-1)
+        cost = np.zeros(len(each))
+        for k, weight in enumerate(self._quadrature[1]):  # one after the other: the same bits in any batch
+            cost += 0.5 * weight * each[:, k]
+        return cost
+
+    @functools.cached_property
+    def _quadrature(self) -> tuple[Float, Float]:
+        nodes, weights = np.polynomial.legendre.leggauss(12)
+        half = 0.5 * self.control_step
+        return half * (nodes + 1.0), half * weights
+
+    @functools.cached_property
+    def _tables(self) -> tuple[Float, Float, Float]:
+        """How position, velocity and acceleration depend on the step's beginning, shape (S + 1, 4) each."""
+        time = self.timestep * np.arange(self.physics_steps + 1)
+        w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
+        one, zero = np.ones_like(time), np.zeros_like(time)
+        slow, fast = (1.0 - decay) / w, (1.0 - decay * (1.0 + w * time)) / w**2
+        of_velocity, of_rate = slow + w * fast, fast
+        position = (one, of_velocity, of_rate, time - of_velocity)
+        velocity = (zero, (1.0 + w * time) * decay, time * decay, 1.0 - (1.0 + w * time) * decay)
+        rate = (zero, -(w**2) * time * decay, (1.0 - w * time) * decay, w**2 * time * decay)
+        return tuple(np.stack(columns, axis=-1) for columns in (position, velocity, rate))  # type: ignore[return-value]
+
+    @functools.cached_property
+    def _jerk_table(self) -> Float:
+        """How jerk at the nodes of the quadrature depends on the step's beginning, shape (12, 4)."""
+        time, w = self._quadrature[0], self.bandwidth
+        decay = np.exp(-w * time)
+        of_velocity = -(w**2) * (1.0 - w * time) * decay
+        return np.stack((0.0 * time, of_velocity, (w * time - 2.0) * w * decay, -of_velocity), axis=-1)
+
+
+def _combined(table: Float, motion: Motion, wanted: Float) -> Float:
+    """What a table makes of position, velocity, acceleration and wanted velocity, shape (N, rows, D)."""
+    parts = (*motion, wanted)
+    return np.asarray(sum(table[:, k, None] * part[:, None] for k, part in enumerate(parts)))

@@ -1,0 +1,304 @@
+"""From an action to via-points and durations, and back."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint import primitives
+from viapoint.envs.common.arrays import namespace_of
+
+MIN_GOAL_DISTANCE = 0.02
+"""Least distance between start and goal, [m]."""
+
+Array = Any
+Timing = Literal["optimal", "learned"]
+
+LOG_SPLIT = float(np.log(4.0))
+"""What an action of 1 adds to the log ratio of two neighbouring segments' durations: a factor of four."""
+
+
+SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
+"""Bounds of the duration range, [s]."""
+MOST_VIAS = 16
+"""Via-points of an action at most: more of them only say the same movement in more words."""
+
+
+class Plan(NamedTuple):
+    """A movement as a person would write it down."""
+
+    waypoints: Array
+    """Start, via-points and goal, shape (..., K + 2, D), [m]."""
+    durations: Array
+    """Of the segments between them, shape (..., K + 1), [s]."""
+
+    def take(self, rows: Any) -> Plan:
+        """The movements at `rows`, an index, slice or mask."""
+        return Plan(self.waypoints[rows], self.durations[rows])
+
+    def trajectory(self) -> primitives.Trajectory:
+        """The minimum-jerk movement through the waypoints."""
+        return primitives.through(self.waypoints, self.durations)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionLayout:
+    """What each component of an action means.
+
+    An action is a vector in [-1, 1]^m: for each of K via-points its offset from the k-th of K evenly spaced points of
+    the straight line, in the frame of start and goal; then the duration; then, with `timing="learned"`, how it is
+    split between the segments. The zero action is the straight minimum-jerk movement.
+    """
+
+    dimension: int = 2
+    """Spatial dimension D."""
+    n_via: int = 1
+    """Number of via-points K, 0 to :data:`MOST_VIAS`."""
+    timing: Timing = "optimal"
+    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: the action says."""
+    duration_range: tuple[float, float] = (0.6, 1.2)
+    """Shortest and longest total duration, [s]; an action of 0 is their geometric mean."""
+    via_scale: tuple[float, ...] = (0.15, 0.25, 0.25)
+    """Largest offset along, across and above the straight line, [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        if self.dimension not in (2, 3):
+            raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
+        whole = isinstance(self.n_via, int | np.integer) and not isinstance(self.n_via, bool)
+        if not (whole and 0 <= self.n_via <= MOST_VIAS):
+            raise ValueError(f"n_via must be a whole number, 0 to {MOST_VIAS}, got {self.n_via!r}")
+        if self.timing not in get_args(Timing):
+            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
+        check_increasing_pair("duration_range", self.duration_range)
+        if not SHORTEST_DURATION <= self.duration_range[0] < self.duration_range[1] <= LONGEST_DURATION:
+            raise ValueError(
+                f"duration_range must lie within {SHORTEST_DURATION} to {LONGEST_DURATION} s, "
+                f"got {self.duration_range!r}"
+            )
+        self._check_scale()
+        low, high = self.duration_range
+        object.__setattr__(self, "duration_range", (float(low), float(high)))
+
+    @property
+    def size(self) -> int:
+        """Number of components m."""
+        return len(self.names)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the components, in order."""
+        axes = ("along", "across", "above")[: self.dimension]
+        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in axes]
+        splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
+        return (*vias, "duration", *splits)
+
+    @functools.cached_property
+    def units(self) -> tuple[str, ...]:
+        """What an action of 1 in each component stands for."""
+        scale = [f"{s:g} m" for s in self.via_scale[: self.dimension]] * self.n_via
+        low, high = self.duration_range
+        splits = ["factor 4 between the segments before and after"] * (
+            self.n_via if self.timing == "learned" else 0
+        )
+        return (*scale, f"factor {(high / low) ** 0.5:.4g} on {self.centre_duration:.4g} s", *splits)
+
+    @property
+    def centre_duration(self) -> float:
+        """Duration of the zero action, [s]."""
+        low, high = self.duration_range
+        return float((low * high) ** 0.5)
+
+    @functools.cached_property
+    def _straight_split(self) -> tuple[float, ...]:
+        """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""
+        waypoints = np.linspace(0.0, 1.0, self.n_via + 2)[:, None]
+        durations = primitives.passage_durations(waypoints, np.asarray(1.0))
+        return tuple(float(r) for r in np.diff(np.log(durations)))
+
+    def decode(self, action: Array, start: Array, goal: Array) -> Plan:
+        """The movement that an action stands for.
+
+        Args:
+            action: Shape (..., m), in [-1, 1].
+            start: Shape (..., D), [m].
+            goal: Shape (..., D), [m], apart from the start.
+
+        Raises:
+            ValueError: One of them has another shape.
+        """
+        action, start, goal = _arrays(action, start, goal)
+        self._check_shapes(action.shape, start.shape, goal.shape)
+        xp = namespace_of(action)
+        line = goal - start
+        axes = frame(line)
+        ends = self.n_via * self.dimension
+        waypoints = [start]
+        for k in range(self.n_via):
+            via = start + line * ((k + 1) / (self.n_via + 1))
+            for i, axis in enumerate(axes):
+                component = k * self.dimension + i
+                via = via + axis * (action[..., component : component + 1] * self.via_scale[i])
+            waypoints.append(via)
+        waypoints.append(goal)
+        duration = self.centre_duration * xp.exp(action[..., ends] * self._log_half_range)
+        points = xp.stack(waypoints, axis=-2)
+        return Plan(points, self._durations(points, duration, action[..., ends + 1 :]))
+
+    def encode(self, plan: Plan) -> Array:
+        """The action that stands for a movement: the inverse of :meth:`decode`.
+
+        Components outside [-1, 1] say that the movement lies outside the action space.
+
+        Raises:
+            ValueError: The movement has another dimension or another number of via-points.
+        """
+        waypoints, durations = _arrays(*plan)
+        rows = (self.n_via + 2, self.dimension)
+        if waypoints.shape[-2:] != rows:
+            raise ValueError(
+                f"waypoints must have shape (..., {rows[0]}, {rows[1]}), start, {self.n_via} via-points and goal, "
+                f"got {tuple(waypoints.shape)}"
+            )
+        wanted = (*waypoints.shape[:-2], self.n_via + 1)
+        if durations.shape != wanted:
+            raise ValueError(
+                f"durations must have shape {wanted}, one for each segment, got {tuple(durations.shape)}"
+            )
+        xp = namespace_of(waypoints)
+        start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
+        line = goal - start
+        components = []
+        for k in range(self.n_via):
+            offset = waypoints[..., k + 1, :] - (start + line * ((k + 1) / (self.n_via + 1)))
+            components += [
+                xp.sum(offset * a, axis=-1) / s for a, s in zip(frame(line), self.via_scale, strict=False)
+            ]
+        total = xp.sum(durations, axis=-1)
+        components.append(xp.log(total / self.centre_duration) / self._log_half_range)
+        if self.timing == "learned":
+            ratios = xp.log(durations[..., 1:] / durations[..., :-1])
+            components += [(ratios[..., k] - r) / LOG_SPLIT for k, r in enumerate(self._straight_split)]
+        return xp.stack(components, axis=-1)
+
+    def _check_scale(self) -> None:
+        try:
+            scale = tuple(float(each) for each in self.via_scale)
+        except (TypeError, ValueError):
+            scale = ()
+        if len(scale) < self.dimension or not all(0.0 < each < float("inf") for each in scale):
+            raise ValueError(
+                f"via_scale must be {self.dimension} positive finite numbers, got {self.via_scale!r}"
+            )
+
+    def _check_shapes(self, action: tuple[int, ...], start: tuple[int, ...], goal: tuple[int, ...]) -> None:
+        """Refuse what would be read as something else; numbers are not looked at, as a graph of tensors has none."""
+        if action[-1:] != (self.size,):
+            raise ValueError(
+                f"action must have shape (..., {self.size}) ({', '.join(self.names)}), got {tuple(action)}"
+            )
+        if start[-1:] != (self.dimension,) or goal != start:
+            raise ValueError(
+                f"start and goal must both have shape (..., {self.dimension}), got {tuple(start)} and {tuple(goal)}"
+            )
+        if action[:-1] != start[:-1]:
+            raise ValueError(
+                f"there must be a start and a goal for each action: actions have shape {tuple(action)}, "
+                f"starts {tuple(start)}"
+            )
+
+    @property
+    def _log_half_range(self) -> float:
+        low, high = self.duration_range
+        return float(np.log(high / low) / 2.0)
+
+    def _durations(self, waypoints: Array, duration: Array, split: Array) -> Array:
+        if self.timing == "optimal":
+            return primitives.passage_durations(waypoints, duration)
+        xp = namespace_of(waypoints)
+        logs = [xp.zeros_like(duration)]
+        for k, ratio in enumerate(self._straight_split):
+            logs.append(logs[-1] + ratio + LOG_SPLIT * split[..., k])
+        shares = xp.exp(xp.stack(logs, axis=-1))
+        return duration[..., None] * shares / xp.sum(shares, axis=-1, keepdims=True)
+
+
+def frame(line: Array) -> list[Array]:
+    """Unit vectors along a line, across it (to its left, horizontal) and above it, each of shape (..., D).
+
+    In space a vertical line has no left; the x axis stands in.
+    """
+    xp = namespace_of(line)
+    along = line / xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
+    x, y = along[..., 0], along[..., 1]
+    if line.shape[-1] == 2:
+        return [along, xp.stack((-y, x), axis=-1)]
+    level = xp.sqrt(x * x + y * y)
+    vertical = level < 1e-9
+    safe = xp.where(vertical, xp.ones_like(level), level)
+    zero = xp.zeros_like(level)
+    left_x = xp.where(vertical, xp.ones_like(level), -y / safe)
+    left_y = xp.where(vertical, zero, x / safe)
+    across = xp.stack((left_x, left_y, zero), axis=-1)
+    z = along[..., 2]
+    above = xp.stack((-z * left_y, z * left_x, x * left_y - y * left_x), axis=-1)
+    return [along, across, above]
+
+
+def _arrays(*values: Array) -> tuple[Array, ...]:
+    """Arrays and tensors as they are, anything else as an array of numbers."""
+    if all(hasattr(value, "shape") for value in values):
+        return values
+    try:
+        return tuple(v if hasattr(v, "shape") else np.asarray(v, dtype=np.float64) for v in values)
+    except (TypeError, ValueError):
+        raise ValueError(f"actions, places and durations must be arrays of numbers, got {values!r}") from None
+
+
+def check_increasing_pair(name: str, pair: Any) -> None:
+    """Refuse anything but two positive finite numbers in increasing order."""
+    try:
+        low, high = pair
+    except (TypeError, ValueError):
+        low = high = None
+    if not all(isinstance(value, Real) and not isinstance(value, bool) for value in (low, high)):
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
+    if not (0.0 < low < high < float("inf")):
+        raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
+
+
+Float = NDArray[np.float64]
+
+
+MAX_START_OFFSET = 1e-3
+"""How far from the hand a plan may begin at most, [m]."""
+
+
+def checked_plan(plan: Plan, start: Float) -> Plan:
+    """Movements that begin where the hands are, shape (N, D), [m]."""
+    try:
+        waypoints, durations = (np.asarray(part, dtype=np.float64) for part in plan)
+    except (TypeError, ValueError):
+        raise ValueError(f"plan must be waypoints and durations, got {plan!r}") from None
+    number, dimension = start.shape
+    if waypoints.ndim != 3 or waypoints.shape[::2] != start.shape or waypoints.shape[1] < 2:
+        raise ValueError(
+            f"plan must have waypoints of shape ({number}, K + 2, {dimension}), got {waypoints.shape}"
+        )
+    if durations.shape != (number, waypoints.shape[1] - 1):
+        raise ValueError(
+            f"plan must have durations of shape {(number, waypoints.shape[1] - 1)}, got {durations.shape}"
+        )
+    away = np.sqrt(((waypoints[:, 0] - start) ** 2).sum(axis=-1))
+    if (away > MAX_START_OFFSET).any():
+        env = int((away > MAX_START_OFFSET).argmax())
+        raise ValueError(
+            f"plan {env} must begin where the hand is, at {start[env]} m, got {waypoints[env, 0]} m, "
+            f"{away[env]:.4f} m from there"
+        )
+    return Plan(waypoints, durations)

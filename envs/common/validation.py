@@ -1,0 +1,114 @@
+"""Arguments at the border: what is refused, and why."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """A whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+    return int(value)
+
+
+def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments as they are now, whatever becomes of a caller's lists and mappings."""
+    return {
+        name: copy.copy(value) if isinstance(value, Mapping | list) else value
+        for name, value in arguments.items()
+    }
+
+
+def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
+    """An exact number or (fewest, most) as the pair."""
+    pair = (number, number) if isinstance(number, int | np.integer) else number
+    try:
+        fewest, most = pair
+        return whole_number(name, fewest, 0), whole_number(name, most, 0)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a whole number or (fewest, most), got {number!r}") from None
+
+
+def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> float:
+    """A finite real number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < np.inf:
+        raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
+    return float(value)
+
+
+def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Refuse keyword arguments that there are not, with those that there are beside the number of environments."""
+    if unknown:
+        allowed = [name for name in known if name not in ("num_envs", "unknown", "return")]
+        raise TypeError(
+            f"unknown keyword argument {', '.join(map(repr, sorted(unknown)))}; allowed are {', '.join(allowed)}"
+        )
+
+
+def reset_options(options: Any) -> dict[str, Any]:
+    """A copy of what `reset(options=...)` was given."""
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
+    return dict(options or {})
+
+
+def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
+    """The environments that a reset mask names; without a mask, all."""
+    if mask is None:
+        return np.arange(num_envs)
+    mask = np.asarray(mask)
+    if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
+        raise ValueError(
+            f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}"
+        )
+    if not running and not mask.all():
+        raise ValueError("options['reset_mask'] must name every environment at the first reset")
+    return np.flatnonzero(mask)
+
+
+def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """An action, or many, as an array; `shape` is the one that is wanted, and only said where these are no numbers."""
+    try:
+        given = np.asarray(actions)
+    except (TypeError, ValueError):  # rows of different lengths, say
+        raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}") from None
+    if given.dtype.kind not in "fiu":
+        raise ValueError(f"action must be real numbers of shape {shape}, got {given.dtype}: {actions!r}")
+    return given
+
+
+def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
+    """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
+    shape = (num_envs, len(names))
+    array = real_numbers(actions, shape).astype(np.float64, copy=False)
+    if array.shape != shape:
+        raise ValueError(f"action must have shape {shape} ({', '.join(names)}), got {array.shape}")
+    if not np.isfinite(array).all():
+        env, component = np.argwhere(~np.isfinite(array))[0]
+        value = array[env, component]
+        raise ValueError(f"action must be finite, got {value} for {names[component]} of environment {env}")
+    return np.clip(array, -1.0, 1.0)
+
+
+def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """A seed for each environment: `seed + i`, `seed[i]`, or None."""
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, np.ndarray) and not seed.ndim:
+        seed = seed.item()
+    if not isinstance(seed, Sequence | np.ndarray):
+        first = whole_number("seed", seed, 0)
+        return [first + i for i in range(num_envs)]
+    seeds = [None if s is None else whole_number("seed", s, 0) for s in cast("Sequence[Any]", seed)]
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed must be a whole number or {num_envs} of them, got {len(seeds)}")
+    return seeds

@@ -1,0 +1,1 @@
+"""Distances between arms and obstacles."""

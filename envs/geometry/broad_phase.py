@@ -1,0 +1,65 @@
+"""How near balls may be to obstacles: bounds that are quick to compute, so that few distances need be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Single = NDArray[np.float32]
+
+CACHED = 48_000
+"""Bounds that are computed together: few enough for the cache."""
+BOUND_ROUNDING = np.float32(4e-6)
+"""More than what rounding adds to a squared distance of places within NEAR of the origin, [m^2]."""
+NEAR = np.float32(2.0)
+"""Where places are expected; rounding grows with the square of their distance from the origin, [m]."""
+
+
+def lift_quadratic(places: Single) -> Single:
+    """Places p as (p, |p|^2, 1), of which squared distances are linear functions: shape (N, 5, P) from (N, 3, P)."""
+    points = np.empty((len(places), 5, *places.shape[2:]), np.float32)
+    points[:, :3], points[:, 4] = places, 1.0
+    np.add.reduce(places * places, axis=1, out=points[:, 3])
+    return points
+
+
+def ball_bounds(points: Single, radii: Single, obstacles: NDArray[np.floating]) -> Single:
+    """No more than the clearances of balls from obstacles, shape (N, n, P), [m]; far away where there is none.
+
+    The squared distance of p from the segment c + t a, -1 <= t <= 1, is |p - c|^2 - t (2 s - t) |a|^2 with
+    s = (p - c) . a / |a|^2 and t = s, no farther out than the ends. Both |p - c|^2 and s are linear in (p, |p|^2, 1),
+    so they come from one product of matrices for each scene.
+
+    Args:
+        points: Centres of P balls in each of N scenes, :func:`lift_quadratic`, shape (N, 5, P).
+        radii: Shape (P,) or (N, P), [m].
+        obstacles: Shape (N, n, 7), [m]; those without a radius are none.
+    """
+    (number, rows), places = obstacles.shape[:2], points.shape[2]
+    farthest = max(float(np.sqrt(points[:, 3].max(initial=0.0))), np.abs(obstacles[..., :6]).max(initial=0.0))
+    rounding = BOUND_ROUNDING * max(np.float32(1.0), np.square(np.float32(farthest) / NEAR))
+    parts = np.moveaxis(obstacles, -1, 0).astype(np.float32, order="C")
+    centre, axis = parts[:3], parts[3:6]
+    square = np.add.reduce(axis * axis)
+    share = axis / np.maximum(square, np.float32(1e-12))
+    one, zero = np.ones_like(square), np.zeros_like(square)
+    apart = np.stack((*(-2.0 * centre), one, np.add.reduce(centre * centre) - rounding), axis=-1)
+    along = np.stack((*share, zero, -np.add.reduce(centre * share)), axis=-1)
+    around = np.broadcast_to(radii, (number, places))[:, None]
+    square, least = square[..., None], np.where(parts[6] > 0.0, parts[6], np.float32(-np.inf))[..., None]
+    bounds = np.empty((number, rows, places), np.float32)
+    several = max(CACHED // max(rows * places, 1), 1)
+    for some in (slice(first, first + several) for first in range(0, number, several)):
+        squared = np.matmul(apart[some], points[some], out=bounds[some])
+        where = np.matmul(along[some], points[some])
+        inside = np.clip(where, np.float32(-1.0), np.float32(1.0))
+        where += where
+        where -= inside
+        where *= inside
+        where *= square[some]
+        squared -= where
+        np.clip(squared, np.float32(0.0), np.float32(np.inf), out=squared)
+        np.sqrt(squared, out=squared)
+        squared -= around[some]
+        squared -= least[some]
+    return bounds

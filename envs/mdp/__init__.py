@@ -1,0 +1,1 @@
+"""Observations, rewards and task definitions."""

@@ -1,0 +1,157 @@
+"""Observations of all tasks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.replanning import NominalPlan
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
+from viapoint.envs.scenes.scene import LARGEST_HALF_AXIS, LARGEST_RADIUS, Scenes
+
+Array = Any
+
+FARTHEST = 1.0
+"""Bound of every coordinate, [m]."""
+BEYOND_LIMIT = 0.1
+"""How far a joint may be pushed past its limit before the observation clips it, [rad]."""
+
+
+class ObstacleRows(NamedTuple):
+    """The obstacles of an observation by name, shape (..., n, .) each, [m]; absent rows are zero."""
+
+    centre: Array
+    half_axis: Array
+    radius: Array
+    present: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationLayout:
+    """Names, sizes, bounds and units of the observation's parts.
+
+    `hand` and `goal` [m], `joints` [rad] and, where there may be obstacles, `obstacles`: n rows of centre (D),
+    half-axis vector (D) and radius [m] and a 1 for present, flattened. The rows are in random order.
+    """
+
+    dimension: int
+    joint_range: tuple[tuple[float, float], ...]
+    n_rows: int
+
+    @classmethod
+    def of(cls, arm: Arm, n_rows: int) -> ObservationLayout:
+        """The layout for an arm and at most `n_rows` obstacles."""
+        return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows)
+
+    @property
+    def row_size(self) -> int:
+        """Numbers of one obstacle."""
+        return 2 * self.dimension + 2
+
+    def space(self) -> spaces.Dict:
+        """The observation space of one environment."""
+        point = np.full(self.dimension, FARTHEST)
+        low, high = (np.array(side) for side in zip(*self.joint_range, strict=True))
+        bounds = {
+            "hand": (-point, point),
+            "goal": (-point, point),
+            "joints": (low - BEYOND_LIMIT, high + BEYOND_LIMIT),
+        }
+        if self.n_rows:
+            half = np.full(self.dimension, LARGEST_HALF_AXIS)
+            row = np.concatenate((point, half, [LARGEST_RADIUS, 1.0]))
+            lowest = np.concatenate((-point, -half, [0.0, 0.0]))
+            bounds["obstacles"] = (np.tile(lowest, self.n_rows), np.tile(row, self.n_rows))
+        return spaces.Dict(
+            {
+                name: spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+                for name, (low, high) in bounds.items()
+            }
+        )
+
+    def observe(
+        self, joints: NDArray[np.float64], hand: NDArray[np.float64], scenes: Scenes
+    ) -> dict[str, NDArray[np.float32]]:
+        """Observations of N environments, shape (N, .) each, in fresh arrays."""
+        low, high = (np.array(side) for side in zip(*self.joint_range, strict=True))
+        parts: dict[str, Any] = {
+            "hand": np.clip(hand, -FARTHEST, FARTHEST),
+            "goal": scenes.goal,
+            "joints": np.clip(joints, low - BEYOND_LIMIT, high + BEYOND_LIMIT),
+        }
+        if self.n_rows:
+            rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1)
+            parts["obstacles"] = rows.reshape(len(rows), -1)
+        return {name: part.astype(np.float32) for name, part in parts.items()}
+
+    def obstacles(self, flat: Array) -> ObstacleRows:
+        """The `obstacles` part, shape (..., n (2 D + 2)), by name; a view, of NumPy arrays and torch tensors."""
+        rows = flat.reshape((*flat.shape[:-1], self.n_rows, self.row_size))
+        d = self.dimension
+        return ObstacleRows(rows[..., :d], rows[..., d : 2 * d], rows[..., 2 * d], rows[..., 2 * d + 1])
+
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+GREATEST_SPEED = 5.0
+"""Bound of the commanded velocity along any axis, [m/s]."""
+GREATEST_ACCELERATION = 100.0
+"""Bound of the commanded acceleration along any axis, [m/s^2]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineObservationLayout(ObservationLayout):
+    """The parts of a whole movement's observation, and what changes on the way; what lies in the future is hidden.
+
+    `hand` [m], `velocity` [m/s] and `acceleration` [m/s^2] are what is commanded, `goal` and `obstacles` the present
+    ones, `obstacle_velocities` n rows of D [m/s], flattened, `time_left` [s]; `via`, K rows of D [m], flattened, and
+    `remaining` [s] are the plan that a zero action leads to. What exceeds its bounds is clipped.
+    """
+
+    n_via: int
+    time_limit: float
+
+    def space(self) -> spaces.Dict:
+        """The observation space of one environment."""
+        d = self.dimension
+        sides = {
+            "velocity": (-GREATEST_SPEED, GREATEST_SPEED, d),
+            "acceleration": (-GREATEST_ACCELERATION, GREATEST_ACCELERATION, d),
+            "obstacle_velocities": (-FASTEST, FASTEST, self.n_rows * d),
+            "time_left": (0.0, self.time_limit, 1),
+            "via": (-FARTHEST, FARTHEST, self.n_via * d),
+            "remaining": (0.0, self.time_limit, 1),
+        }
+        boxes = {name: spaces.Box(low, high, (n,), np.float32) for name, (low, high, n) in sides.items() if n}
+        return spaces.Dict({**super().space().spaces, **boxes})
+
+    def online(self, joints: Float, scenes: ChangingScenes, default: NominalPlan, time: Float) -> Observation:
+        """Observations of N environments, shape (N, .) each, in fresh arrays.
+
+        Args:
+            joints: Shape (N, J), [rad].
+            scenes: N of them.
+            default: What N hands do on a zero action.
+            time: Since the start, shape (N,), [s].
+        """
+        now = scenes.at(time)
+        d, number = self.dimension, len(time)
+        now.obstacles[..., :d] = np.clip(now.obstacles[..., :d], -FARTHEST, FARTHEST)
+        seen = self.observe(joints, default.state.position, now)
+        parts = {
+            "velocity": np.clip(default.state.velocity, -GREATEST_SPEED, GREATEST_SPEED),
+            "acceleration": np.clip(
+                default.state.acceleration, -GREATEST_ACCELERATION, GREATEST_ACCELERATION
+            ),
+            "obstacle_velocities": scenes.velocities(time).reshape(number, -1),
+            "time_left": np.clip(self.time_limit - time, 0.0, self.time_limit)[:, None],
+            "via": np.clip(default.vias, -FARTHEST, FARTHEST).reshape(number, -1),
+            "remaining": np.clip(default.remaining, 0.0, self.time_limit)[:, None],
+        }
+        return {**seen, **{name: part.astype(np.float32) for name, part in parts.items() if part.shape[1]}}

@@ -1,0 +1,213 @@
+"""Rewards of all tasks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.outcome import Outcome
+
+Float = NDArray[np.float64]
+
+CLEARANCE_RANGE = (-0.05, 0.01)
+"""Clearance beyond which nothing more is lost or won, [m]."""
+CLEARANCE_UNIT = 0.05
+"""[m]."""
+GOAL_ERROR_UNIT = 0.1
+"""Goal error at which all is lost, [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeights:
+    """How much each term counts, 0 or more."""
+
+    success: float = 1.0
+    """+ 1[success]."""
+    collision: float = 0.5
+    """- 1[contact at any physics step]."""
+    clearance: float = 0.5
+    """+ clip(planned_clearance, -0.05 m, 0.01 m) / 0.05 m; the plan's, as a crash ends at the surface."""
+    goal_error: float = 0.5
+    """- min(goal_error / 0.1 m, 1)."""
+    smoothness: float = 0.1
+    """- log(jerk cost / jerk cost of the zero action), never less than 0 for the same duration."""
+    duration: float = 0.5
+    """- (duration / duration of the zero action - 1)."""
+
+    def __post_init__(self) -> None:
+        """Refuse a weight that turns its term round."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) < np.inf:
+                raise ValueError(
+                    f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}"
+                )
+
+    @classmethod
+    def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:
+        """Weights from a record, from a mapping of some of them, or the defaults.
+
+        Raises:
+            ValueError: It is something else, or has terms that there are not.
+        """
+        if weights is not None and not isinstance(weights, RewardWeights | Mapping):
+            raise ValueError(f"reward_weights must be a mapping of names to numbers, got {weights!r}")
+        given = dict(vars(weights) if isinstance(weights, RewardWeights) else weights or {})
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(repr(name) for name in given if name not in known)
+        if unknown:
+            raise ValueError(f"reward_weights knows {', '.join(known)}, not {', '.join(unknown)}")
+        return weights if isinstance(weights, RewardWeights) else cls(**given)
+
+
+class RewardTerms(NamedTuple):
+    """The weighted terms, shape (N,) each; the reward is their sum."""
+
+    success: Float
+    collision: Float
+    clearance: Float
+    goal_error: Float
+    smoothness: Float
+    duration: Float
+
+    def total(self) -> Float:
+        """The reward, shape (N,): the terms added in order."""
+        return np.asarray(sum(self))
+
+    def as_info(self) -> dict[str, Any]:
+        """The terms as `reward_*`."""
+        return {f"reward_{name}": term for name, term in self._asdict().items()}
+
+
+def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeights) -> RewardTerms:
+    """The weighted terms of movements.
+
+    Every term is bounded, so that no movement outweighs all others. With the default weights any success is worth
+    more than any failure; and among movements of one shape the one of the centre duration is best: there a longer
+    one costs as much time as it saves jerk.
+
+    Args:
+        outcome: Of N movements.
+        centre_duration: Duration of the zero action, [s].
+        weights: Of the terms.
+    """
+    relative: Any = outcome.duration / centre_duration
+    log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
+    return RewardTerms(
+        success=np.multiply(weights.success, outcome.is_success, dtype=np.float64),
+        collision=np.multiply(-weights.collision, outcome.collision, dtype=np.float64),
+        clearance=weights.clearance * np.clip(outcome.planned_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
+        goal_error=-weights.goal_error * np.minimum(outcome.goal_error / GOAL_ERROR_UNIT, 1.0),
+        smoothness=-weights.smoothness * log_jerk,
+        duration=-weights.duration * (relative - 1.0),
+    )
+
+
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineRewardWeights(RewardWeights):
+    """How much each term counts, 0 or more."""
+
+    smoothness: float = 0.05
+    """- log(1 + jerk cost so far / jerk cost of the straight movement), less what was given before."""
+    duration: float = 0.2
+    """- time that the decision took / duration of the zero action."""
+
+
+def online_rewards(
+    before: Outcome,
+    after: Outcome,
+    elapsed: Float,
+    ended: Bool,
+    begun: Bool,
+    scenes: ChangingScenes,
+    centre_duration: float,
+    weights: RewardWeights,
+) -> RewardTerms:
+    """The weighted terms of one decision of N episodes.
+
+    Over an episode clearance and smoothness sum to what they are of all that was commanded, the duration to its time.
+
+    Args:
+        before: The decision.
+        after: It.
+        elapsed: Time that it took, shape (N,), [s].
+        ended: Whether the episode ended in it, shape (N,).
+        begun: Whether it is the episode's first.
+        scenes: N of them.
+        centre_duration: Duration of the zero action, [s].
+        weights: Of the terms.
+    """
+    low, high = CLEARANCE_RANGE
+    kept, lost = (np.clip(each.planned_clearance, low, high) / CLEARANCE_UNIT for each in (after, before))
+    straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / centre_duration**5  # half of 720 A^2/T^5
+    rough = np.log1p(after.jerk_cost / straight) - np.log1p(before.jerk_cost / straight)
+    far = np.minimum(after.goal_error / GOAL_ERROR_UNIT, 1.0)
+    return RewardTerms(
+        success=np.where(after.is_success, weights.success, 0.0),
+        collision=np.where(after.collision, -weights.collision, 0.0),
+        clearance=weights.clearance * (kept - np.where(begun, 0.0, lost)),
+        goal_error=np.where(ended, -weights.goal_error * far, 0.0),
+        smoothness=-weights.smoothness * rough,
+        duration=-weights.duration * elapsed / centre_duration,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepRewardWeights(RewardWeights):
+    """How much each term counts, 0 or more: those of a whole movement, and one for every step of it."""
+
+    progress: float = 1.0
+    """+ how much nearer the goal, as a share of the distance at the start."""
+
+
+def step_rewards(
+    before: Outcome,
+    after: Outcome,
+    ended: NDArray[np.bool_],
+    begun: NDArray[np.bool_],
+    scenes: Scenes,
+    centre_duration: float,
+    weights: StepRewardWeights,
+) -> tuple[RewardTerms, Float]:
+    """The weighted terms of one control step of N episodes, and that of its progress.
+
+    Over an episode the terms of a success sum to those of a whole movement with the same outcome, and the progress to
+    its weight. Clearance and goal error are given when they change, the others at the end; smoothness and duration
+    count where the hand arrived only, as a movement that ends early would seem the smoothest and quickest.
+
+    Args:
+        before: The step.
+        after: It.
+        ended: Whether the episode ended in it, shape (N,).
+        begun: Whether it is the episode's first.
+        scenes: N of them.
+        centre_duration: Duration of the zero action of a whole movement, [s].
+        weights: Of the terms.
+    """
+    whole = reward_terms(after, centre_duration, weights)
+    low, high = CLEARANCE_RANGE
+    lost = weights.clearance * np.clip(before.planned_clearance, low, high) / CLEARANCE_UNIT
+    far = -weights.goal_error * np.minimum(before.goal_error / GOAL_ERROR_UNIT, 1.0)
+    arrived = after.is_success
+    terms = RewardTerms(
+        success=np.where(ended, whole.success, 0.0),
+        collision=np.where(ended, whole.collision, 0.0),
+        clearance=whole.clearance - np.where(begun, 0.0, lost),
+        goal_error=whole.goal_error - np.where(begun, 0.0, far),
+        smoothness=np.where(ended & arrived, whole.smoothness, 0.0),
+        duration=np.where(ended & arrived, whole.duration, 0.0),
+    )
+    distance = norm(scenes.goal - scenes.start)
+    return terms, np.asarray(weights.progress * (before.goal_error - after.goal_error) / distance)

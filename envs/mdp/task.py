@@ -1,0 +1,99 @@
+"""What a task is, apart from any episode of it: all that an agent may compute with before it has moved."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from viapoint.envs.actions.via_points import ActionLayout
+from viapoint.envs.arms import OF_ONES_OWN
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.mdp.observation import ObservationLayout
+from viapoint.envs.mdp.rewards import RewardWeights
+from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
+from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
+from viapoint.envs.scenes.planar_hard import ATTEMPTS, FAMILIES, ROWS, FamilyObstacles
+from viapoint.envs.scenes.sampler import Sampler, SceneSampler
+from viapoint.envs.scenes.spatial import SpaceSampler
+
+AnyDistribution = SceneDistribution | SpaceDistribution
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Arm, layouts, weights and scenes of an environment."""
+
+    arm: Arm
+    whole_arm: bool
+    action: ActionLayout
+    weights: RewardWeights
+    scenes: AnyDistribution
+
+    @property
+    def observation(self) -> ObservationLayout:
+        """The layout of the observation."""
+        return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
+
+    def sampler(self) -> Sampler:
+        """Draws scenes of the task."""
+        if isinstance(self.scenes, SpaceDistribution):
+            return SpaceSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
+        return SceneSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The task as plain values, fit for JSON."""
+        record = {name: dataclasses.asdict(getattr(self, name)) for name in ("action", "weights", "scenes")}
+        return {"arm": self.arm.name, "whole_arm": self.whole_arm, **record}
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any], arms: Mapping[str, Arm]) -> Task:
+        """The task that :meth:`as_dict` wrote down; its arm is one of `arms`.
+
+        Raises:
+            ValueError: The arm is not among them, or a value is not allowed.
+        """
+        arm = arms.get(record["arm"])
+        if arm is None:
+            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}; {OF_ONES_OWN}")
+        return cls(
+            arm=arm,
+            whole_arm=bool(record["whole_arm"]),
+            action=ActionLayout(**_tuples(record["action"])),
+            weights=RewardWeights(**record["weights"]),
+            scenes=distribution_of(arm)(**_tuples(record["scenes"])),
+        )
+
+
+def distribution_of(arm: Arm) -> type[SceneDistribution] | type[SpaceDistribution]:
+    """What describes the scenes of an arm: of the plane, or of space."""
+    return SceneDistribution if arm.dimension == 2 else SpaceDistribution
+
+
+def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON knows lists only; the records hold tuples."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+
+
+def family_sampler(task: Task, family: str) -> Sampler:
+    """Return a sampler of one family of scenes, planar or spatial as the task.
+
+    Raises:
+        ValueError: There is no such family, or it takes more obstacles than the task has.
+    """
+    scenes = task.scenes
+    in_plane = isinstance(scenes, SceneDistribution)
+    names: Iterable[str] = FAMILIES if in_plane else SPACE_FAMILIES
+    if family not in names:
+        raise ValueError(f"family must be one of {', '.join(names)}, got {family!r}")
+    needed = ROWS if in_plane else SPACE_FAMILIES[family]
+    if scenes.n_obstacles[1] < needed:
+        raise ValueError(
+            f"{family} needs a task with up to {needed} obstacles, this one has {scenes.n_obstacles[1]} at most"
+        )
+    if not isinstance(scenes, SceneDistribution):
+        return dataclasses.replace(task, scenes=dataclasses.replace(scenes, families=(family,))).sampler()
+    placer = FamilyObstacles(task.arm, scenes, FAMILIES[family], whole_arm=task.whole_arm)
+    distribution = dataclasses.replace(scenes, n_obstacles=(1, ROWS))
+    return SceneSampler(task.arm, distribution, whole_arm=task.whole_arm, placer=placer, attempts=ATTEMPTS)

@@ -1,0 +1,114 @@
+"""Shapes added to a MuJoCo scene for the eye alone."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.common.palette import PALETTE, Colour
+
+Float = NDArray[np.float64]
+Geom = Any
+"""A shape in a scene."""
+Shape = mujoco.mjtGeom
+
+MATT, GLOWING = 0.0, 1.0
+"""How much of its colour a thing shows without light: lines are ink, things are lit."""
+VAULT = 0.4
+"""Height of a post's head relative to its radius."""
+
+
+class Pencil:
+    """Adds shapes to a scene until its room is used up."""
+
+    def __init__(self, scene: mujoco.MjvScene) -> None:
+        self._scene = scene
+
+    def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
+        """A sphere at `centre` (3,) [m]."""
+        self._add(Shape.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+
+    def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
+        """A flat cylinder that stands on `centre` (3,) [m]."""
+        middle = np.array([*centre[:2], centre[2] + height / 2.0])
+        self._add(Shape.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
+
+    def rod(
+        self, first: Float, second: Float, radius: float, colour: Colour, glow: float = MATT
+    ) -> Geom | None:
+        """A capsule from `first` (3,) to `second` (3,) [m]."""
+        geom = self._add(Shape.mjGEOM_CAPSULE, (radius,) * 3, first, colour, glow)
+        if geom is not None:
+            mujoco.mjv_connector(geom, Shape.mjGEOM_CAPSULE, radius, first, second)
+        return geom
+
+    def line(self, points: Float, radius: float, colour: Colour) -> None:
+        """A tube through `points` (n, 3) [m] that throws no shadow."""
+        for first, second in itertools.pairwise(points):
+            geom = self.rod(first, second, radius, colour, GLOWING)
+            if geom is not None:
+                geom.castshadow = False
+
+    def ring(self, centre: Float, radius: float, thickness: float, colour: Colour) -> None:
+        """A circle painted on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
+        self.disc(centre, radius, 0.001, colour, GLOWING)
+        self.disc(centre, radius - thickness, 0.002, PALETTE.table)
+
+    def post(self, foot: Float, top: float, radius: float, colour: Colour) -> None:
+        """An upright post with a vaulted head, from `foot` (3,) up to the height `top` [m]."""
+        vault = VAULT * radius
+        self.disc(foot, radius, top - vault - foot[2], colour)
+        head = np.array([*foot[:2], top - vault])
+        self._add(Shape.mjGEOM_ELLIPSOID, (radius, radius, vault), head, colour, MATT)
+
+    def wall(self, foot: Float, half_axis: Float, top: float, radius: float, colour: Colour) -> None:
+        """A rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
+        crest = top - radius
+        ends = foot - half_axis, foot + half_axis
+        for end in ends:
+            self.rod(end, np.array([*end[:2], crest]), radius, colour)
+        self.rod(np.array([*ends[0][:2], crest]), np.array([*ends[1][:2], crest]), radius, colour)
+        half = float(np.linalg.norm(half_axis))
+        along = half_axis / half
+        turn = np.stack((along, (-along[1], along[0], 0.0), (0.0, 0.0, 1.0)), axis=-1)
+        middle = np.array([*foot[:2], (foot[2] + crest) / 2.0])
+        self._add(Shape.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
+
+    def _add(
+        self,
+        kind: int,
+        size: tuple[float, ...],
+        centre: Float,
+        colour: Colour,
+        glow: float,
+        turn: Float | None = None,
+    ) -> Geom | None:
+        if self._scene.ngeom >= self._scene.maxgeom:
+            return None
+        geom = self._scene.geoms[self._scene.ngeom]
+        turn = np.eye(3) if turn is None else turn
+        lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, turn.flatten(), lit)
+        geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
+        self._scene.ngeom += 1
+        return geom
+
+
+def resampled(points: Float, spacing: float) -> Float:
+    """A polyline through `points` (n, D) with points about `spacing` apart, [m]; both ends are kept."""
+    steps = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=-1))
+    length = np.concatenate(([0.0], np.cumsum(steps)))
+    count = max(int(np.ceil(length[-1] / spacing)), 1) + 1
+    places = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
+
+
+def in_space(points: Float, height: float) -> Float:
+    """Points (..., D) of the plane at `height` [m]; those of space as they are."""
+    if points.shape[-1] == 3:
+        return points
+    return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)

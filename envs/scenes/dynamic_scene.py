@@ -1,0 +1,198 @@
+"""Scenes that change while the hand is on its way: targets that jump, obstacles that move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.geometry.distance import MAX_CLEARANCE, clearance_profile
+from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
+
+Float = NDArray[np.float64]
+
+MOST_JUMPS = 4
+"""Jumps of a target in one episode at most."""
+FASTEST = 1.0
+"""Greatest speed of an obstacle, [m/s]."""
+
+
+class ChangingScenes(NamedTuple):
+    """N scenes of up to n obstacles each, and what will become of them."""
+
+    start: Float
+    """Shape (N, D), [m]."""
+    goal: Float
+    """The first target, shape (N, D), [m]."""
+    obstacles: Float
+    """Where they are at the start: rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]."""
+    jumps: Float
+    """Rows (time [s], target D [m]), in the order of time, shape (N, MOST_JUMPS, D + 1); absent rows are zero."""
+    courses: Float
+    """Of each obstacle: velocity D [m/s], time of the change of course [s], velocity D after it, shape (N, n, 2 D + 1).
+
+    The course is straight before and after. Where both velocities are the same there is no change, whatever the time.
+    """
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Whether a row is an obstacle, shape (N, n): an absent one has no radius."""
+        return self.obstacles[..., -1] > 0.0
+
+    @property
+    def turns(self) -> NDArray[np.bool_]:
+        """Which obstacles change their course, shape (N, n)."""
+        d = self.start.shape[-1]
+        return np.asarray(self.present & (self.courses[..., :d] != self.courses[..., d + 1 :]).any(axis=-1))
+
+    @property
+    def jump_times(self) -> Float:
+        """When the target jumps, shape (N, MOST_JUMPS), [s]; infinite where it does not."""
+        return np.where((self.jumps != 0.0).any(axis=-1), self.jumps[..., 0], np.inf)
+
+    @property
+    def turn_times(self) -> Float:
+        """When each obstacle changes its course, shape (N, n), [s]; infinite where it does not."""
+        return np.where(self.turns, self.courses[..., self.start.shape[-1]], np.inf)
+
+    def take(self, rows: Any) -> ChangingScenes:
+        """The scenes at `rows`, an index, slice or mask."""
+        return ChangingScenes(*(field[rows] for field in self))
+
+    def put(self, rows: Any, scenes: ChangingScenes) -> None:
+        """Overwrite the scenes at `rows`."""
+        for mine, theirs in zip(self, scenes, strict=True):
+            mine[rows] = theirs
+
+    def as_options(self) -> dict[str, Float]:
+        """What `reset(options=...)` of the environments takes."""
+        return dict(self._asdict())
+
+    def goals(self, time: Float) -> Float:
+        """The targets at a time for each, shape (N,), [s]; from the moment of a jump on it is the new one: (N, D)."""
+        number = (self.jump_times <= time[:, None] + 1e-9).sum(axis=-1)
+        targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
+        return np.asarray(targets[np.arange(len(targets)), number])
+
+    def places(self, time: Float, *, unturned: Float | None = None) -> Float:
+        """Obstacles at T times of each scene, rows of shape (N, T, n, 2 D + 1), [m].
+
+        Args:
+            time: Shape (N, T), [s].
+            unturned: As if no course changed after that time, shape (N,), [s]: what one foresees then.
+        """
+        d = self.start.shape[-1]
+        turn = self.turn_times
+        if unturned is not None:
+            turn = np.where(turn > unturned[:, None] + 1e-9, np.inf, turn)
+        before = np.minimum(time[..., None], turn[:, None])[..., None]
+        after = np.maximum(time[..., None] - turn[:, None], 0.0)[..., None]
+        rows = np.repeat(self.obstacles[:, None], time.shape[1], axis=1)
+        rows[..., :d] += self.courses[:, None, :, :d] * before + self.courses[:, None, :, d + 1 :] * after
+        return rows
+
+    def velocities(self, time: Float) -> Float:
+        """Of the obstacles at a time for each, shape (N,), [s]: (N, n, D), [m/s]; zero where there is none."""
+        d = self.start.shape[-1]
+        turned = (self.turn_times <= time[:, None] + 1e-9)[..., None]
+        velocity = np.where(turned, self.courses[..., d + 1 :], self.courses[..., :d])
+        return np.where(self.present[..., None], velocity, 0.0)
+
+    def at(self, time: Float) -> Scenes:
+        """How they look at a time for each, shape (N,), [s]."""
+        return Scenes(self.start, self.goals(time), self.places(time[:, None])[:, 0])
+
+
+def problems_of_changes(
+    scenes: ChangingScenes, arm: Arm, *, whole_arm: bool, time_limit: float
+) -> Iterator[Problem]:
+    """Everything that can be wrong with what will become of N scenes that are sound at the start.
+
+    Args:
+        scenes: To look at.
+        arm: Whose hand shall reach the targets.
+        whole_arm: Whether its links count.
+        time_limit: After which nothing happens, [s].
+    """
+    d = scenes.start.shape[-1]
+    given, turns = (scenes.jumps != 0.0).any(axis=-1), scenes.turns
+    for there, time, what in (
+        (given, scenes.jumps[..., 0], "jump"),
+        (turns, scenes.courses[..., d], "the change of course"),
+    ):
+        yield _first(there & (time <= 0.0), time, what, "s lies in the past (a time over 0 is needed)")
+        yield _first(
+            there & (time >= time_limit), time, what, f"s is not before the time limit, {time_limit:g} s"
+        )
+    late = np.zeros_like(given)
+    late[:, 1:] = scenes.jump_times[:, 1:] <= scenes.jump_times[:, :-1]
+    yield _first(given & late, scenes.jumps[..., 0], "jump", "s is not after the one before it")
+    for first in (0, d + 1):
+        speed = np.sqrt((scenes.courses[..., first : first + d] ** 2).sum(axis=-1))
+        yield _first(scenes.present & (speed > FASTEST), speed, "course", f"m/s is faster than {FASTEST} m/s")
+    for k in range(scenes.jumps.shape[1]):
+        goal = np.where(given[:, k, None], scenes.jumps[:, k, 1:], scenes.goal)
+        margin = np.asarray(arm.reach_margin(goal))
+        yield (
+            given[:, k] & (margin < 0.0),
+            lambda i, k=k, m=margin: (  # type: ignore[misc]
+                f"the target of jump {k} is {-m[i]:.4f} m out of the arm's reach"
+            ),
+        )
+        then = scenes.at(np.where(given[:, k], scenes.jumps[:, k, 0], 0.0))
+        least = rest_clearance(then, goal, arm, whole_arm=whole_arm).min(axis=-1)
+        yield (
+            given[:, k] & (least <= 0.0),
+            lambda i, k=k, c=least: (  # type: ignore[misc]
+                f"an obstacle touches the arm at the target of jump {k} when it appears (clearance {c[i]:.4f} m)"
+            ),
+        )
+
+
+def _first(wrong: NDArray[np.bool_], values: Float, what: str, why: str) -> Problem:
+    """A fault of some rows, told of the first."""
+    return (
+        np.asarray(wrong.any(axis=-1)),
+        lambda i: f"{what} {wrong[i].argmax()} at {values[i, wrong[i].argmax()]:g} {why}",
+    )
+
+
+def clearance_over_time(
+    arm: Arm,
+    hand: Float,
+    rows: Float,
+    present: NDArray[np.bool_],
+    *,
+    whole_arm: bool,
+    joints: Float | None = None,
+) -> Float:
+    """Clearance of the arm from each obstacle at each time, shape (N, T, n), [m]; at most MAX_CLEARANCE.
+
+    Args:
+        arm: That moves.
+        hand: Positions, shape (N, T, D), [m].
+        rows: Obstacles, shape (N, T, n, 2 D + 1), [m].
+        present: Whether a row is an obstacle, shape (N, n).
+        whole_arm: Whether the links count.
+        joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
+    """
+    number, times, most = rows.shape[:3]
+    if not rows.size or not present.any():
+        return np.full((number, times, most), MAX_CLEARANCE)
+    links, radius = None, arm.hand_radius
+    if whole_arm:
+        radius = arm.link_radii[-1] if arm.traced else radius  # there the last link ends in the hand
+        links = np.asarray(arm.links(arm.inverse_kinematics(hand) if joints is None else joints))
+        links = links.reshape(-1, 1, *links.shape[2:])
+    profile = clearance_profile(
+        hand.reshape(-1, 1, hand.shape[-1]),
+        radius,
+        rows.reshape(-1, *rows.shape[2:]),
+        np.repeat(present, times, axis=0),
+        links,
+        arm.link_radii,
+    )
+    return np.asarray(profile[..., 0].reshape(number, times, most))

@@ -1,0 +1,275 @@
+"""Drawing what will become of scenes: when targets jump and where to, how obstacles move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint import primitives
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
+from viapoint.envs.scenes.planar_draws import Uniforms, between
+from viapoint.envs.scenes.scene import FARTHEST_CENTRE, Scenes, rest_clearance
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Index = NDArray[np.int64]
+
+CANDIDATES, ATTEMPTS = 8, 40
+"""Jumps and courses that are drawn at once, and how often jumps are drawn until some fit."""
+REDRAWN = 100
+"""How often other scenes are drawn instead of those in which no jump fits: one in a few hundred of some tasks."""
+LOOKS = 10
+"""At how many times it is looked whether start and goal are free."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeDistribution:
+    """What becomes of scenes. Times are relative to the centre duration of a movement."""
+
+    n_jumps: tuple[int, int] = (0, 0)
+    """Fewest and most jumps of the target."""
+    moving: bool = False
+    """Whether obstacles move."""
+    first_jump: tuple[float, float] = (0.1, 0.7)
+    """After the start."""
+    next_jump: tuple[float, float] = (0.4, 0.9)
+    """After the one before."""
+    jump_distance: tuple[float, float] = (0.10, 0.30)
+    """From one target to the next, [m]."""
+    steepness: float = 0.5
+    """Greatest height gained by a jump or an obstacle in space, relative to the distance."""
+    speed: tuple[float, float] = (0.05, 0.30)
+    """Of the obstacles, [m/s]."""
+    turning: float = 0.5
+    """Share of the obstacles that change their course."""
+    turn: tuple[float, float] = (0.2, 0.7)
+    """When they do so."""
+    meeting: tuple[float, float] = (0.25, 0.6)
+    """When an obstacle is where it would stand if it did not move: in the way of the straight movement, say."""
+    end_margin: float = 0.015
+    """Least clearance of the arm at the start, and at the goal while movements may end, [m]."""
+    reach_margin: float = 0.03
+    """How far inside the arm's reach targets stay, [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be sampled."""
+        fewest, most = self.n_jumps
+        if not 0 <= fewest <= most <= MOST_JUMPS:
+            raise ValueError(
+                f"n_jumps must be (fewest, most), 0 <= fewest <= most <= {MOST_JUMPS}, got {self.n_jumps}"
+            )
+
+
+class ChangeSampler:
+    """Draws what will become of scenes, each from a generator of its own.
+
+    Args:
+        arm: Whose hand moves.
+        distribution: What becomes of scenes.
+        whole_arm: Whether the links count.
+        durations: Shortest, centre and longest duration of a movement, [s].
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        distribution: ChangeDistribution,
+        *,
+        whole_arm: bool,
+        durations: tuple[float, float, float],
+    ) -> None:
+        self.arm, self.distribution, self.whole_arm = arm, distribution, whole_arm
+        self._shortest, self._centre, self._longest = durations
+
+    def __call__(
+        self,
+        generators: Sequence[np.random.Generator],
+        scenes: Scenes,
+        jumps: Float | None = None,
+        courses: Float | None = None,
+        *,
+        again: Callable[[Index], Scenes] | None = None,
+    ) -> ChangingScenes:
+        """What will become of N scenes.
+
+        Args:
+            generators: N random generators.
+            scenes: N scenes; obstacles whose courses are drawn will be there when a movement may meet them.
+            jumps: Given ones, shape (N, MOST_JUMPS, D + 1).
+            courses: Given ones, shape (N, n, 2 D + 1).
+            again: Draws other scenes instead of some, where no jump fits in; without it they are refused.
+
+        Raises:
+            RuntimeError: No jump that fits was found in many attempts.
+        """
+        changing, left = self._changing(generators, scenes, jumps, courses)
+        for _ in range(REDRAWN if again else 0):
+            if not left.size:
+                break
+            assert again is not None
+            others, still = self._changing([generators[int(i)] for i in left], again(left), jumps, courses)
+            changing.put(left, others)
+            left = left[still]
+        if left.size:
+            start, goal = changing.start[left[0]], changing.goal[left[0]]
+            raise RuntimeError(
+                f"no jump of the target was found in {ATTEMPTS} attempts from start {start}, goal {goal}"
+            )
+        return changing
+
+    def _changing(
+        self,
+        generators: Sequence[np.random.Generator],
+        scenes: Scenes,
+        jumps: Float | None,
+        courses: Float | None,
+    ) -> tuple[ChangingScenes, Index]:
+        """What will become of N scenes, and those in which no jump fits."""
+        number, dimension = scenes.start.shape
+        still = np.zeros((number, scenes.obstacles.shape[1], 2 * dimension + 1))
+        none = np.zeros((number, MOST_JUMPS, dimension + 1))
+        obstacles, moving = scenes.obstacles, still if courses is None else courses
+        if courses is None and self.distribution.moving and still.size:
+            obstacles, moving = self._courses(generators, scenes)
+        changing = ChangingScenes(scenes.start, scenes.goal, obstacles, none, moving)
+        if jumps is not None:
+            return changing._replace(jumps=jumps), np.arange(0)
+        if not self.distribution.n_jumps[1]:
+            return changing, np.arange(0)
+        return changing, self._jump(generators, changing)
+
+    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> Index:
+        """Draw jumps into scenes, all of an episode at once, until all fit; which are left."""
+        fewest, most = self.distribution.n_jumps
+        pending = np.arange(len(scenes.start))
+        size = 1 + most * (1 + 3 * CANDIDATES)
+        for _ in range(ATTEMPTS):
+            if not len(pending):
+                break
+            u = Uniforms(np.stack([generators[int(i)].random(size) for i in pending]))
+            number = fewest + np.floor((most - fewest + 1) * u.take(1)[:, 0])
+            good, jumps = self._attempt(u, number, scenes.take(pending))
+            scenes.jumps[pending[good]] = jumps[good]
+            pending = pending[~good]
+        return pending
+
+    def _attempt(self, uniforms: Uniforms, number: Float, scenes: ChangingScenes) -> tuple[Bool, Float]:
+        """Which of N episodes got all their jumps, and the jumps; the hand is thought to follow without detours."""
+        d, centre = self.distribution, self._centre
+        jumps, good = np.zeros_like(scenes.jumps), np.ones(len(number), dtype=bool)
+        target, each = scenes.goal, np.arange(len(number))
+        movement = primitives.point_to_point(scenes.start, target, centre)
+        before = np.zeros(len(number))
+        for k in range(d.n_jumps[1]):
+            wait = centre * between(d.next_jump if k else d.first_jump, uniforms.take(1)[:, 0])
+            time = before + wait
+            targets = self._targets(uniforms, target)
+            state = [part[:, 0] for part in movement.sample(wait[:, None])]
+            position, velocity, acceleration = (np.repeat(part[:, None], CANDIDATES, 1) for part in state)
+            revised = primitives.point_to_point(
+                position, targets, centre, start_velocity=velocity, start_acceleration=acceleration
+            )
+            fits = self._fits(scenes, time, targets, revised(np.linspace(0.0, centre, LOOKS)))
+            chosen, some = fits.argmax(axis=-1), number > k
+            target = np.where(some[:, None], targets[each, chosen], target)
+            good &= fits.any(axis=-1) | ~some
+            jumps[some, k] = np.concatenate((time[:, None], target), axis=-1)[some]
+            movement = primitives.point_to_point(
+                state[0], target, centre, start_velocity=state[1], start_acceleration=state[2]
+            )
+            before = time
+        return good, jumps
+
+    def _targets(self, uniforms: Uniforms, target: Float) -> Float:
+        """Candidates for the next target, shape (N, CANDIDATES, D)."""
+        angle, length = 2.0 * np.pi * uniforms.take(CANDIDATES), uniforms.take(CANDIDATES)
+        step = self._direction(angle, uniforms.take(CANDIDATES), target.shape[-1])
+        return np.asarray(
+            target[:, None] + between(self.distribution.jump_distance, length)[..., None] * step
+        )
+
+    def _fits(self, scenes: ChangingScenes, time: Float, targets: Float, paths: Float) -> Bool:
+        """Which candidates are inside the workspace, free when they appear, and reached without detours."""
+        low, high = (np.array(corner) for corner in self.arm.workspace)
+        inside = ((targets >= low) & (targets <= high)).all(axis=-1)
+        inside &= np.asarray(self.arm.reach_margin(targets)) > self.distribution.reach_margin
+        inside &= (np.asarray(self.arm.reach_margin(paths)) > 0.5 * self.distribution.reach_margin).all(
+            axis=-1
+        )
+        then = scenes.at(time)
+        many = Scenes(*(np.repeat(field, CANDIDATES, axis=0) for field in then))
+        clearance = rest_clearance(
+            many, targets.reshape(-1, targets.shape[-1]), self.arm, whole_arm=self.whole_arm
+        )
+        free: Bool = inside & (clearance.min(axis=-1).reshape(inside.shape) > self.distribution.end_margin)
+        return free
+
+    def _courses(self, generators: Sequence[np.random.Generator], scenes: Scenes) -> tuple[Float, Float]:
+        """Where obstacles are at the start, and their courses; where none fits an obstacle stands still."""
+        d, (number, rows) = self.distribution, scenes.obstacles.shape[:2]
+        size, dimension = rows * CANDIDATES, scenes.start.shape[-1]
+        u = Uniforms(np.stack([generator.random(9 * size) for generator in generators]))
+        velocities = [self._velocity(u, size, dimension) for _ in range(2)]
+        turns = u.take(size) < d.turning
+        turn = np.where(turns, self._centre * between(d.turn, u.take(size)), 0.0)
+        velocities[1] = np.where(turns[..., None], velocities[1], velocities[0])
+        meeting = self._centre * between(d.meeting, u.take(size))
+        courses = np.concatenate((velocities[0], turn[..., None], velocities[1]), axis=-1)
+        at_rest = np.repeat(scenes.obstacles, CANDIDATES, axis=1)
+        many = ChangingScenes(
+            scenes.start, scenes.goal, at_rest, np.zeros((number, 0, dimension + 1)), courses
+        )
+        ahead = _moved(many, meeting)[..., :dimension] - at_rest[..., :dimension]
+        many.obstacles[..., :dimension] -= np.where(many.present[..., None], ahead, 0.0)
+        fits = self._free(many).reshape(number, rows, CANDIDATES)
+        first = fits.argmax(axis=-1) + CANDIDATES * np.arange(rows)
+        some = (fits.any(axis=-1) & scenes.present)[..., None]
+        each = np.arange(number)[:, None]
+        return np.where(some, many.obstacles[each, first], scenes.obstacles), np.where(
+            some, courses[each, first], 0.0
+        )
+
+    def _velocity(self, uniforms: Uniforms, size: int, dimension: int) -> Float:
+        angle, speed = (
+            2.0 * np.pi * uniforms.take(size),
+            between(self.distribution.speed, uniforms.take(size)),
+        )
+        return np.asarray(speed[..., None] * self._direction(angle, uniforms.take(size), dimension))
+
+    def _direction(self, angle: Float, height: Float, dimension: int) -> Float:
+        """Unit vectors; in space they climb or fall by as much as a number from 0 to 1 says."""
+        if dimension == 2:
+            return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+        rise = self.distribution.steepness * (2.0 * height - 1.0)
+        level = np.sqrt(1.0 - rise**2)
+        return np.stack((level * np.cos(angle), level * np.sin(angle), rise), axis=-1)
+
+    def _free(self, many: ChangingScenes) -> Bool:
+        """Which obstacles leave start and goal free at first, and the goal while movements may end."""
+        d, dimension = self.distribution, many.start.shape[-1]
+        good = (np.abs(many.obstacles[..., :dimension]) < FARTHEST_CENTRE).all(axis=-1)
+        at_first = np.linspace(0.0, 0.2 * self._centre, 3)
+        at_last = np.append(0.0, np.linspace(self._shortest, 1.2 * self._longest, LOOKS))
+        for point, times in ((many.start, at_first), (many.goal, at_last)):
+            rows = many.places(np.repeat(times[None], len(point), axis=0))
+            scenes = Scenes(many.start, many.goal, rows.reshape(len(rows), -1, rows.shape[-1]))
+            clearance = rest_clearance(scenes, point, self.arm, whole_arm=self.whole_arm)[:, :-1]
+            good &= (clearance.reshape(rows.shape[:3]) > d.end_margin).all(axis=1)
+        return np.asarray(good)
+
+
+def _moved(many: ChangingScenes, time: Float) -> Float:
+    """Every obstacle at a time of its own, shape (N, n), [s]: rows of shape (N, n, 2 D + 1)."""
+    number, rows = time.shape
+    each = ChangingScenes(
+        np.repeat(many.start, rows, axis=0),
+        np.repeat(many.goal, rows, axis=0),
+        many.obstacles.reshape(-1, 1, many.obstacles.shape[-1]),
+        np.zeros((number * rows, *many.jumps.shape[1:])),
+        many.courses.reshape(-1, 1, many.courses.shape[-1]),
+    )
+    return each.places(time.reshape(-1, 1)).reshape(number, rows, -1)

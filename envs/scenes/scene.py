@@ -1,0 +1,171 @@
+"""Scenes: where a movement starts and ends, and what stands in its way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
+
+Float = NDArray[np.float64]
+
+LARGEST_HALF_AXIS = 0.3
+"""Greatest half length of a bar, [m]."""
+LARGEST_RADIUS = 0.1
+"""Greatest radius of an obstacle, [m]."""
+FARTHEST_CENTRE = 1.0
+"""Greatest coordinate of an obstacle's centre, [m]."""
+
+TARGETS = {
+    "T1": (-0.32, 0.42),
+    "T2": (-0.22, 0.27),
+    "T3": (-0.02, 0.27),
+    "T4": (0.08, 0.42),
+    "T5": (-0.02, 0.57),
+    "T6": (-0.22, 0.57),
+}
+"""The six targets of Flash & Hogan 1985, Fig. 2, [m], shoulder at the origin.
+
+The figure gives no coordinates. Its movements T1-T4, T2-T5 and T3-T6 (Figs. 1, 3 and 4) are the three diagonals of a
+hexagon here, 40, 36 and 36 cm long, in front of the right shoulder and within the reach of the arm.
+"""
+
+
+class Scenes(NamedTuple):
+    """N scenes of up to n obstacles each."""
+
+    start: Float
+    """Shape (N, D), [m]."""
+    goal: Float
+    """Shape (N, D), [m]."""
+    obstacles: Float
+    """Rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]; absent rows are zero."""
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Whether a row is an obstacle, shape (N, n): an absent one has no radius."""
+        return self.obstacles[..., -1] > 0.0
+
+    def take(self, rows: Any) -> Scenes:
+        """The scenes at `rows`, an index, slice or mask."""
+        return Scenes(self.start[rows], self.goal[rows], self.obstacles[rows])
+
+    def put(self, rows: Any, scenes: Scenes) -> None:
+        """Overwrite the scenes at `rows`."""
+        for mine, theirs in zip(self, scenes, strict=True):
+            mine[rows] = theirs
+
+    def as_options(self) -> dict[str, Float]:
+        """What `reset(options=...)` of the environments takes."""
+        return dict(self._asdict())
+
+
+def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tuple[str, str]], Scenes]:
+    """The paper's obstacle paradigm: a row of lights across the middle of the line between each two targets.
+
+    Args:
+        length: Of the row, [m]; the paper's rows were up to 25 cm long.
+        radius: Of the row, [m].
+
+    Returns:
+        The ordered pairs of targets, 0.3 m or more apart, and their scenes.
+    """
+    pairs = [
+        (a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3
+    ]
+    start = np.array([TARGETS[a] for a, _ in pairs])
+    goal = np.array([TARGETS[b] for _, b in pairs])
+    along = (goal - start) / np.sqrt(((goal - start) ** 2).sum(-1, keepdims=True))
+    half = 0.5 * length * np.stack((-along[:, 1], along[:, 0]), axis=-1)
+    rows = np.concatenate(((start + goal) / 2.0, half, np.full((len(pairs), 1), radius)), axis=-1)
+    return pairs, Scenes(start, goal, rows[:, None, :])
+
+
+Problem = tuple[NDArray[np.bool_], Callable[[int], str]]
+"""Which scenes have a fault, shape (N,), and the words for it in one of them."""
+
+
+def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
+    """Refuse a scene that no movement can start or end in.
+
+    Raises:
+        ValueError: With the scene, the offender and what is allowed.
+    """
+    for wrong, reason in problems(scenes, arm, whole_arm=whole_arm):
+        if wrong.any():
+            first = int(wrong.argmax())
+            raise ValueError(f"scene {first}: {reason(first)}")
+
+
+def problems(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Iterator[Problem]:
+    """Everything that can be wrong with N scenes."""
+    yield from _problems_of_ends(scenes, arm)
+    yield from _problems_of_sizes(scenes)
+    for name, point in (("start", scenes.start), ("goal", scenes.goal)):
+        clearance = rest_clearance(scenes, point, arm, whole_arm=whole_arm)
+        touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
+        yield (
+            least <= 0.0,
+            lambda i, n=name, t=touched, c=least: (  # type: ignore[misc]
+                f"obstacle {t[i]} {_shown(scenes.obstacles[i, t[i]])} m touches the arm at the {n} "
+                f"(clearance {c[i]:.4f} m; more than 0 is needed)"
+            ),
+        )
+
+
+def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
+    apart = np.sqrt(((scenes.goal - scenes.start) ** 2).sum(axis=-1))
+    yield (
+        apart < MIN_GOAL_DISTANCE,
+        lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {MIN_GOAL_DISTANCE} m is needed",
+    )
+    for name, point in (("start", scenes.start), ("goal", scenes.goal)):
+        margin = np.asarray(arm.reach_margin(point))
+        yield (
+            margin < 0.0,
+            lambda i, n=name, p=point, m=margin: (  # type: ignore[misc]
+                f"{n} {_shown(p[i])} m is {-m[i]:.4f} m out of the arm's reach"
+            ),
+        )
+
+
+def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
+    dimension = scenes.start.shape[-1]
+    half = np.sqrt((scenes.obstacles[..., dimension : 2 * dimension] ** 2).sum(axis=-1))
+    radius = scenes.obstacles[..., -1]
+    named = (scenes.obstacles != 0.0).any(axis=-1)
+    for wrong, what in (
+        (named & (radius <= 0.0), "has no positive radius"),
+        (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
+        (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
+        (
+            (np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE).any(axis=-1),
+            "has its centre over 1 m from the origin",
+        ),
+    ):
+        yield (
+            wrong.any(axis=-1),
+            lambda i, w=wrong, x=what: (  # type: ignore[misc]
+                f"obstacle {w[i].argmax()} {_shown(scenes.obstacles[i, w[i].argmax()])} m {x}"
+            ),
+        )
+
+
+def rest_clearance(scenes: Scenes, point: Float, arm: Arm, *, whole_arm: bool) -> Float:
+    """Clearance of the arm, its hand at rest at `point` (N, D), from n obstacles and one far away: (N, n + 1), [m]."""
+    hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
+    if whole_arm:
+        links = arm.links(arm.inverse_kinematics(point))[:, None]
+        hand = np.minimum(hand, arm_clearance(links, arm.link_radii, scenes.obstacles, scenes.present))
+    return np.concatenate(
+        (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
+    )
+
+
+def _shown(values: Float) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"

@@ -1,0 +1,154 @@
+"""The space that an arm sweeps, as scenes are drawn around it: quick, and no more exact than that needs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.geometry.broad_phase import Single, ball_bounds, lift_quadratic
+from viapoint.envs.geometry.distance import segment_distance_squared
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+OUTER = 5
+"""Links next to the hand: what is drawn near it concerns them first, and only what is chosen concerns the others."""
+LENGTH = 1e-4
+"""A hand alone is a link of that length, as a link must have one, [m]."""
+ABOVE = 0.06
+"""How far sideways what is above the hand may be, [m]."""
+SIZE_ROUNDING = 1e-4
+"""More than what rounding adds to a distance, [m]."""
+
+
+class Bodies(NamedTuple):
+    """Some links of an arm at T times of N movements."""
+
+    ends: Single
+    """Of their axes, with components apart in memory, shape (2, 3, N, B, T), [m]."""
+    balls: Single
+    """Centres of balls around the B links, :func:`lift_quadratic`, shape (N, 5, B, T)."""
+    around: Single
+    """Radii of the balls, shape (B,), [m]."""
+    radii: Single
+    """Of the links, shape (B,), [m]."""
+
+    @classmethod
+    def of(cls, ends: Single, radii: tuple[float, ...]) -> Bodies:
+        """Links whose axes end there, shape (2, 3, N, B, T), [m], and their radii, [m]."""
+        links, size = np.ascontiguousarray(ends), np.array(radii, np.float32)
+        balls = lift_quadratic(np.moveaxis(np.float32(0.5) * (links[0] + links[1]), 0, 1))
+        half = 0.5 * np.sqrt(np.add.reduce(np.square(links[1] - links[0])).max(axis=(0, 2), initial=0.0))
+        return cls(links, balls, half + size + np.float32(SIZE_ROUNDING), size)
+
+    def clearance(
+        self,
+        rows: Float,
+        most: float,
+        margin: Float | float = 0.0,
+        *,
+        floor: float = -np.inf,
+        together: int = 1,
+    ) -> Float:
+        """Least clearance over time from each of n obstacles, or from those that belong together, less a margin.
+
+        A link is at least as far away as the ball around it. Only balls that come near enough to matter are looked
+        into, so narrow bounds are quick.
+
+        Args:
+            rows: Obstacles, shape (N, n, 7), [m]; those without a radius are none, and as far away as `most`.
+            most: Greatest number that matters, [m].
+            margin: To subtract at each time, shape (T,), or at all of them, [m].
+            floor: Below it one number is as good as another, [m].
+            together: How many rows belong together.
+
+        Returns:
+            Shape (N, n / together), [m]; no more than `most`.
+        """
+        shape, places = (len(rows), rows.shape[1] // together), math.prod(self.balls.shape[2:])
+        least = np.full(math.prod(shape), most)
+        if not places or not (rows[..., -1] > 0.0).any():
+            return least.reshape(shape)
+        margins = np.zeros(self.balls.shape[2:]) + margin
+        around = (self.around[:, None] + margins).astype(np.float32).reshape(-1)
+        bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows).reshape(len(least), -1)
+        nearest = bound.argmin(axis=-1)
+
+        def look(one: Index, ball: Index) -> None:
+            row, ball = np.divmod(one * bound.shape[-1] + ball, places)
+            clearance = self._between(rows, row, ball) - margins.reshape(-1)[ball]
+            np.minimum.at(least, one, clearance)
+
+        one = np.flatnonzero(bound[np.arange(len(least)), nearest] < most)
+        look(one, nearest[one])
+        one = one[least[one] >= floor]
+        nearer = bound.take(one, axis=0) < least[one, None].astype(np.float32)
+        nearer[np.arange(len(one)), nearest[one]] = False
+        which, ball = np.nonzero(nearer)
+        if len(which):
+            look(one[which], ball)
+        return least.reshape(shape)
+
+    def every_other(self) -> Bodies:
+        """The same at every other time."""
+        return self._replace(ends=self.ends[..., ::2], balls=self.balls[..., ::2])
+
+    def take(self, movements: Index) -> Bodies:
+        """Some of the movements."""
+        return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
+
+    def _between(self, rows: Float, row: Index, ball: Index) -> Float:
+        """Clearance of obstacles, the index of each among all rows, each from one link at one time, shape (M,), [m]."""
+        links, times = self.balls.shape[2:]
+        ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
+        obstacles = rows.reshape(-1, 7).take(row, axis=0)
+        # Components apart in memory, which are mostly read one after the other.
+        first, second = ends[:3].T[:, None], ends[3:].T[:, None]
+        squared = segment_distance_squared(first, second, obstacles.astype(np.float32, order="F")[:, None])
+        distance = np.sqrt(squared[:, 0, 0]) - self.radii[ball // times]
+        return np.asarray(distance.astype(np.float64) - obstacles[:, -1])
+
+
+class Swept(NamedTuple):
+    """Where an arm is on N movements, the links near its hand and the others."""
+
+    outer: Bodies
+    inner: Bodies
+
+    @classmethod
+    def of(cls, arm: Arm, hand: Float, *, whole_arm: bool) -> Swept:
+        """Of an arm, or its hand alone, whose hand takes paths of shape (N, T, 3), [m]."""
+        if whole_arm:
+            links, radii = np.asarray(arm.links(arm.inverse_kinematics(hand))), arm.link_radii
+        else:
+            links = np.stack((hand, hand + np.array([0.0, 0.0, LENGTH])), axis=-2)[:, :, None]
+            radii = (arm.hand_radius,)
+        ends = links.astype(np.float32).transpose(3, 4, 0, 2, 1)
+        first = max(len(radii) - OUTER, 0)
+        return cls(
+            *(Bodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
+        )
+
+    def top(self, phase: NDArray[np.int64], place: Float) -> Float:
+        """Height of what of the links near the hand stands above it, at K times of each movement.
+
+        Args:
+            phase: Index of the times, shape (N, K).
+            place: The hand then, shape (N, K, 3), [m].
+
+        Returns:
+            Shape (N, K), [m].
+        """
+        there = self.outer.ends[:, :, np.arange(len(phase))[:, None], :, phase]
+        x, y, z = (place[:, :, i, None, None] for i in range(3))
+        apart = np.sqrt(np.square(there[..., 0, :] - x) + np.square(there[..., 1, :] - y))
+        high = there[..., 2, :] + self.outer.radii
+        return np.asarray(np.where(apart < ABOVE, high, z).max(axis=(-2, -1)))
+
+    def take(self, movements: Index) -> Swept:
+        """Some of the movements."""
+        return Swept(*(bodies.take(movements) for bodies in self))

@@ -1,0 +1,1 @@
+"""Physics simulation of plans and its metrics."""

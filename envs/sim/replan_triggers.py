@@ -1,0 +1,171 @@
+"""When a decision ends. Plans and courses are known to the environment, so all but a contact is known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from enum import IntEnum
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.replanning import MovingPlan
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.validation import number_of_at_least
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
+from viapoint.envs.sim.executor import SETTLING
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+Trigger = Literal["horizon", "target", "course", "clearance"]
+TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
+"""What may end a decision on the way."""
+
+FORESIGHT = 0.4
+"""How far ahead clearance is predicted, [s]."""
+SAMPLED = 0.016
+"""Between the times at which clearance is predicted, [s]."""
+LOOK = 2
+"""How many of them pass from one prediction to the next."""
+NEVER = np.iinfo(np.int64).max
+
+
+class Event(IntEnum):
+    """What ended a decision, the `event` of `info`; of several at once the most telling."""
+
+    HORIZON = 0
+    """The horizon has passed."""
+    TARGET = 1
+    """The target has jumped."""
+    COURSE = 2
+    """An obstacle has changed its course."""
+    CLEARANCE = 3
+    """The predicted clearance has fallen below the margin."""
+    ARRIVAL = 4
+    """The hand has arrived and settled."""
+    CONTACT = 5
+    """The arm touched an obstacle."""
+    TIME_LIMIT = 6
+    """The time is up."""
+    REACH = 7
+    """The plan leaves the arm's reach; the arm does not start on it."""
+    UNSTABLE = 8
+    """The physics broke down."""
+
+
+class Ends(NamedTuple):
+    """How N decisions end, if nothing is touched."""
+
+    step: Int
+    """Physics step of the episode before which they end, shape (N,)."""
+    event: Int
+    """:class:`Event`, shape (N,)."""
+    final: NDArray[np.bool_]
+    """Whether the hand has arrived and nothing is to come, shape (N,)."""
+
+
+class DecisionEnds:
+    """Finds out when decisions end.
+
+    Args:
+        arm: That moves.
+        whole_arm: Whether its links count.
+        timestep: Of the physics, [s].
+        triggers: What ends a decision on the way.
+        horizon: [s].
+        margin: Predicted clearance below which a decision ends, [m].
+        time_limit: Of an episode, [s].
+
+    Raises:
+        ValueError: There is no such trigger, or horizon or margin are too small.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        whole_arm: bool,
+        timestep: float,
+        triggers: Sequence[Trigger],
+        horizon: float,
+        margin: float,
+        time_limit: float,
+    ) -> None:
+        self.arm, self.whole_arm, self.timestep = arm, whole_arm, timestep
+        known = not isinstance(triggers, str) and isinstance(triggers, Iterable)
+        if not known or any(each not in TRIGGERS for each in triggers):
+            raise ValueError(f"decide_at must be some of {', '.join(TRIGGERS)}, got {triggers!r}")
+        number_of_at_least("horizon", horizon, timestep, " (a control step)")
+        self.triggers, self.margin = frozenset(triggers), number_of_at_least("margin", margin, 0.0)
+        self.horizon, self.limit = self.steps(min(horizon, time_limit)), self.steps(time_limit)
+
+    def steps(self, time: Any) -> Any:
+        """The first physics step at or after a time [s]; NEVER for an infinite one."""
+        finite = np.isfinite(time)
+        number = np.ceil((np.where(finite, time, 0.0) - 1e-9) / self.timestep).astype(np.int64)
+        return np.where(finite, number, NEVER)[()]
+
+    def __call__(self, plan: MovingPlan, began: Int, now: Int, scenes: ChangingScenes) -> Ends:
+        """How decisions end that begin at the physics step `now`, under plans that began at the step `began`."""
+        jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_times)
+        moving_until = began + self.steps(plan.duration)
+        arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
+        there = (plan.waypoints[:, -1] == scenes.goals(arrival * self.timestep)).all(axis=-1)
+        after = _next(jump, arrival), _next(turn, arrival)
+        waits = there & (np.minimum(*after) != NEVER)  # at rest, for what is still to come
+        ends = {Event.TIME_LIMIT: np.maximum(self.limit, now + 1)}
+        for event, trigger, steps, later in (
+            (Event.TARGET, "target", jump, after[0]),
+            (Event.COURSE, "course", turn, after[1]),
+        ):
+            ends[event] = _next(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
+        horizon = now + self.horizon
+        ends[Event.HORIZON] = np.where(
+            ("horizon" in self.triggers) & (horizon < moving_until), horizon, NEVER
+        )
+        ends[Event.ARRIVAL] = np.where(waits, NEVER, arrival)
+        ends[Event.CLEARANCE] = self._clearance(plan, began, now, scenes, np.minimum.reduce([*ends.values()]))
+        order = sorted(ends, key=_RANK.index)
+        steps = np.stack([ends[event] for event in order])
+        event = np.array([int(each) for each in order])[steps.argmin(axis=0)]
+        return Ends(steps.min(axis=0), event, there & (event == Event.ARRIVAL))
+
+    def _clearance(self, plan: MovingPlan, began: Int, now: Int, scenes: ChangingScenes, latest: Int) -> Int:
+        """When the predicted clearance falls below the margin, NEVER where it does not before the `latest` step.
+
+        An obstacle is foreseen to go on as it does at that moment. As every course turns once at most, two profiles
+        over time say it all: without the turn, and with it.
+        """
+        never = np.full(len(now), NEVER)
+        if "clearance" not in self.triggers or not scenes.present.any():
+            return never
+        every = max(round(SAMPLED / self.timestep), 1)
+        ahead = round(FORESIGHT / self.timestep) // every
+        looks = int((latest - now).max()) // (every * LOOK) + 1
+        times = np.asarray(self.timestep * (now[:, None] + every * np.arange((looks - 1) * LOOK + ahead + 1)))
+        hand = plan.trajectory()(times - self.timestep * began[:, None])
+        unturned, turned = (
+            clearance_over_time(self.arm, hand, rows, scenes.present, whole_arm=self.whole_arm)
+            for rows in (scenes.places(times, unturned=times[:, 0]), scenes.places(times))
+        )
+        windows = [
+            np.lib.stride_tricks.sliding_window_view(each, ahead + 1, axis=1)[:, ::LOOK].min(axis=-1)
+            for each in (unturned, turned)
+        ]
+        seen = times[:, : looks * LOOK : LOOK, None] + 1e-9 >= scenes.turn_times[:, None]
+        below = np.where(seen, windows[1], windows[0]).min(axis=-1) < self.margin
+        falls = below[:, 1:] & ~below[:, :-1]
+        if not falls.shape[1]:
+            return never
+        step = now + every * LOOK * (falls.argmax(axis=1) + 1)
+        return np.where(falls.any(axis=1), step, NEVER)
+
+
+_RANK = [Event.TIME_LIMIT, Event.TARGET, Event.COURSE, Event.CLEARANCE, Event.ARRIVAL, Event.HORIZON]
+"""Of several events at once the first counts."""
+
+
+def _next(steps: Int, now: Int) -> Int:
+    """The first of some steps, shape (N, n), after the present one; NEVER where there is none: (N,)."""
+    return np.asarray(np.where(steps > now[:, None], steps, NEVER).min(axis=1, initial=NEVER))

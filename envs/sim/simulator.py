@@ -1,0 +1,171 @@
+"""Many simulations of one arm among obstacles, run by one call into C."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import batch
+from numpy.typing import NDArray
+
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.geometry.narrow_phase import LinkPositions
+
+Float = NDArray[np.float64]
+
+OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
+"""Where an absent obstacle waits, [m]."""
+
+MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+"""What a control sequence holds where obstacles move: controls, then the obstacles' centres."""
+
+
+class SimulationLog(NamedTuple):
+    """What a rollout of n simulations over T physics steps left behind."""
+
+    joints: Float
+    """Angles after each step, shape (n, T, J), [rad]."""
+    contact: NDArray[np.bool_]
+    """Whether arm and obstacle touched at the state before each step, shape (n, T)."""
+    unstable: NDArray[np.bool_]
+    """Whether MuJoCo raised a warning, shape (n,); such a simulation stopped there."""
+    traced: LinkPositions | None
+    """The arm's traced sites before each step; None where it has none."""
+
+
+class Simulator:
+    """MuJoCo's batch engine with the arm in its posture and capsules of any place and size around it."""
+
+    def __init__(self, arm: Arm, *, n_obstacles: int, whole_arm: bool, num_envs: int, threads: int) -> None:
+        """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
+        self.arm = arm
+        self.model = arm.compile(n_obstacles, whole_arm)
+        self.physics_steps = 0
+        """Physics steps simulated so far, all simulations together."""
+        self.batch = batch.Batch(self.model, num_envs, threads)
+        """MuJoCo's engine, whose state rows are the simulations'."""
+        self._rest_state = self.batch.state[0].copy()
+        self.recorded = ("qpos", "ncon", "site_xpos") if arm.traced else ("qpos", "ncon")
+        """What the engine records at every step."""
+        sites = [self.model.site(name).id for name in arm.traced]
+        self._traced = (sites[0], np.array(sites[1:]).reshape(-1, 2)) if sites else None
+        self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
+        if n_obstacles:
+            self._sizes = self.batch.expand("geom_size")
+            self._bounds = self.batch.expand("geom_rbound")
+            self._boxes = self.batch.expand("geom_aabb")
+
+    @property
+    def timestep(self) -> float:
+        """Length of a physics step, [s]."""
+        return float(self.model.opt.timestep)
+
+    def place(
+        self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
+    ) -> None:
+        """Put arms at rest and obstacles where they belong.
+
+        Args:
+            sims: The simulations, shape (n,).
+            joints: Shape (n, J), [rad].
+            obstacles: Rows (centre D, half-axis D, radius), shape (n, rows, 2 D + 1), [m].
+            present: Whether a row is an obstacle, shape (n, rows).
+        """
+        self.batch.state[sims] = self._rest_state
+        self.batch.bind("qpos")[sims] = joints
+        if not self._geoms:
+            return
+        dimension = (obstacles.shape[-1] - 1) // 2
+        centre = _in_space(obstacles[..., :dimension])
+        axis = _in_space(obstacles[..., dimension : 2 * dimension])
+        half = np.sqrt((axis * axis).sum(axis=-1))
+        radius = obstacles[..., -1]
+        self.batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
+        self.batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
+        self._resize(sims, np.where(present, radius, 0.01), np.where(present, half, 0.0))
+
+    def rollout(self, sims: NDArray[np.int64], controls: Float) -> SimulationLog:
+        """Run simulations under controls, all for the same number of steps.
+
+        Args:
+            sims: The simulations in increasing order, shape (n,).
+            controls: Shape (n, T, U).
+        """
+        steps = controls.shape[1]
+        warnings = self._warnings(sims)
+        out = self.batch.rollout(steps, controls, record=self.recorded, ids=sims)
+        self.physics_steps += steps * len(sims)
+        unstable = (self._warnings(sims) > warnings) | ~_finite(out["qpos"])
+        traced = LinkPositions(out["site_xpos"], *self._traced) if self._traced else None
+        return SimulationLog(out["qpos"], out["ncon"] > 0, unstable, traced)
+
+    def rollout_among_moving(
+        self, sims: NDArray[np.int64], controls: Float, places: Float, steps: NDArray[np.int64]
+    ) -> SimulationLog:
+        """Run simulations under controls while their obstacles move, each for a number of steps of its own.
+
+        Those of a call run together for the greatest number, and then stand where they were after their own.
+
+        Args:
+            sims: The simulations in increasing order, shape (n,).
+            controls: Shape (n, T, U).
+            places: Of the obstacles' centres before each step, NaN where there is none, shape (n, T, rows, D), [m].
+            steps: Of each, 1 to T, shape (n,).
+        """
+        number = controls.shape[1]
+        warnings = self._warnings(sims)
+        absent = np.isnan(places[..., :1])
+        where = np.where(absent, OUT_OF_THE_WAY, _in_space(places)).reshape(*controls.shape[:2], -1)
+        kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ()))
+        out = self.batch.rollout(
+            number, np.concatenate((controls, where), axis=-1), MOVING, record=(*kept, "ncon"), ids=sims
+        )
+        self.physics_steps += number * len(sims)
+        each, last = np.arange(len(sims)), steps - 1
+        for name in kept:
+            self.batch.bind(name)[sims] = out[name][each, last]
+        joints, contact = out["qpos"], out["ncon"] > 0
+        # A simulation that stops repeats its record; one that went on after its own steps was sound in them.
+        stopped = (joints[each, last] == joints[:, -1]).all(axis=-1)
+        unstable = (self._warnings(sims) > warnings) & stopped | ~np.isfinite(joints[each, last]).all(axis=-1)
+        return SimulationLog(joints, contact, unstable, None)
+
+    def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of one simulation with the arm at `joints`, to draw them."""
+        model, data = self.batch.get_model(sim), self.batch.get_data(sim)
+        data.qpos[:] = joints
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def _warnings(self, sims: NDArray[np.int64]) -> Any:
+        return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
+
+    def _resize(self, sims: NDArray[np.int64], radius: Float, half: Float) -> None:
+        """Set the sizes of the capsules and everything that MuJoCo derived from them when it compiled the model."""
+        rows = np.ix_(sims, self._geoms)
+        length = half + radius
+        self._sizes[rows] = np.stack((radius, half, np.zeros_like(half)), axis=-1)
+        self._bounds[rows] = length
+        self._boxes[rows] = np.stack((*[np.zeros_like(half)] * 3, radius, radius, length), axis=-1)
+
+
+def _in_space(vectors: Float) -> Float:
+    """Vectors of the plane as vectors of space, at height zero; those of space as they are."""
+    if vectors.shape[-1] == 3:
+        return vectors
+    return np.concatenate((vectors, np.zeros_like(vectors[..., :1])), axis=-1)
+
+
+def _turn_up_to(axis: Float, half: Float) -> Float:
+    """Quaternion that turns the z axis, along which MuJoCo lays its capsules, towards `axis`."""
+    lying = half > 1e-9
+    unit = np.where(lying[..., None], axis / np.where(lying, half, 1.0)[..., None], (0.0, 0.0, 1.0))
+    unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction
+    x, y, z = (unit[..., i] for i in range(3))
+    norm = np.sqrt(2.0 * (1.0 + z))
+    return np.stack(((1.0 + z) / norm, -y / norm, x / norm, np.zeros_like(z)), axis=-1)
+
+
+def _finite(joints: Float) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(joints).all(axis=(1, 2)))

@@ -1,0 +1,1 @@
+"""Learning algorithms, their networks and replay buffers."""

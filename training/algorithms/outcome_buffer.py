@@ -1,0 +1,145 @@
+"""Replay buffer that keeps the terms of the reward besides their sum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import DictReplayBuffer
+
+from viapoint.training.algorithms.smdp_buffers import TimedDictReplayBuffer
+from viapoint.training.config.discount import ELAPSED, TimeDiscount
+from viapoint.training.rollouts.vec_env import TERMS
+
+Single = NDArray[np.float32]
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+LOWER = 1e-6
+"""Least change of the clearance term that counts as one."""
+REWARD_TOLERANCE = 1e-4
+"""Greatest difference between the reward and the sum of its terms."""
+
+
+class Outcomes(NamedTuple):
+    """Outcomes of N decisions, shape (N,) each; NaN where the environment tells the sum of the terms only."""
+
+    success: Array
+    """1 for success, 0 for none."""
+    contact: Array
+    """1 where something was touched."""
+    clearance: Array
+    """Term of the reward, summed over the episode so far."""
+    lower: Array
+    """1 where that sum is lower than before, so that this decision and none before it is responsible."""
+    goal_error: Array
+    """Term of the reward."""
+    rest: Array
+    """Sum of the terms for smoothness and duration."""
+
+
+class OutcomeSamples(NamedTuple):
+    """Decisions drawn from a buffer: B observations by name, actions (B, m), and (B,) of everything else."""
+
+    observations: dict[str, Single]
+    actions: Single
+    next_observations: dict[str, Single]
+    ended: Single
+    reward: Single
+    discount: Single
+    """Discount of what follows, by the algorithm's gamma or by the time that the decision took."""
+    elapsed: Single
+    """Time that the decision took, [s]; infinite where it is not told, as the whole plan is carried out then."""
+    outcomes: Outcomes
+
+
+class OutcomeReplayBuffer(TimedDictReplayBuffer):
+    """Replay buffer of dictionaries that keeps the outcome of each decision as `info` tells it.
+
+    Args:
+        *args: Arguments of :class:`stable_baselines3.common.buffers.DictReplayBuffer`.
+        gamma: Discount of one unit of time.
+        unit: [s]; None discounts every decision by gamma, no matter how long it takes.
+        key: Of the infos, where they tell the elapsed time [s].
+        **kwargs: As `args`.
+    """
+
+    def __init__(
+        self, *args: Any, gamma: float = 0.0, unit: float | None = None, key: str = ELAPSED, **kwargs: Any
+    ) -> None:
+        DictReplayBuffer.__init__(self, *args, **kwargs)
+        if self.optimize_memory_usage:
+            raise ValueError("optimize_memory_usage must be False where the terms of the reward are kept")
+        self.gamma = gamma
+        self.time_discount = None if unit is None else TimeDiscount(gamma=gamma, unit=unit, key=key)  # type: ignore[assignment]
+        self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
+        self._begins = False
+        self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
+        self.outcomes = np.full(
+            (self.buffer_size, self.n_envs, len(Outcomes._fields)), np.nan, dtype=np.float32
+        )
+
+    def add(
+        self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
+    ) -> None:
+        """Keep a transition of every environment."""
+        if self.time_discount is not None:
+            self.discounts[self.pos] = self.time_discount.of(infos)
+        before = self._clearance_before()
+        for i, info in enumerate(infos):
+            self.elapsed[self.pos, i] = info.get(ELAPSED, np.inf)
+            self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
+        DictReplayBuffer.add(self, obs, next_obs, action, reward, done, infos)
+
+    def begin(self) -> None:
+        """Note that all environments begin new episodes, whether or not the last ones had come to an end."""
+        self._begins = True
+
+    def _clearance_before(self) -> Single:
+        """Return the sums of the clearance terms of the running episodes, shape (N,); NaN where one begins."""
+        begins, self._begins = self._begins, False
+        if begins or (not self.pos and not self.full):
+            return np.full(self.n_envs, np.nan, dtype=np.float32)
+        last = self.pos - 1
+        over = self.dones[last] > 0.5
+        return np.where(over, np.nan, self.outcomes[last, :, Outcomes._fields.index("clearance")])
+
+    def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
+        """Return `batch_size` decisions drawn with replacement."""
+        rows = np.random.randint(0, self.size(), size=batch_size)  # noqa: NPY002 - as SB3
+        at = rows, np.random.randint(0, self.n_envs, size=batch_size)  # noqa: NPY002
+        return OutcomeSamples(
+            {name: part[at] for name, part in self.observations.items()},
+            self.actions[at],
+            {name: part[at] for name, part in self.next_observations.items()},
+            np.asarray(self.dones[at] * (1.0 - self.timeouts[at]), dtype=np.float32),
+            self.rewards[at],
+            self.discounts[at],
+            self.elapsed[at],
+            Outcomes(*self.outcomes[at].T),
+        )
+
+
+def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
+    """Return the outcome that `info` tells, or NaN where its terms do not sum to the reward.
+
+    Args:
+        info: Of the decision.
+        reward: Of the decision.
+        before: Sum of the clearance terms of the episode's earlier decisions; NaN where there are none.
+    """
+    unknown = (np.nan,) * len(Outcomes._fields)
+    if not all(name in info for name in TERMS):
+        return unknown
+    success, collision, clearance, goal_error, smoothness, duration = (float(info[name]) for name in TERMS)
+    total = success + collision + clearance + goal_error + smoothness + duration
+    if abs(total - reward) > REWARD_TOLERANCE:
+        return unknown
+    succeeded = bool(info.get("is_success", success > 0.0))
+    contact = bool(info.get("collision", collision < 0.0))
+    first = bool(np.isnan(before))
+    lower = first or clearance < -LOWER
+    so_far = clearance if first else before + clearance
+    return float(succeeded), float(contact), so_far, float(lower), goal_error, smoothness + duration

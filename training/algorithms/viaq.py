@@ -1,0 +1,299 @@
+"""Q-learning over candidate plans, with a critic that is a minimum over obstacles.
+
+An algorithm on Stable-Baselines3's :class:`OffPolicyAlgorithm`. There is no actor: the policy evaluates many candidate
+actions with the critic and takes the best (as QT-Opt does: Kalashnikov et al. 2018, arXiv 1806.10293). The critic is
+regressed on the terms of the environment's reward, each of which `info` tells; it never computes a distance to an
+obstacle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from torch import Tensor
+from torch.nn import functional
+
+from viapoint.envs.arms import ARMS
+from viapoint.envs.mdp.rewards import StepRewardWeights
+from viapoint.envs.mdp.task import Task
+from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
+from viapoint.training.algorithms.policy import KEEP, Values, ViaQPolicy
+from viapoint.training.config.checks import PARTICULAR, check_hyperparameters, check_via_policy
+from viapoint.training.search.candidates import candidate_actions
+
+OWN = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
+"""Settings that other off-policy algorithms do not have."""
+BOUND = ("arm", "whole_arm", "action")
+"""Parts of a task that an agent cannot do without: it plans with them."""
+CLEARANCE_SCALE = 0.4
+"""Error of the clearance term that counts one, as a share of the term's weight: 2 cm."""
+KEPT = 0.5
+"""Share of random decisions on the way that keep the plan."""
+CONTACT_WEIGHT = 0.1
+"""Weight of the loss for contact beside that for clearance, which tells the same more finely."""
+
+
+class ViaQ(OffPolicyAlgorithm):
+    """Off-policy learner of via-points that ranks candidate plans.
+
+    Args:
+        policy: `ViaQPolicy`.
+        env: An environment of this package whose actions are whole movements, or many of them.
+        learning_rate: A number, or a function of the progress that remains.
+        buffer_size: Decisions that are kept.
+        learning_starts: Decisions taken at random before anything is learned.
+        batch_size: Decisions of an update.
+        gamma: Discount of what follows a decision; without effect where an episode is one decision.
+        gradient_steps: Updates after each step of all environments.
+        explore_uniformly: Share of decisions that are random later on.
+        temperature: Difference of Q that makes one candidate e times as likely as another.
+        explore_candidates: Candidates of each decision during training.
+        next_candidates: Candidates over which the value of the next observation is maximised.
+        policy_kwargs: Arguments of :class:`ViaQPolicy`; the task is asked of `env`.
+        **kwargs: Arguments of :class:`OffPolicyAlgorithm`.
+
+    Raises:
+        ValueError: A setting is out of range, or the environment lacks what the algorithm needs.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaQPolicy": ViaQPolicy}
+    policy: ViaQPolicy
+    replay_buffer: OutcomeReplayBuffer | None
+
+    def __init__(
+        self,
+        policy: str | type[ViaQPolicy],
+        env: Any,
+        learning_rate: Any = 3e-3,
+        *,
+        buffer_size: int = 50_000,
+        learning_starts: int = 4_096,
+        batch_size: int = 256,
+        gamma: float = 0.99,
+        gradient_steps: int = 16,
+        explore_uniformly: float = 0.25,
+        temperature: float = 0.1,
+        explore_candidates: int = 32,
+        next_candidates: int = 8,
+        policy_kwargs: dict[str, Any] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        replay_buffer_class: Any = None,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.explore_uniformly, self.temperature = explore_uniformly, temperature
+        self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
+        narrower = {name: kwargs[name] for name in PARTICULAR["viaq"] if name in kwargs}
+        check_hyperparameters("viaq", _plain({**narrower, **{name: getattr(self, name) for name in OWN}}))
+        check_via_policy(_plain(policy_kwargs or {}))
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=OutcomeReplayBuffer,
+            replay_buffer_kwargs={"gamma": gamma, **(replay_buffer_kwargs or {})},
+            policy_kwargs=dict(policy_kwargs or {}),
+            support_multi_env=True,
+            sde_support=False,
+            **kwargs,
+        )
+        if self.env is not None:
+            self.policy_kwargs.setdefault("task", task_of(self.env).as_dict())
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._check_env(self.env)
+        super()._setup_model()
+        self.actor = self.policy
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Set the environment to learn on.
+
+        Raises:
+            ValueError: The environment does not fit the agent.
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        self._check_env(wrapped)
+        super().set_env(wrapped, force_reset)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        before = self._last_obs
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self._last_obs is not before and self.replay_buffer is not None:  # the environment was reset
+            self.replay_buffer.begin()
+        return prepared
+
+    def _check_env(self, env: VecEnv) -> None:
+        mine, theirs = (
+            task.as_dict() for task in (Task.from_dict(self.policy_kwargs["task"], ARMS), task_of(env))
+        )
+        others = [name for name in BOUND if mine[name] != theirs[name]]
+        if others:
+            raise ValueError(
+                f"the environment must have the {', '.join(others)} that the agent was made for: "
+                f"{ {name: mine[name] for name in others} }, got { {name: theirs[name] for name in others} }"
+            )
+        normalized = unwrap_vec_normalize(env)
+        if normalized is not None and normalized.norm_obs:
+            raise ValueError("ViaQ computes with metres: VecNormalize must be made with norm_obs=False")
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """Update the critic `gradient_steps` times."""
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = []
+        for _ in range(gradient_steps):
+            parts = self._losses(self.replay_buffer.sample_outcomes(batch_size))
+            loss: Any = sum(parts.values())
+            self.policy.optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.policy.critic.parameters(), 10.0)
+            self.policy.optimizer.step()
+            if self.policy.critic_target is not None:
+                polyak_update(
+                    self.policy.critic.parameters(), self.policy.critic_target.parameters(), self.tau
+                )
+            losses.append([float(part.detach()) for part in parts.values()])
+            self._n_updates += 1
+        for name, value in zip(parts, np.mean(losses, axis=0), strict=True):
+            self.logger.record(f"train/{name}_loss", float(value))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
+        """Return the losses of the critic's predictions, by name."""
+        policy, critic = self.policy, self.policy.critic
+        inputs = policy.inputs(batch.observations, batch.actions[:, None])
+        if policy.replanning:
+            inputs = inputs._replace(until=torch.from_numpy(batch.elapsed)[:, None])
+        values = Values(*(each[:, 0] for each in critic(inputs)))
+        following = self._following(batch)
+        ended, discount = torch.from_numpy(batch.ended), torch.from_numpy(batch.discount)
+        goes_on = (1.0 - ended) * discount if following is not None else torch.zeros_like(ended)
+        known = torch.from_numpy(np.isfinite(batch.outcomes.success))
+        outcomes = Outcomes(*(torch.nan_to_num(torch.from_numpy(each)) for each in batch.outcomes))
+        contact, arrives, rest = outcomes.contact, outcomes.success, outcomes.rest
+        if following is not None:
+            arrives = torch.where(ended > 0.5, arrives, discount * torch.sigmoid(following.arrives))
+            rest = rest + goes_on * following.rest
+        carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
+        losses = {
+            "clearance": self._clearance_loss(values.clearance, outcomes, known),
+            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.clear, 1.0 - contact), carried_out),
+            "arrival": _mean(_cross_entropy(values.arrives, arrives), known & (contact < 0.5)),
+            "rest": 10.0
+            * _mean(functional.smooth_l1_loss(values.rest, rest, beta=0.1, reduction="none"), known),
+        }
+        if not bool(known.all()):
+            target = torch.from_numpy(batch.reward)
+            if following is not None:
+                target = target + goes_on * critic.value(following).detach()
+            losses["reward"] = _mean(
+                functional.smooth_l1_loss(critic.value(values), target, beta=0.2, reduction="none"), ~known
+            )
+        return losses
+
+    def _clearance_loss(self, predicted: Tensor, outcomes: Outcomes, known: Tensor) -> Tensor:
+        """Return the loss of the clearance of what was carried out.
+
+        Where an earlier decision of the episode came nearer to an obstacle, this one was no nearer: then only a
+        prediction below that counts.
+        """
+        scale = CLEARANCE_SCALE * max(float(self.policy.task.weights.clearance), 1e-3)
+        apart = (predicted - outcomes.clearance) / scale
+        apart = torch.where(outcomes.lower > 0.5, apart, apart.clamp(max=0.0))
+        return _mean(
+            functional.smooth_l1_loss(apart, torch.zeros_like(apart), beta=0.2, reduction="none"), known
+        )
+
+    @torch.no_grad()
+    def _following(self, batch: OutcomeSamples) -> Values | None:
+        """Return the target critic's predictions for the best of a few candidates after each decision."""
+        policy, critic = self.policy, self.policy.critic_target
+        if critic is None or not self.gamma:
+            return None
+        every = candidate_actions(policy.task, policy.candidates, replanning=True)
+        shape = len(batch.ended), self.next_candidates
+        chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
+        chosen[:, 0] = 0
+        values = critic(policy.inputs(batch.next_observations, every[chosen]))
+        worth = critic.value(values)
+        worth[:, 0] += KEEP
+        best = worth.argmax(dim=1, keepdim=True)
+        return Values(*(each.gather(1, best)[:, 0] for each in values))
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return random actions at first and for some environments always, for the others one of the candidates."""
+        size = self.policy.task.action.size
+        uniform = np.random.uniform(-1.0, 1.0, (n_envs, size)).astype(np.float32)  # noqa: NPY002 - seeded by SB3
+        if self.policy.replanning:  # a plan that is revised at random in every decision hardly ever arrives
+            uniform[np.random.uniform(size=n_envs) < KEPT] = 0.0  # noqa: NPY002
+        if self.num_timesteps < learning_starts:
+            return uniform, uniform
+        observation: Any = self._last_obs
+        candidates = np.random.uniform(-1.0, 1.0, (n_envs, self.explore_candidates, size))  # noqa: NPY002
+        candidates[:, 0] = 0.0
+        candidates = candidates.astype(np.float32)
+        values = self.policy.values(observation, candidates) / self.temperature
+        # The maximum of values plus Gumbel noise is distributed as their softmax.
+        noisy = values + np.random.gumbel(size=values.shape)  # noqa: NPY002
+        chosen = candidates[np.arange(n_envs), noisy.argmax(axis=1)]
+        explore = np.random.uniform(size=(n_envs, 1)) < self.explore_uniformly  # noqa: NPY002
+        actions = np.where(explore, uniform, chosen).astype(np.float32)
+        return actions, actions
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+
+def task_of(env: VecEnv) -> Task:
+    """Return the task of an environment whose actions are whole movements.
+
+    Raises:
+        ValueError: The environment is not one of this package, or an action is less than a movement.
+    """
+    try:
+        task = env.get_attr("task", indices=0)[0]
+    except AttributeError:
+        task = None
+    if not isinstance(task, Task) or isinstance(task.weights, StepRewardWeights):
+        raise ValueError(
+            "ViaQ needs an environment of this package in which an action is a whole movement, such as "
+            f"viapoint/PlanarObstacles-v0, got {env.observation_space} with {env.action_space}"
+        )
+    return task
+
+
+def _mean(losses: Tensor, counted: Tensor) -> Tensor:
+    """Return the mean over all rows, with zero for those that do not count."""
+    return (losses * counted).mean()
+
+
+def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
+    return functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with numbers of NumPy as those of Python."""
+    return {name: each.item() if isinstance(each, np.generic) else each for name, each in settings.items()}

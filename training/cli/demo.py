@@ -1,0 +1,174 @@
+"""The whole story in one folder: train, measure, draw, film."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.cli.commands import progress_bar, spread
+from viapoint.training.config.configs import DemoConfig, TrainConfig
+from viapoint.training.evaluation import report
+from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.io.files import BadFileError, read_json
+from viapoint.training.planners.baselines import Method, make_method
+from viapoint.training.plotting import plots
+from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.plotting.video import film
+from viapoint.training.runs.agents import Agent, load_agent
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import one_thread, train
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
+
+BASELINES = ("search16", "search512", "straight", "random")
+PICTURES = 12
+"""In the gallery."""
+MOVEMENTS = 4
+"""In the film."""
+
+
+class StoredSolutions:
+    """The solutions that the planner found when the scenes were frozen; `viapoint evaluate` runs it anew."""
+
+    name = "planner (stored)"
+    timed = False
+
+    def __init__(self, frozen: FrozenScenes) -> None:
+        keys = map(self._key, *frozen.scenes)
+        self._solutions = dict(zip(keys, frozen.solution, strict=True))
+
+    def decide(self, observation: Any, scenes: Scenes) -> NDArray[np.float64]:
+        """See :class:`viapoint.training.planners.baselines.Method`; the scenes must be of the set."""
+        return np.array([self._solutions[key] for key in map(self._key, *scenes)])
+
+    @staticmethod
+    def _key(*fields: NDArray[np.float64]) -> bytes:
+        return b"".join(field.tobytes() for field in fields)
+
+
+def run(config: DemoConfig) -> None:
+    """Train an agent, measure it, draw and film it, and print the table and where everything is.
+
+    What a folder holds already is kept, so a second call only shows it, and an interrupted one goes on.
+    """
+    began = time.monotonic()
+    folder = config.out
+    trained = _trained(config)
+    agent = load_agent(folder, None)
+    frozen = load("test", config.env).take(slice(0, config.n_scenes))
+    record = _measured(config, agent, frozen)
+    pictures: dict[str, Callable[[Path], Any]] = {
+        "learning_curve.png": lambda path: plots.learning_curve(path, {"agent": trained.curve}),
+        "success_by_band.png": lambda path: plots.success_by_band(path, record),
+        "gallery.png": lambda path: gallery(
+            path,
+            entries(agent, frozen, PICTURES),
+            heading=f"The agent alone in {frozen.name} scenes, easy to hard",
+        ),
+        "movements.mp4": lambda path: _film(path, agent, frozen),
+    }
+    for name, draw in pictures.items():
+        _once(folder / name, agent.folder / "weights.safetensors", draw)
+    report.show(record)
+    for name, what in (
+        ("table.md", "the table"),
+        ("table.json", "the table with every outcome"),
+        ("learning_curve.png", "success during training"),
+        ("success_by_band.png", "success by difficulty"),
+        ("gallery.png", "test scenes, planned and executed"),
+        ("movements.mp4", "movements"),
+        (agent.folder.name, "the trained agent"),
+    ):
+        print(f"  {folder / name!s:<34} {what}")
+    print(f"done in {time.monotonic() - began:.0f} s")
+
+
+def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
+    """The agent's movements in scenes spread over all difficulties, ready to be drawn."""
+    env = gym.make(agent.env_id, **agent.env_kwargs)
+    inner: Any = env.unwrapped
+    by_difficulty = np.argsort(-frozen.share, kind="stable")
+    result = []
+    for row in by_difficulty[spread(len(by_difficulty), count)]:
+        scene = frozen.scenes.take([row])
+        observation, _ = env.reset(options=scene.as_options())
+        action, _ = agent.model.predict(observation, deterministic=True)
+        info = env.step(action)[-1]
+        result.append(
+            Entry(
+                arm=inner.task.arm,
+                scene=scene,
+                plan=inner.last_plan,
+                rollout=inner.last_rollout,
+                title=f"share {BANDS[frozen.band[row]]}",
+                success=bool(info["is_success"]),
+                whole_arm=inner.task.whole_arm,
+            )
+        )
+    env.close()
+    return result
+
+
+def _trained(config: DemoConfig) -> Run:
+    """The run in the folder, trained to its end."""
+    asked = TrainConfig(env=config.env, seed=config.seed, n_timesteps=config.total_timesteps, out=config.out)
+    if not (config.out / "config.json").exists():
+        print(f"training for {asked.total_timesteps} decisions; Ctrl-C saves, and the same command goes on")
+        return train(asked)
+    found = Run(config.out)
+    for name in ("env", "seed"):
+        if getattr(found.config, name) != getattr(config, name):
+            raise BadFileError(
+                config.out,
+                f"holds a run with {name} {getattr(found.config, name)!r}, not {getattr(config, name)!r}; "
+                "name another folder with --out",
+            )
+    done = found.decisions
+    if done >= (config.n_timesteps or found.config.total_timesteps):
+        print(f"{config.out} holds an agent trained for {done} decisions: starting from it")
+        return found
+    print(f"{config.out} holds a training stopped after {done} decisions: going on with it")
+    return train(TrainConfig(env=config.env, n_timesteps=config.n_timesteps, out=config.out, resume=True))
+
+
+def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
+    """The evaluation, from the folder where it holds one of this agent on these scenes."""
+    path = config.out / "table.json"
+    identity = {
+        "sha256": frozen.sha256,
+        "weights_sha256": hashlib.sha256((agent.folder / "weights.safetensors").read_bytes()).hexdigest(),
+        "checks": config.checks,
+    }
+    if path.exists():
+        record = read_json(path)
+        if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
+            print(f"{path} holds its evaluation: starting from it")
+            return record
+    methods: list[Method] = [agent.method(), agent.method(config.checks), agent.untrained()]
+    methods += [*(make_method(name, config.env) for name in BASELINES), StoredSolutions(frozen)]
+    with progress_bar(methods, len(frozen.share)) as progress, one_thread():
+        result = evaluate(methods, frozen, config.env, progress=progress)
+    record = {**result.as_json(), **identity}
+    report.write(record, config.out)
+    if result.partial:
+        raise KeyboardInterrupt
+    return record
+
+
+def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
+    film(path, env, frozen.scenes.take(spread(len(frozen.share), MOVEMENTS)), agent.method().decide)
+    env.close()
+
+
+def _once(path: Path, source: Path, draw: Callable[[Path], Any]) -> None:
+    """Draw a file unless it is there and newer than what it shows."""
+    if not path.exists() or path.stat().st_mtime < source.stat().st_mtime:
+        draw(path)

@@ -1,0 +1,21 @@
+"""Entry point of the command `viapoint`: it imports nothing of the extra `training` before it is known to be there."""
+
+from __future__ import annotations
+
+import sys
+
+from viapoint.training.cli import doctor
+
+
+def main() -> None:
+    """Run the command; where its packages are missing, print what to install and exit with code 2."""
+    try:
+        from viapoint.training.cli.main import main as run
+    except ImportError as error:
+        if sys.argv[1:2] == ["doctor"]:
+            doctor.run_without_command(sys.argv[2:])
+        if "--debug" in sys.argv:
+            raise
+        print(f"viapoint: {doctor.explain_import_error(error)}", file=sys.stderr)
+        raise SystemExit(2) from None
+    run()

@@ -1,0 +1,154 @@
+"""The command `viapoint`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import io
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple, Union
+
+import tyro
+
+from viapoint.envs.registration import ENV_IDS
+from viapoint.training.cli.doctor import explain_import_error
+from viapoint.training.config.configs import (
+    BenchConfig,
+    DemoConfig,
+    DoctorConfig,
+    EvaluateConfig,
+    ImportConfig,
+    PaperConfig,
+    PlayConfig,
+    TrainConfig,
+)
+
+
+class UsageError(ValueError):
+    """A command line that is not understood; the message is one line."""
+
+
+class Command(NamedTuple):
+    """One subcommand: what it can be told, and the function that does it, imported only when it is called."""
+
+    config: type[Any]
+    module: str
+    function: str
+
+    def __call__(self, config: Any) -> None:
+        """Do it."""
+        getattr(importlib.import_module(self.module), self.function)(config)
+
+
+COMMANDS: dict[str, Command] = {
+    "train": Command(TrainConfig, "viapoint.training.cli.commands", "train"),
+    "evaluate": Command(EvaluateConfig, "viapoint.training.cli.commands", "evaluate"),
+    "play": Command(PlayConfig, "viapoint.training.cli.commands", "play"),
+    "bench": Command(BenchConfig, "viapoint.training.cli.bench", "run"),
+    "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
+    "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
+    "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
+    "import-sb3": Command(ImportConfig, "viapoint.training.runs.model_io", "run"),
+}
+"""Every subcommand by its name; one line adds one."""
+
+DESCRIPTION = (
+    "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
+    "`viapoint COMMAND --help` shows a command's options and an example; --debug shows where an error came from. "
+    f"Environments: {', '.join(ENV_IDS)}."
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a subcommand; an error is one line on the standard error output and exit code 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        config = parse(words)
+        if isinstance(config, TrainConfig) and config.resume:
+            _check_resumed(config, words)
+        next(command for command in COMMANDS.values() if type(config) is command.config)(config)
+    except KeyboardInterrupt:
+        _leave("stopped", 130)
+    except Exception as error:
+        if debug:
+            raise
+        _leave(_one_line(error), getattr(error, "exit_code", 2))
+
+
+def parse(words: Sequence[str], usual: Any = None) -> Any:
+    """The configuration that a command line stands for.
+
+    Args:
+        words: Of the command line, without the program's name.
+        usual: Of the command's configuration, what stands for everything that is not told; its defaults if not given.
+
+    Raises:
+        SystemExit: Help was asked for; code 0.
+        UsageError: A word is not understood or not allowed.
+    """
+    kinds = [
+        Annotated[
+            command.config,
+            tyro.conf.subcommand(name=name, default=usual)
+            if isinstance(usual, command.config)
+            else tyro.conf.subcommand(name=name),
+        ]
+        for name, command in COMMANDS.items()
+    ]
+    union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                union,
+                prog="viapoint",
+                description=DESCRIPTION,
+                args=list(words),
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(_unboxed(complaint.getvalue())) from None
+
+
+def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
+    """Refuse flags that are not those of the run to resume, also where they say what is usual otherwise."""
+    from viapoint.training.runs.run_dir import Run
+    from viapoint.training.runs.trainer import check_unchanged
+
+    run = Run(config.folder)
+    usual = dataclasses.replace(run.config, out=config.out, resume=True)
+    check_unchanged(run, parse(words, usual), usual)
+
+
+def _unboxed(text: str) -> str:
+    """The words in tyro's boxes, without the frame, its title and its rules.
+
+    Where the output knows only ASCII, there is no frame, and a rule follows the title.
+    """
+    lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
+    if "╭" not in text:
+        rule = next((i for i, line in enumerate(lines) if line and not line.strip("-")), -1)
+        lines = lines[rule + 1 :]
+    return " ".join(line for line in lines if line.strip("-")) or text
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, ImportError):
+        return explain_import_error(error)
+    known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
+        ("viapoint", "gymnasium")
+    )
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if known else f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+def _leave(message: str, code: int) -> None:
+    print(f"viapoint: {message}", file=sys.stderr)
+    raise SystemExit(code)

@@ -1,0 +1,300 @@
+"""Checks of configurations and hyperparameters."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS
+
+DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
+
+METHODS = (
+    "agent", "untrained", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
+    "search16", "search64", "search512", "search4096",
+)  # fmt: skip
+"""Everything that can be measured; not every environment has each of them."""
+ELSEWHERE = {
+    "num_envs": "--n-envs says how many environments are stepped together",
+    "seed": "--seed is that of everything",
+    "env_id": "--env names the environment",
+    "id": "--env names the environment",
+    "render_mode": "viapoint play films",
+    "vectorization_mode": "the environments are native vector environments",
+    "vector_kwargs": "the environments are native vector environments",
+    "wrappers": "the environments are trained on as they are",
+}
+"""What is no argument of a training's environment, and what is instead."""
+GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
+"""Of what has a limit: seeds as NumPy's old generator takes them, environments as many as may fit into memory."""
+
+
+def check_env(env: str) -> None:
+    """Refuse an id that is not one of this package's."""
+    if env not in ENV_IDS:
+        raise ValueError(
+            f"env must be one of {', '.join(ENV_IDS)}, which `import viapoint.envs` registers; got {env!r}"
+        )
+
+
+def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
+    """Refuse arguments that are given elsewhere; the others are checked by the environment."""
+    if not isinstance(kwargs, Mapping):
+        raise ValueError(f"env_kwargs must be values by name, got {kwargs!r}")
+    for name in kwargs:
+        if name in ELSEWHERE:
+            raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
+
+
+def check_whole_movements(env: str) -> None:
+    """Refuse a task in which an action is less than a whole movement."""
+    if env in STEP_TASKS or env in ONLINE_TASKS:
+        like = STEP_TASKS.get(env, DEFAULT_ENV)
+        raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
+
+
+def check_has_scenes(env: str) -> None:
+    """Refuse a task that no scenes are shipped for."""
+    if env in OWN_ARM_TASKS:
+        raise ValueError(f"env must be one with frozen scenes, {OWN_ARM_TASKS[env]} for one, got {env!r}")
+
+
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Refuse anything but whole numbers from `least` to the greatest that makes sense."""
+    most = GREATEST.get(name)
+    known = isinstance(value, int) and not isinstance(value, bool)
+    if not known or value < least or (most is not None and value > most):
+        allowed = f"{least} or more" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
+
+
+def check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) -> None:
+    """Refuse two agents, or none where one is needed."""
+    if run is not None and pretrained is not None:
+        raise ValueError("give a run folder or --pretrained, not both")
+    if needed and run is None and pretrained is None:
+        raise ValueError("name a run folder, or an environment with --pretrained")
+
+
+def check_methods(methods: tuple[str, ...]) -> None:
+    """Refuse none, names that there are not, and one that is there twice, as a table has one row for each."""
+    if not methods:
+        raise ValueError("methods must name at least one method")
+    for name in methods:
+        if name not in METHODS:
+            raise ValueError(f"methods must be some of {', '.join(METHODS)}, got {name!r}")
+        if methods.count(name) > 1:
+            raise ValueError(f"methods must differ, {name} is there twice")
+
+
+def check_file(name: str, path: Path | None, suffix: str = "") -> None:
+    """Refuse a file that cannot be written, before there is anything to write."""
+    if path is None:
+        return
+    if suffix and path.suffix.lower() != suffix:
+        raise ValueError(f"{name} must end in {suffix}, got {path}")
+    if os.path.isdir(path):
+        raise ValueError(f"{name} must be a file, and {path} is a folder")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ValueError(f"{name} must be a file, and {path} is something else")
+    _check_place(name, path, path.parent)
+
+
+def check_folder(name: str, path: Path | None) -> None:
+    """Refuse a folder that cannot be written to, before there is anything to write."""
+    if path is not None:
+        _check_place(name, path, path)
+
+
+def _check_place(name: str, path: Path, folder: Path) -> None:
+    """Whether a folder is there or can be made, and can be written to."""
+    there = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.exists(each))
+    if not os.path.isdir(there):
+        raise ValueError(f"{name} {path} cannot be written: {there} is no folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ValueError(f"{name} {path} cannot be written: nothing may be written in {there}")
+
+
+class Allowed(NamedTuple):
+    """Values of one hyperparameter."""
+
+    words: str
+    """As an error says it, behind "must be"."""
+    fits: Callable[[Any], bool]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _whole(least: int) -> Allowed:
+    return Allowed(f"a whole number, {least} or more", lambda value: _is_whole(value, least))
+
+
+def _between(low: float, high: float) -> Allowed:
+    return Allowed(
+        f"a number from {low:g} to {high:g}", lambda value: _is_number(value) and low <= value <= high
+    )
+
+
+def _or(one: Allowed, other: Allowed) -> Allowed:
+    return Allowed(f"{one.words}, or {other.words}", lambda value: one.fits(value) or other.fits(value))
+
+
+def _is_linear(value: Any) -> bool:
+    return (
+        isinstance(value, Mapping)
+        and set(value) == {"kind", "start", "end", "end_fraction"}
+        and value["kind"] == "linear"
+        and all(_is_number(value[name]) and value[name] >= 0 for name in ("start", "end"))
+        and _is_number(value["end_fraction"])
+        and 0 < value["end_fraction"] <= 1
+    )
+
+
+def _is_normal(value: Any) -> bool:
+    named = isinstance(value, Mapping) and set(value) == {"kind", "sigma"} and value["kind"] == "normal"
+    return named and _is_number(value["sigma"]) and value["sigma"] >= 0
+
+
+def _is_automatic(value: Any) -> bool:
+    found = re.fullmatch(r"auto(_(?P<start>[0-9.]+(e-?[0-9]+)?))?", value) if isinstance(value, str) else None
+    try:
+        return found is not None and float(found["start"] or 1.0) > 0.0
+    except ValueError:
+        return False
+
+
+def _is_steps(value: Any) -> bool:
+    pair = isinstance(value, list | tuple) and len(value) == 2 and value[1] == "step"
+    return _is_whole(value, 1) or (pair and _is_whole(value[0], 1))
+
+
+FLAG = Allowed("true or false", lambda value: isinstance(value, bool))
+NONE = Allowed("null", lambda value: value is None)
+POSITIVE = Allowed("a number greater than 0", lambda value: _is_number(value) and value > 0)
+NOT_NEGATIVE = Allowed("a number, 0 or more", lambda value: _is_number(value) and value >= 0)
+FINITE = Allowed("a number", _is_number)
+LINEAR = Allowed('{"kind":"linear","start":S,"end":E,"end_fraction":F}', _is_linear)
+NORMAL = Allowed('{"kind":"normal","sigma":S}', _is_normal)
+AUTOMATIC = Allowed('"auto" or "auto_START"', _is_automatic)
+AUTO = Allowed('"auto"', lambda value: value == "auto")
+STEPS = Allowed('a whole number, 1 or more, or [N,"step"]', _is_steps)
+SETTINGS = Allowed('settings by name, {"net_arch":[256,256]}', lambda value: isinstance(value, Mapping))
+SHARE = _between(0, 1)
+
+HYPERPARAMETERS: dict[str, Allowed] = {
+    "learning_rate": _or(POSITIVE, LINEAR),
+    "gamma": SHARE,
+    "batch_size": _whole(1),
+    "policy_kwargs": _or(SETTINGS, NONE),
+    # of algorithms with a replay buffer
+    "buffer_size": _whole(1),
+    "learning_starts": _whole(0),
+    "train_freq": STEPS,
+    "gradient_steps": _whole(-1),  # -1: as many as there were steps
+    "tau": SHARE,
+    "n_steps": _whole(1),
+    "action_noise": _or(NORMAL, NONE),
+    "optimize_memory_usage": FLAG,
+    # TD3
+    "policy_delay": _whole(1),
+    "target_policy_noise": NOT_NEGATIVE,
+    "target_noise_clip": NOT_NEGATIVE,
+    # SAC and TQC
+    "ent_coef": _or(NOT_NEGATIVE, AUTOMATIC),
+    "target_entropy": _or(FINITE, AUTO),
+    "target_update_interval": _whole(1),
+    "top_quantiles_to_drop_per_net": _whole(0),
+    "use_sde": FLAG,
+    "use_sde_at_warmup": FLAG,
+    "sde_sample_freq": _whole(-1),  # -1: at the beginning only
+    # PPO
+    "n_epochs": _whole(1),
+    "gae_lambda": SHARE,
+    "clip_range": _or(POSITIVE, LINEAR),
+    "clip_range_vf": _or(_or(POSITIVE, LINEAR), NONE),
+    "normalize_advantage": FLAG,
+    "vf_coef": NOT_NEGATIVE,
+    "max_grad_norm": POSITIVE,
+    "target_kl": _or(POSITIVE, NONE),
+    # ViaQ
+    "explore_uniformly": SHARE,
+    "temperature": POSITIVE,
+    "explore_candidates": _whole(2),
+    "next_candidates": _whole(1),
+}
+"""By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaQ."""
+
+PARTICULAR: dict[str, dict[str, Allowed]] = {
+    "ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)},
+    "viaq": {
+        "action_noise": Allowed("null, as it explores by itself", NONE.fits),
+        "n_steps": Allowed("1", lambda value: value == 1 and not isinstance(value, bool)),
+        "optimize_memory_usage": Allowed("false", lambda value: value is False),
+        "use_sde": Allowed("false", lambda value: value is False),
+    },
+}
+"""What is narrower for one algorithm."""
+
+VIA_POLICY: dict[str, Allowed] = {
+    "form": Allowed("places or action", lambda value: value in ("places", "action")),
+    "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
+    "heads": _whole(1),
+    "width": _or(_whole(1), NONE),
+    "instants": _or(_whole(2), NONE),
+    "candidates": _whole(1),
+    "refinements": _whole(0),
+    "per_refinement": _whole(1),
+    "checks": _whole(0),
+    "optimizer_kwargs": _or(SETTINGS, NONE),
+}
+"""Allowed `policy_kwargs` of ViaQ, by name; the task is taken from the environment."""
+
+
+def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
+    """Refuse values that make no sense; names that there are not are refused by whoever builds the model.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"hyperparameters must be values by name, got {values!r}")
+    table = {**HYPERPARAMETERS, **PARTICULAR.get(algo, {})}
+    _check(f"of {algo}", table, values)
+    if algo == "viaq":
+        policy = values.get("policy_kwargs") or {}
+        unknown = sorted(set(policy) - set(VIA_POLICY))
+        if unknown:
+            raise ValueError(
+                f"policy_kwargs of viaq have no {unknown[0]!r}; they have {', '.join(VIA_POLICY)}"
+            )
+        check_via_policy(policy)
+
+
+def check_via_policy(values: Mapping[str, Any]) -> None:
+    """Refuse `policy_kwargs` of ViaQ that make no sense; names that are not in the table are passed over.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+    _check("in policy_kwargs of viaq", VIA_POLICY, values)
+    if values.get("form", "places") == "places" and values.get("pooling", "minimum") != "minimum":
+        raise ValueError(
+            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is places, got "
+            f"{values['pooling']!r}"
+        )
+
+
+def _check(where: str, table: Mapping[str, Allowed], values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if name in table and not table[name].fits(value):
+            raise ValueError(f"hyperparameter {name} {where} must be {table[name].words}, got {value!r}")

@@ -1,0 +1,155 @@
+"""Tuned settings of the learning algorithms, in one table."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
+
+Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """How an algorithm is run unless one says otherwise."""
+
+    policy: str
+    """One of the algorithm's policies."""
+    n_envs: int
+    """Environments that are stepped together."""
+    n_timesteps: int
+    """Decisions in all."""
+    eval_every: int = 1_000
+    """Decisions between two evaluations on the validation scenes."""
+    checkpoint_every: int = 5_000
+    """Decisions between two checkpoints."""
+    discount_unit: float | None = None
+    """Seconds that count gamma; None where each decision does, whatever it takes."""
+    hyperparameters: tuple[tuple[str, Any], ...]
+    """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.runs.model_io` writes them."""
+
+    def arguments(self) -> dict[str, Any]:
+        """The hyperparameters as a fresh dictionary."""
+        return copy.deepcopy(dict(self.hyperparameters))
+
+
+def _preset(
+    n_envs: int,
+    n_timesteps: int,
+    policy: str = "MultiInputPolicy",
+    *,
+    eval_every: int = 1_000,
+    checkpoint_every: int = 5_000,
+    discount_unit: float | None = None,
+    **hyperparameters: Any,
+) -> Preset:
+    return Preset(
+        policy=policy,
+        n_envs=n_envs,
+        n_timesteps=n_timesteps,
+        eval_every=eval_every,
+        checkpoint_every=checkpoint_every,
+        discount_unit=discount_unit,
+        hyperparameters=tuple(hyperparameters.items()),
+    )
+
+
+_NETWORK: dict[str, Any] = {
+    "features_extractor_class": {"kind": "extractor", "name": "SceneExtractor"},
+    "net_arch": [256, 256],
+}
+_FALLING: dict[str, Any] = {"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0}
+_OFF_POLICY: dict[str, Any] = {
+    "learning_rate": 1e-3,
+    "buffer_size": 200_000,
+    "learning_starts": 1024,
+    "batch_size": 256,
+    "gamma": 0.99,  # of no account where an episode is one decision
+    "train_freq": 1,
+    "gradient_steps": 16,
+    "policy_kwargs": _NETWORK,
+}
+_LITTLE_ENTROPY = "auto_0.02"
+"""Rewards are of size one: begun at 1, as it is otherwise, entropy outweighs them for ten thousand decisions."""
+_STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
+_SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
+
+PRESETS: dict[str, Preset] = {
+    "viaq": _preset(
+        64,
+        40_000,
+        "ViaQPolicy",  # its defaults are its settings
+        eval_every=5_000,
+        checkpoint_every=20_000,
+        learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
+    ),
+    "sac": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
+    "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
+    "ppo": _preset(
+        64,
+        400_000,
+        **_SELDOM,
+        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
+        n_steps=16,
+        batch_size=256,
+        n_epochs=10,
+        ent_coef=0.001,
+        policy_kwargs=_NETWORK,
+    ),
+}
+"""By the name the command line knows them by; the comments and units are those of Stable-Baselines3."""
+
+STEP_PRESETS: dict[str, Preset] = {
+    "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
+    "td3": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
+    "ppo": _preset(
+        64,
+        2_000_000,
+        eval_every=50_000,
+        checkpoint_every=200_000,
+        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
+        n_steps=64,
+        batch_size=512,
+        n_epochs=5,
+        gamma=0.98,
+        ent_coef=0.0,
+        policy_kwargs=_NETWORK,
+    ),
+}
+"""The same where an action lasts one control step, which then counts as a decision."""
+
+REACH_PRESETS: dict[str, Preset] = {
+    "viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000),
+}
+"""Where nothing is in the way, less will do."""
+
+ONLINE_PRESETS: dict[str, Preset] = {
+    name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
+} | {
+    "viaq": dataclasses.replace(
+        PRESETS["viaq"],
+        discount_unit=0.1,
+        hyperparameters=(
+            *PRESETS["viaq"].hyperparameters,
+            ("gradient_steps", 6),
+            ("next_candidates", 4),
+        ),
+    ),
+}
+"""Where plans are revised on the way: episodes are several decisions, and discounts follow time."""
+
+
+def preset_of(env_id: str, algo: Algorithm) -> Preset:
+    """What holds for an algorithm on an environment unless one says otherwise."""
+    if env_id in STEP_TASKS:
+        return STEP_PRESETS[algo]
+    if env_id in ONLINE_TASKS:
+        return ONLINE_PRESETS[algo]
+    task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
+    presets = REACH_PRESETS if task.get("n_obstacles") == 0 else PRESETS
+    return presets.get(algo, PRESETS[algo])

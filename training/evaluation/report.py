@@ -1,0 +1,142 @@
+"""An evaluation as a table: for the terminal, for a document, for a program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.scene_sets.scene_set import BANDS
+
+Summary = Mapping[str, Any]
+Record = Mapping[str, Any]
+"""What :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json` returns, or a file that holds it."""
+
+
+class Column(NamedTuple):
+    """One column of the table."""
+
+    heading: str
+    cell: Callable[[Summary], str]
+
+
+def _percent(rate: Summary | None) -> str:
+    return "-" if rate is None or rate["rate"] is None else f"{100.0 * rate['rate']:.1f} %"
+
+
+def _interval(rate: Summary) -> str:
+    ends = (f"{100.0 * rate[end]:.1f}".replace("100.0", "100") for end in ("low", "high"))
+    return "-" if rate["rate"] is None else "-".join(ends)
+
+
+def _number(name: str, scale: float, digits: int) -> Callable[[Summary], str]:
+    def cell(summary: Summary) -> str:
+        value = summary[name]
+        return "-" if value is None else f"{scale * value:.{digits}f}"
+
+    return cell
+
+
+def _in_band(name: str) -> Callable[[Summary], str]:
+    return lambda summary: _percent(summary["success_by_band"].get(name))
+
+
+def _in_family(name: str) -> Callable[[Summary], str]:
+    return lambda summary: _percent(summary.get("success_by_family", {}).get(name))
+
+
+COLUMNS = (
+    Column("success", lambda summary: _percent(summary["success"])),
+    Column("95 % interval", lambda summary: _interval(summary["success"])),
+    *(Column(f"share {band}", _in_band(band)) for band in BANDS),
+    Column("collision", lambda summary: _percent(summary["collision"])),
+    Column("clearance [mm]", _number("min_clearance", 1e3, 1)),
+    Column("goal error [mm]", _number("goal_error", 1e3, 2)),
+    Column("jerk ratio", _number("jerk_ratio", 1.0, 2)),
+    Column("SPL", _number("spl", 1.0, 3)),
+    Column("duration [s]", _number("duration", 1.0, 2)),
+    Column("decision [ms]", _number("decision_time", 1e3, 2)),
+    Column("98 % of them [ms]", _number("decision_time_98", 1e3, 2)),
+)
+
+NOTES = (
+    "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
+    "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
+    "that solve a scene; in hard sets also among scenes of each family. Clearance and goal error are medians "
+    "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted "
+    "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
+    "percentile; where that is missing, the mean in a batch."
+)
+
+
+HEADINGS, COLUMN = 21, 11
+"""Widths in the terminal: of the column of headings, and the least of a method's column, [characters]."""
+
+
+def rows(record: Record) -> list[list[str]]:
+    """Headings, then the cells of each method; columns in which no method has a value are left out."""
+    columns = _columns(record)
+    heads = ["method", *(column.heading for column in columns)]
+    table = [
+        [_name(name, summary), *(column.cell(summary) for column in columns)]
+        for name, summary in record["methods"].items()
+    ]
+    shown = [i for i in range(len(heads)) if any(line[i] != "-" for line in table)]
+    return [[line[i] for i in shown] for line in (heads, *table)]
+
+
+def _columns(record: Record) -> list[Column]:
+    """Those of every table, and behind the bands one for each family that there is."""
+    summaries = record["methods"].values()
+    names = dict.fromkeys(name for summary in summaries for name in summary.get("success_by_family", {}))
+    behind = 2 + len(BANDS)
+    return [*COLUMNS[:behind], *(Column(name, _in_family(name)) for name in names), *COLUMNS[behind:]]
+
+
+def title(record: Record) -> str:
+    """What was measured on what."""
+    number = max(summary["scenes"] for summary in record["methods"].values())
+    return f"{record['env']}, scenes {record['scenes']} ({number}, sha256 {record['sha256'][:12]})"
+
+
+def markdown(record: Record) -> str:
+    """The table as a document."""
+    head, *body = rows(record)
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"# {title(record)}\n\n{table}\n\n{NOTES}\n"
+
+
+def show(record: Record, console: Console | None = None) -> None:
+    """Print the table, turned on its side: one column for each method, in several tables where they are too many."""
+    console = console or Console()
+    heads, *body = rows(record)
+    fitting = max((console.width - HEADINGS) // COLUMN, 1)
+    for first in range(0, len(body), fitting):
+        lines = [heads, *body[first : first + fitting]]
+        table = Table(title=title(record) if not first else None, title_justify="left")
+        for i, line in enumerate(lines):
+            table.add_column(
+                escape(line[0]) if i else "", justify="right" if i else "left", no_wrap=not i, overflow="fold"
+            )
+        for i in range(1, len(heads)):
+            table.add_row(*(escape(line[i]) for line in lines))
+        console.print(table)
+
+
+def write(record: Record, folder: Path, stem: str = "table") -> tuple[Path, Path]:
+    """Write the table as Markdown and as JSON; the JSON holds every outcome of every scene, too."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document, data = folder / f"{stem}.md", folder / f"{stem}.json"
+    write_bytes(document, markdown(record).encode())
+    write_json(data, dict(record))
+    return document, data
+
+
+def _name(name: str, summary: Summary) -> str:
+    return f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name

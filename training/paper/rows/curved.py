@@ -1,0 +1,223 @@
+"""Rows 4 to 6: movements through one via-point."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.primitives import speed_valleys
+from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
+from viapoint.training.paper.passage_polynomial import closed_form, count_roots, passage_polynomial, root_of
+from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
+from viapoint.training.paper.reference_movements import (
+    curved,
+    passage_share,
+    smoothest,
+    target,
+    via_waypoints,
+)
+from viapoint.training.paper.simulated import Performed, perform
+
+Float = NDArray[np.float64]
+
+ENDS = ("T1", "T4")
+"""Of the family of curved movements; Fig. 1B shows one between these targets."""
+EXAMPLE = (0.35, -0.4)
+"""d1 / (d1 + d2) and d3 / (d1 + d2) of the movement of Fig. 1B, towards the body."""
+ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])
+"""d1 / (d1 + d2) of the family."""
+HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])
+"""d3 / (d1 + d2) of the family: high enough for two speed peaks everywhere, and within the reach."""
+
+
+def passage_claims(count: int = 300, seed: int = 0) -> list[Claim]:
+    """Row 4."""
+    wrong, difference = _count_and_compare(count, seed)
+    waypoints = via_waypoints(target(ENDS[0]), target(ENDS[1]), *EXAMPLE)
+    movement = smoothest(waypoints)
+    share = float(passage_share(movement))
+    time = np.linspace(0.0, 1.0, 401)
+    formula = 1e3 * float(np.abs(closed_form(waypoints, share, time) - movement(time)).max())
+    done = perform(movement)
+    arm_share = closest_approach(done, waypoints[1])
+    passed = 1e3 * float(np.linalg.norm(done.at(0, np.array([share]))[0] - waypoints[1]))
+    return [
+        Claim(
+            row=4, claim=f"Eq. C16 has one root in (0, 1): vias with another count, of {count} (exact arithmetic)",
+            figure="App. C", paper="only one acceptable root", model=float(wrong), promise=near(0.0, 0.0),
+        ),
+        Claim(
+            row=4, claim="Passage time from the exact root against the library's, the same vias: greatest difference",
+            figure="App. C", model=difference, promise=at_most(1e-12),
+        ),
+        Claim(
+            row=4, claim="Eqs. 4 and 5, misprints put right, give the same movement (arm: distance from the via-point "
+            "at t1)", figure="1B", paper="Eqs. 4, 5, C12 to C15", unit="mm", model=formula, promise=at_most(1e-9),
+            arm=passed, arm_promise=at_most(1.0), deviation=done.worst,
+        ),
+        Claim(
+            row=4, claim=f"t1/t_f of the movement of Fig. 1B, d1/(d1+d2) = {EXAMPLE[0]}, d3/(d1+d2) = "
+            f"{-EXAMPLE[1]} (arm: when nearest to the via-point)", figure="1B", paper="free, from Eq. C16",
+            model=share, promise=near(_exact_share(waypoints), 1e-12), arm=arm_share,
+            arm_promise=near(share, 0.01), deviation=done.worst,
+        ),
+    ]  # fmt: skip
+
+
+def _count_and_compare(count: int, seed: int) -> tuple[int, float]:
+    """Vias with another number of roots than one, and the greatest difference to the library's passage share."""
+    generator = np.random.default_rng(seed)
+    wrong, difference = 0, 0.0
+    goal = (Fraction(1), Fraction(0))
+    for along, height in generator.integers((-1500, 1), (2500, 1500), (count, 2)):
+        via = (Fraction(int(along), 1000), Fraction(int(height), 1000))
+        polynomial = passage_polynomial(via, goal)
+        wrong += count_roots(polynomial) != 1
+        points = np.array([[0.0, 0.0], [float(via[0]), float(via[1])], [1.0, 0.0]])
+        share = float(passage_share(smoothest(points)))
+        difference = max(difference, abs(share - root_of(polynomial)))
+    return wrong, difference
+
+
+def _exact_share(waypoints: Float) -> float:
+    via, goal = ([Fraction(float(each)) for each in point - waypoints[0]] for point in waypoints[1:])
+    return root_of(passage_polynomial(via, goal))
+
+
+def closest_approach(done: Performed, via: Float, row: int = 0) -> float:
+    """When the simulated hand is nearest to the via-point, as a part of the duration."""
+    distance = np.linalg.norm(done.hand[row] - via, axis=-1)
+    i = int(np.clip(distance.argmin(), 1, len(distance) - 2))
+    before, here, after = distance[i - 1 : i + 2] ** 2
+    shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+    return float((done.time[i] + shift * (done.time[1] - done.time[0])) / done.duration[row])
+
+
+class Both(NamedTuple):
+    """A curved movement on the model and on the simulated arm."""
+
+    shown: tuple[Profile, Profile]
+    """Model, arm."""
+    worst: float
+    """Deviation of the arm from the plan, [mm]."""
+
+
+def both(along: float, height: float) -> Both:
+    """The movement through a via-point between the targets of the family."""
+    movement = curved(*ENDS, along, height)
+    done = perform(movement)
+    return Both((model_profile(movement), arm_profile(done)), done.worst)
+
+
+def valley_claims() -> list[Claim]:
+    """Row 5."""
+    even, skewed = both(0.5, -0.5), both(0.28125, -0.5)
+    offset = [each.bend[0] - each.valley for each in skewed.shown]
+    family = [both(along, height) for along in ALONGS for height in HEIGHTS]
+    near_by = [max(abs(each.shown[i].bend[0] - each.shown[i].valley) for each in family) for i in (0, 1)]
+    worst = max(each.worst for each in family)
+    return [
+        Claim(
+            row=5, claim="d1 = d2: time from the speed valley to the curvature peak / t_f", figure="1B",
+            paper="at the same time", model=abs(even.shown[0].bend[0] - even.shown[0].valley), promise=at_most(1e-6),
+            arm=abs(even.shown[1].bend[0] - even.shown[1].valley), arm_promise=at_most(0.01), deviation=even.worst,
+        ),
+        Claim(
+            row=5, claim="d1 = .28125, d3 = .5 of d1+d2: the same; it is not zero, the paper's statement holds nearly",
+            figure="1B", paper="at the same time", model=offset[0], promise=near(0.01073, 2e-5), arm=offset[1],
+            arm_promise=near(0.01073, 0.01), deviation=skewed.worst,
+        ),
+        Claim(
+            row=5, claim=f"The same, greatest of {len(family)} movements, d1/(d1+d2) .25 to .75, d3/(d1+d2) .42 to .54",
+            figure="5-7", paper="at the same time", model=near_by[0], promise=at_most(0.03), arm=near_by[1],
+            arm_promise=at_most(0.04), deviation=worst,
+        ),
+        _threshold_claim(0.5, "exact: 9/32 = .28125", near(9.0 / 32.0, 1e-6)),
+        _threshold_claim(0.3, "-", near(0.38115, 1e-4)),
+    ]  # fmt: skip
+
+
+def _threshold_claim(along: float, exact: str, promise: Promise) -> Claim:
+    model = valley_threshold(along, functools.partial(model_has_valley, along))
+    arm = valley_threshold(along, functools.partial(_arm_has_valley, along), halvings=12)
+    return Claim(
+        row=5, claim=f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds",
+        figure="1B", paper=f"two peaks and a valley; {exact}".removesuffix("; -"), model=model, promise=promise,
+        arm=arm, arm_promise=near((promise.low + promise.high) / 2.0, 0.01),
+        deviation=perform(curved(*ENDS, along, -arm)).worst,
+    )  # fmt: skip
+
+
+def model_has_valley(along: float, height: float) -> bool:
+    """Whether the model's speed has a valley, exactly."""
+    return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
+
+
+def _arm_has_valley(along: float, height: float) -> bool:
+    return bool(np.isfinite(arm_profile(perform(curved(*ENDS, along, -height))).valley))
+
+
+def valley_threshold(along: float, has_valley: Callable[[float], bool], halvings: int = 30) -> float:
+    """Least d3 / (d1 + d2) with a speed valley at a given d1 / (d1 + d2), by bisection."""
+    low, high = 0.2, 0.5
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if has_valley(middle) else (middle, high)
+    return 0.5 * (low + high)
+
+
+def place_claims() -> list[Claim]:
+    """Row 6."""
+    family = {(along, height): both(along, height) for along in (*ALONGS, 0.5) for height in HEIGHTS.tolist()}
+    worst = max(each.worst for each in family.values())
+    higher = [
+        min(_longer_side_lead(family[a, h].shown[i], a) for a in ALONGS for h in HEIGHTS.tolist())
+        for i in (0, 1)
+    ]
+    deeper, bent = (
+        [min(_least_step(family, a, i, quantity) for a in (*ALONGS, 0.5)) for i in (0, 1)]
+        for quantity in (lambda each: -each.valley_depth, lambda each: each.bend[1])
+    )
+    text = f"least of {len(ALONGS) * len(HEIGHTS)} vias"
+    return [
+        Claim(
+            row=6, claim=f"Longer side has the higher speed peak: ratio of the peaks, {text}", figure="6",
+            paper="higher", model=higher[0], promise=at_least(1.0), arm=higher[1], arm_promise=at_least(1.0),
+            deviation=worst,
+        ),
+        Claim(
+            row=6, claim="Larger d3, deeper valley: valley / peaks falls by at least, per step of .03 in d3/(d1+d2)",
+            figure="5", paper="deeper", model=deeper[0], promise=at_least(0.001), arm=deeper[1],
+            arm_promise=at_least(0.001), deviation=worst,
+        ),
+        Claim(
+            row=6, claim="Larger d3, higher curvature peak: it rises by at least, per step of .03 in d3/(d1+d2)",
+            figure="5", paper="higher", unit="1/m", model=bent[0], promise=at_least(0.1), arm=bent[1],
+            arm_promise=at_least(0.1), deviation=worst,
+        ),
+    ]  # fmt: skip
+
+
+def _longer_side_lead(profile: Profile, along: float) -> float:
+    """Speed peak on the longer side over that on the shorter; NaN without two peaks."""
+    peaks = profile.peaks
+    if len(peaks) < 2:
+        return np.nan
+    early, late = peaks[:2][np.argsort(peaks[:2, 0]), 1]
+    return float(late / early if along < 0.5 else early / late)
+
+
+def _least_step(
+    family: dict[tuple[float, float], Both],
+    along: float,
+    which: int,
+    quantity: Callable[[Profile], float],
+) -> float:
+    """Least rise of a quantity from one height to the next, on the model (0) or the arm (1)."""
+    values = [quantity(family[along, height].shown[which]) for height in HEIGHTS.tolist()]
+    return float(np.diff(values).min())

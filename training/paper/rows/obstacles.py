@@ -1,0 +1,217 @@
+"""Row 12: whether an agent that goes around the paper's rows of lights moves as the paper's subjects did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.registration import TASKS
+from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
+from viapoint.primitives import speed_valleys
+from viapoint.training.config.checks import DEFAULT_ENV
+from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
+from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
+from viapoint.training.paper.reference_movements import construction, passage_share, smoothest
+from viapoint.training.paper.rows.timing import FAST, SLOW
+from viapoint.training.paper.simulated import Performed, perform
+from viapoint.training.planners.baselines import Method, PlannerMethod
+from viapoint.training.planners.cma_planner import PlannerBudget
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.runs.agents import load_agent, pretrained_folder
+
+Float = NDArray[np.float64]
+
+LENGTHS = (0.15, 0.2, 0.25)
+"""Of the rows of lights, [m]; the paper's were up to 25 cm."""
+RADII = (0.008, 0.02)
+"""[m]"""
+SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
+"""Of a row's middle from the middle of the line between the targets, along and across it, [m]."""
+BUDGET = PlannerBudget(first=32, more=512, generations=8, population=6)
+
+
+class Decided(NamedTuple):
+    """What an agent or the planner did in N scenes."""
+
+    name: str
+    scenes: Scenes
+    """Those in which the movement succeeded."""
+    plan: Plan
+    done: Performed
+    tried: int
+    """Scenes in all."""
+    planned: list[Profile]
+    executed: list[Profile]
+
+
+def light_scenes() -> Scenes:
+    """Rows of lights of several lengths, widths and places between each two targets; 252 scenes."""
+    parts = [_shifted(length, radius, shift) for length in LENGTHS for radius in RADII for shift in SHIFTS]
+    return Scenes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes:
+    _, scenes = rows_of_lights(length, radius)
+    line = scenes.goal - scenes.start
+    along = line / np.linalg.norm(line, axis=-1, keepdims=True)
+    left = np.stack((-along[:, 1], along[:, 0]), axis=-1)
+    scenes.obstacles[:, 0, :2] += shift[0] * along + shift[1] * left
+    return scenes
+
+
+def decide(agent: Path | None) -> Decided:
+    """Let the agent of a run folder, the shipped one, or else the planner, move around the rows of lights."""
+    scenes = light_scenes()
+    method, trial = _method(agent)
+    check_scenes(scenes, trial.task.arm, whole_arm=trial.task.whole_arm)
+    action = method.decide(trial.observe(_padded(scenes, trial)), _padded(scenes, trial))
+    success = trial(scenes, action).success
+    trial.close()
+    if not success.any():
+        raise ValueError(f"{method.name} gets around none of {len(scenes.start)} rows of lights")
+    kept = scenes.take(success)
+    plan = trial.task.action.decode(action[success], kept.start, kept.goal)
+    movement = plan.trajectory()
+    done = perform(movement)
+    number = range(int(success.sum()))
+    planned = [model_profile(plan.take(row).trajectory()) for row in number]
+    executed = [arm_profile(done, row) for row in number]
+    return Decided(method.name, kept, plan, done, len(scenes.start), planned, executed)
+
+
+def check_agent(agent: Path) -> None:
+    """Refuse agents of tasks whose scenes cannot be those of the paper.
+
+    Raises:
+        ValueError: It moves in space, sees no obstacles, or needs several decisions for a movement.
+    """
+    found = load_agent(agent, None)
+    (task,) = found.model.get_env().get_attr("task", 0)
+    if found.env_id not in TASKS or task.arm.dimension != 2 or not task.scenes.n_obstacles[1]:
+        raise ValueError(
+            f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
+            f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
+        )
+
+
+def _method(agent: Path | None) -> tuple[Method, Trial]:
+    if agent is not None or _is_shipped():
+        found = load_agent(agent, None if agent else DEFAULT_ENV)
+        method: Method = found.method()
+        return method, Trial(found.env_id, 256, **found.env_kwargs)
+    trial = Trial(DEFAULT_ENV, 256)
+    return PlannerMethod(trial, budget=BUDGET), trial
+
+
+def _is_shipped() -> bool:
+    try:
+        pretrained_folder(DEFAULT_ENV)
+    except ValueError:
+        return False
+    return True
+
+
+def _padded(scenes: Scenes, trial: Trial) -> Scenes:
+    """With as many rows of obstacles as the observation has; the added ones are absent."""
+    most = trial.task.scenes.n_obstacles[1]
+    missing = most - scenes.obstacles.shape[1]
+    return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
+
+
+class Features(NamedTuple):
+    """What the paper looks at, one value per movement; NaN where a movement has no such thing."""
+
+    valley: Float
+    """When the speed valley is, as a part of the duration."""
+    bend: Float
+    """When the curvature peak is."""
+    via: Float
+    """Where that is, d1 / (d1 + d2) and d3 / (d1 + d2), shape (n, 2)."""
+    residual: Float
+    """t1 / (t1 + t2) minus the model's through the point of greatest curvature, as in Fig. 10B."""
+    agrees: NDArray[np.bool_]
+    """Whether the movement has a speed valley exactly if the model through that point has one."""
+    apart: Float
+    """Greatest distance from the model through that point / distance of the targets, as in Fig. 8."""
+
+
+def features(profiles: list[Profile], scenes: Scenes) -> Features:
+    """The paper's analysis: the via-point is where the curvature is greatest."""
+    valley = np.array([each.valley for each in profiles])
+    bend = np.array([each.bend[0] for each in profiles])
+    agrees = np.zeros(len(bend), dtype=bool)
+    via, residual, apart = (
+        np.full((len(bend), 2), np.nan),
+        np.full(len(bend), np.nan),
+        np.full(len(bend), np.nan),
+    )
+    for row in np.flatnonzero(np.isfinite(bend)):
+        points = np.stack((scenes.start[row], profiles[row].place(bend[row]), scenes.goal[row]))
+        model = smoothest(points)
+        via[row] = construction(points)
+        residual[row] = bend[row] - passage_share(model)
+        agrees[row] = bool(speed_valleys(model).time.size) == bool(np.isfinite(valley[row]))
+        distance = np.linalg.norm(np.asarray(model(profiles[row].time)) - profiles[row].position, axis=-1)
+        apart[row] = distance.max() / np.linalg.norm(points[2] - points[0])
+    return Features(valley, bend, via, residual, agrees, apart)
+
+
+def obstacle_claims(decided: Decided) -> list[Claim]:
+    """Row 12."""
+    both = features(decided.planned, decided.scenes), features(decided.executed, decided.scenes)
+    worst = decided.done.worst
+    who = f"{decided.name}, {len(decided.executed)} movements"
+
+    def claim(
+        text: str, paper: str, value: Callable[[Features], float], promise: Promise, unit: str = ""
+    ) -> Claim:
+        return Claim(
+            row=12, claim=f"{text} ({who})", figure="8", paper=paper, unit=unit, model=value(both[0]), promise=promise,
+            arm=value(both[1]), arm_promise=promise, deviation=worst,
+        )  # fmt: skip
+
+    return [
+        Claim(
+            row=12, claim=f"Around rows of lights without contact, of {decided.tried} scenes ({decided.name})",
+            figure="8", unit="%", model=None, arm=100.0 * len(decided.executed) / decided.tried,
+            arm_promise=at_least(90.0), deviation=worst,
+        ),
+        claim("Movements with a curvature peak inside", "all", lambda f: 100 * _share(f.bend), at_least(50.0), "%"),
+        claim("Movements with a speed valley: not all", "all", lambda f: 100 * _share(f.valley), at_least(10.0), "%"),
+        claim("A valley exactly where the model through the point of greatest curvature has one", "-",
+              lambda f: 100 * float(f.agrees.mean()), at_least(90.0), "%"),
+        claim("Valley and curvature peak: median distance in time / t_f, where there are both", "at the same time",
+              lambda f: float(np.nanmedian(np.abs(f.valley - f.bend))), at_most(0.05)),
+        claim("Isochrony: median of |t1/(t1+t2) - .5| at the curvature peak", "roughly .5",
+              lambda f: float(np.nanmedian(np.abs(f.bend - 0.5))), at_most(0.1)),
+        claim("t1/(t1+t2) minus the model's through the point of greatest curvature: mean", "-.004",
+              lambda f: float(np.nanmean(f.residual)), near(0.0, 0.02)),
+        claim("The same: standard deviation", ".02", lambda f: float(np.nanstd(f.residual)), at_most(0.04)),
+        claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
+              "close match", lambda f: 100 * float(np.nanmedian(f.apart)), at_most(5.0), "%"),
+        _scaling_claim(decided, who),
+    ]  # fmt: skip
+
+
+def _share(values: Float) -> float:
+    return float(np.isfinite(values).mean())
+
+
+def _scaling_claim(decided: Decided, who: str) -> Claim:
+    """The same decisions in the two durations of Fig. 11."""
+    fractions, movement = np.linspace(0.0, 1.0, 101), decided.plan.trajectory()
+    both = [perform(movement.stretched(duration)) for duration in (SLOW, FAST)]
+    number = len(decided.executed)
+    paths = [np.stack([each.at(row, fractions) for row in range(number)]) for each in both]
+    plans = [movement.stretched(duration).sample(101, 0)[0] for duration in (SLOW, FAST)]
+    apart, model = (1e3 * float(np.linalg.norm(a - b, axis=-1).max()) for a, b in (paths, plans))
+    return Claim(
+        row=12, claim=f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
+        figure="8, 11", paper="the same path", unit="mm", model=model, promise=at_most(1e-9), arm=apart,
+        arm_promise=at_most(1.0), deviation=max(each.worst for each in both),
+    )  # fmt: skip

@@ -1,0 +1,173 @@
+"""Reproduction of the paper and the command that runs it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from PIL import Image
+from tqdm import tqdm
+
+from viapoint.training.config.configs import PaperConfig
+from viapoint.training.paper.claim import Claim, Reproduction
+from viapoint.training.paper.figures import curved as figures_curved
+from viapoint.training.paper.figures import double, other
+from viapoint.training.paper.figures import straight as figures_straight
+from viapoint.training.paper.figures.style import STYLE, save
+from viapoint.training.paper.report import summary, write
+from viapoint.training.paper.rows import (
+    alternatives,
+    curved,
+    double_step,
+    limits,
+    obstacles,
+    online,
+    straight,
+    timing,
+)
+from viapoint.training.paper.rows.obstacles import Decided, check_agent
+from viapoint.training.runs import trainer as training
+
+ROWS: dict[int, Callable[[], list[Claim]]] = {
+    1: straight.point_to_point_claims,
+    2: straight.invariance_claims,
+    3: straight.joint_claims,
+    4: curved.passage_claims,
+    5: curved.valley_claims,
+    6: curved.place_claims,
+    7: timing.isochrony_claims,
+    8: timing.scaling_claims,
+    9: alternatives.alternative_claims,
+    10: limits.limit_claims,
+    11: online.online_claims,
+    13: double_step.double_step_claims,
+}
+"""The rows that need no agent; row 12 comes with its movements."""
+
+
+class Drawing(NamedTuple):
+    """A figure by its file name, with its caption."""
+
+    name: str
+    caption: str
+    draw: Callable[[Decided], Figure]
+
+
+def _plain(draw: Callable[[], Figure]) -> Callable[[Decided], Figure]:
+    return lambda decided: draw()
+
+
+DRAWINGS = (
+    Drawing("fig01_model", "The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
+            "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
+            _plain(figures_straight.model)),
+    Drawing("fig03_straight", "Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
+            "simulated arm, here and in the following figures.", _plain(figures_straight.straight_movements)),
+    Drawing("fig04_joints", "Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
+            "the same for the hand is not for the joints.", _plain(figures_straight.joints)),
+    Drawing("fig05_height", "A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
+            "relative to d1 + d2. Dotted: passage of the via-point.", _plain(figures_curved.height)),
+    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", _plain(figures_curved.place)),
+    Drawing("fig07_turned", "The same in other directions (Fig. 7).", _plain(figures_curved.turned)),
+    Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and the one "
+            "with the median depth (B), each with the model through its point of greatest curvature.",
+            figures_curved.obstacles),
+    Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
+            "B, D: difference from the model. Grey squares: movements around rows of lights.",
+            other.isochrony),
+    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", _plain(figures_curved.scaling)),
+    Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
+            _plain(figures_curved.valleys)),
+    Drawing("alternatives", "Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
+            "(D).", _plain(other.alternatives)),
+    Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
+            "the torques of both (C, D; limits dotted).", _plain(other.limits)),
+    Drawing("online", "The target jumps on the way (dot) and the movement follows without a jerk.",
+            _plain(other.online)),
+    Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
+            "after its start: by a second movement that is added, or by one new plan with the same arrival.",
+            _plain(double.paths_and_speeds)),
+    Drawing("double_step_jerk", "Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
+            "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
+            _plain(double.comparison)),
+)  # fmt: skip
+"""Every figure, in the order of the paper."""
+
+
+def reproduce(out: Path, agent: Path | None, tell: Callable[[str], None]) -> Reproduction:
+    """Compute every row and draw every figure.
+
+    Args:
+        out: Folder for the figures.
+        agent: Run folder of the agent of row 12.
+        tell: Called with the name of each step when it begins; there are `STEPS` of them.
+    """
+    claims: list[Claim] = []
+    for row, compute in ROWS.items():
+        tell(f"row {row}")
+        claims += compute()
+    tell("row 12")
+    decided = obstacles.decide(agent)
+    claims += obstacles.obstacle_claims(decided)
+    claims.sort(key=lambda claim: claim.row)
+    pictures = []
+    for drawing in DRAWINGS:
+        tell(drawing.name)
+        with mpl.rc_context(STYLE):
+            picture, _ = save(drawing.draw(decided), out, drawing.name)
+        pictures.append((picture, drawing.caption))
+    return Reproduction(claims, pictures)
+
+
+STEPS = len(ROWS) + 1 + len(DRAWINGS)
+
+
+IN_THE_GUIDE = (
+    "fig01_model", "fig03_straight", "fig04_joints", "fig05_height", "fig06_place", "fig08_obstacles",
+    "fig10_isochrony", "valleys", "alternatives", "limits", "double_step", "double_step_jerk",
+)  # fmt: skip
+"""The figures that docs/flash-hogan.md shows."""
+
+
+class ClaimsFailedError(Exception):
+    """Some claims do not hold; what was computed is written all the same."""
+
+    exit_code = 1
+
+
+def run(config: PaperConfig) -> None:
+    """Compute, draw, write, and end with an error if a verdict fails.
+
+    Raises:
+        ValueError: There is no such agent, or it cannot move around the paper's lights; nothing is computed.
+        ClaimsFailedError: A claim does not hold.
+    """
+    if config.agent is not None:
+        check_agent(config.agent)
+    with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, training.one_thread():
+
+        def tell(name: str) -> None:
+            bar.set_description(name)
+            bar.update()
+
+        result = reproduce(config.out, config.agent, tell)
+    pages = write(result, config.out)
+    if config.guide is not None:
+        write_guide(result, config.guide)
+    print(f"{summary(result.claims)} The page: {pages[-1]}")
+    if result.failed:
+        names = "; ".join(f"row {claim.row}, {claim.claim}" for claim in result.failed)
+        raise ClaimsFailedError(f"{len(result.failed)} of {len(result.claims)} claims fail: {names}")
+
+
+def write_guide(result: Reproduction, folder: Path) -> None:
+    """Small versions of the figures for the guide: paper_*.png with few colours."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, _ in result.pictures:
+        if path.stem in IN_THE_GUIDE:
+            small = Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE)
+            small.save(folder / f"paper_{path.name}", optimize=True)

@@ -1,0 +1,1 @@
+"""Planners and baselines without learning."""

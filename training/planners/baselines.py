@@ -1,0 +1,199 @@
+"""What an agent is measured against, and the agent, all behind one method: observations and scenes in, actions out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planners.ompl_planner import MotionPlannerMethod
+from viapoint.training.planners.replanning_baselines import OnlinePlanner, OpenLoopBaseline
+from viapoint.training.rollouts.rollout import Trial, Trials, new_trial
+from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
+from viapoint.training.search.geometry_search import GeometrySearch
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+
+class Method(Protocol):
+    """Decides on a movement in each of N scenes."""
+
+    @property
+    def name(self) -> str:
+        """As it stands in the table."""
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Actions, shape (N, m), from the first observations and, for those that may search, the scenes."""
+
+
+class OwnMethod(Method, Protocol):
+    """Decides on movements that no action of the environment stands for, and carries them out itself."""
+
+    def execute(self, scenes: Scenes, decided: Float) -> Trials:
+        """What came of what was decided in N scenes, in the same simulation."""
+
+
+class Straight:
+    """The straight minimum-jerk movement: the zero action."""
+
+    name = "straight line"
+
+    def __init__(self, trial: Trial) -> None:
+        self._size = trial.task.action.size
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return np.zeros((len(scenes.start), self._size))
+
+
+class Constant:
+    """The one action that succeeds in most scenes of the training distribution."""
+
+    name = "best constant action"
+
+    def __init__(self, trial: Trial, *, seed: int = 0, candidates: int = 256, number: int = 256) -> None:
+        generator = np.random.default_rng(seed)
+        scenes = trial.task.sampler()([generator] * number)
+        actions = generator.uniform(-1.0, 1.0, (candidates, trial.task.action.size))
+        tried = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
+        solved = [trial(scenes, np.tile(action, (number, 1))).success.sum() for action in tried]
+        self._action = actions[np.argmax(solved)]
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return np.tile(self._action, (len(scenes.start), 1))
+
+
+class RandomVias:
+    """The best of some random actions, checked in simulation where there is more than one."""
+
+    def __init__(self, trial: Trial, count: int, *, seed: int = 0) -> None:
+        self._trial, self._count = trial, count
+        self._generator = np.random.default_rng(seed)
+        self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        number, size = len(scenes.start), self._trial.task.action.size
+        actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
+        if self._count == 1:
+            return actions[:, 0]
+        every = scenes.take(np.repeat(np.arange(number), self._count))
+        reward = self._trial(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
+        return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
+
+
+class PlannerMethod:
+    """The planner, see :mod:`viapoint.training.planners.cma_planner`."""
+
+    name = "planner"
+
+    def __init__(self, trial: Trial, *, seed: int = 0, budget: PlannerBudget | None = None) -> None:
+        self._planner = Planner(trial, seed=seed, budget=budget)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`."""
+        return self._planner(scenes).action
+
+
+class AgentMethod:
+    """A trained agent.
+
+    Args:
+        name: As it stands in the table.
+        model: That decides.
+        checks: How many of its proposals are checked by exact geometry at each decision; None leaves the model's own
+            setting.
+    """
+
+    def __init__(self, name: str, model: Any, checks: int | None = None) -> None:
+        self.name, self._model, self._checks = name, model, checks
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`Method`; the scenes are not looked at."""
+        policy = self._model.policy
+        own = getattr(policy, "checks", None)
+        if own is not None and self._checks is not None:
+            policy.checks = self._checks
+        try:
+            actions, _ = self._model.predict(observation, deterministic=True)
+        finally:
+            if own is not None:
+                policy.checks = own
+        return np.asarray(actions, dtype=np.float64)
+
+
+def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
+    """Return a trained agent as a method, whether an action of it is a whole movement or lasts a control step."""
+    env = model.get_env()
+    if is_step_wise(env.env_id):
+        return StepAgentMethod(name, model, env.env_id, env.env_kwargs)
+    return AgentMethod(name, model, checks)
+
+
+def _search(total: int) -> Callable[[Trial], Method]:
+    """Return what makes a search that spends half of its checks on refinement, which solves more scenes (measured)."""
+    rounds = 2 if total < 256 else 4
+    return lambda trial: GeometrySearch(
+        trial.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
+    )
+
+
+SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
+"""Searches among computed plans by name, with the number of plans that each checks for a decision."""
+
+METHODS: dict[str, Callable[[Trial], Method]] = {
+    "straight": Straight,
+    "constant": Constant,
+    "random": lambda trial: RandomVias(trial, 1),
+    "random16": lambda trial: RandomVias(trial, 16),
+    "random80": lambda trial: RandomVias(trial, 80),
+    "planner": PlannerMethod,
+    "ompl": MotionPlannerMethod,
+    **SEARCHES,
+}
+"""The baselines by the name the command line knows them by."""
+
+ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
+    "straight": Straight,
+    "random": lambda trial: RandomVias(trial, 1),
+    "planner": OnlinePlanner,
+    "unrevised": lambda trial: OpenLoopBaseline(Straight(trial), trial),
+    **SEARCHES,
+}
+"""Those where plans are revised on the way."""
+
+
+def check_method(name: str, env_id: str) -> None:
+    """Refuse what cannot be measured in an environment.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    known = _known(env_id)
+    if name not in known and name not in ("agent", "untrained"):
+        raise ValueError(
+            f"method must be agent, untrained or one of {', '.join(known)} in {env_id}, got {name!r}"
+        )
+
+
+def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
+    """A baseline for an environment made with `kwargs`.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    check_method(name, env_id)
+    return _known(env_id)[name](new_trial(env_id, **kwargs))
+
+
+def _known(env_id: str) -> dict[str, Callable[[Any], Method]]:
+    return ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS

@@ -1,0 +1,267 @@
+"""A sampling-based motion planner from a library, OMPL: what a roboticist would use instead.
+
+RRT-Connect (Kuffner & LaValle 2000) finds a path of straight pieces that is clear, OMPL's own shortcuts straighten it,
+and the least-jerk movement through as few of its points as stay clear makes it smooth. It knows the scene exactly and
+learns nothing.
+
+It plans where the hand goes. As every arm here takes one posture for each position of its hand, that is a chart of all
+its postures: nothing is lost by not planning in the joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint import primitives
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.mdp.task import Task
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.outcome import least_clearance
+from viapoint.training.rollouts.rollout import Trial, Trials
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+Clear = Callable[[Float, Float], bool]
+"""Whether the straight line between two positions of the hand is clear."""
+
+MARGINS = (0.010, 0.004, 0.001)
+"""Clearances that are asked of a path, one after the other until there is one, [m]."""
+AROUND = 0.30
+"""How far from start and goal the hand may go, [m]."""
+APART = 0.005
+"""Between points of a line that are looked at for the whole arm, [m]."""
+DENSE = (1, 2, 3, 4, 6, 8, 12)
+"""Via-points that are tried, the fewest first."""
+LOOKS = 150
+"""Times at which a smooth movement is looked at."""
+
+
+def library() -> Any:
+    """The library, `ompl`.
+
+    Raises:
+        ValueError: It is not installed.
+    """
+    try:
+        import ompl.base
+        import ompl.geometric
+        import ompl.util
+    except ImportError:
+        raise ValueError(
+            "the method ompl needs the library of that name: pip install 'viapoint[planning]'"
+        ) from None
+    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_ERROR)
+    return ompl
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionPlannerBudget:
+    """How long the planner tries in each scene."""
+
+    attempts: int = 4
+    """Paths that are looked for until one can be made smooth."""
+    seconds: float = 0.25
+    """For each of them, at most."""
+
+
+class MotionPlanner:
+    """Plans one movement in one scene at a time.
+
+    Args:
+        task: The environment's.
+        seed: Of the library, which has one random generator for all its planners.
+        budget: How long it tries.
+    """
+
+    def __init__(self, task: Task, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
+        self._task, self._budget, self._ompl = task, budget or MotionPlannerBudget(), library()
+        self._ompl.util.RNG.setSeed(max(seed, 1))
+
+    def __call__(self, scene: Scenes) -> Plan:
+        """The movement in one scene: of the smooth ones that are clear the first, or else the clearest; one row."""
+        best, merit = self._straight(scene), -np.inf
+        for attempt in range(self._budget.attempts):
+            margin = MARGINS[min(attempt, len(MARGINS) - 1)]
+            path = self._path(scene, margin)
+            if path is None:
+                continue
+            for count in DENSE:
+                plan = self._smooth(points_on(path, count))
+                clearance = self._clearance(plan, scene)
+                if clearance > merit:
+                    best, merit = plan, clearance
+                if clearance >= 0.5 * margin:
+                    return plan
+        return best
+
+    def _path(self, scene: Scenes, margin: float) -> Float | None:
+        """Corners of a clear path, start and goal included, shape (P, D), [m]; None where none was found in time."""
+        ends = np.concatenate((scene.start, scene.goal))
+        corners = _search(self._ompl, ends, self._clear(scene, margin), self._budget.seconds)
+        return corners if corners is None else np.concatenate((ends[:1], corners[1:-1], ends[1:]))
+
+    def _smooth(self, waypoints: Float) -> Plan:
+        """The least-jerk movement through waypoints, of the centre duration."""
+        points = waypoints[None]
+        duration = np.array([self._task.action.centre_duration])
+        return Plan(points, np.asarray(primitives.passage_durations(points, duration)))
+
+    def _straight(self, scene: Scenes) -> Plan:
+        return self._smooth(np.concatenate((scene.start, scene.goal)))
+
+    def _clearance(self, plan: Plan, scene: Scenes) -> float:
+        """Least clearance of a plan, or reach margin where that is negative, [m]."""
+        time = np.linspace(0.0, self._task.action.centre_duration, LOOKS)
+        hand = np.asarray(plan.trajectory()(time))
+        margin = float(np.asarray(self._task.arm.reach_margin(hand)).min())
+        clearance = least_clearance(self._task.arm, hand, scene, whole_arm=self._task.whole_arm)
+        return min(margin, 0.0) + float(clearance[0])
+
+    def _clear(self, scene: Scenes, margin: float) -> Clear:
+        arm, whole_arm = self._task.arm, self._task.whole_arm
+        rows = scene.obstacles[0][scene.present[0]]
+        capsules = [(*_split(row), float(row[-1]) + arm.hand_radius + margin) for row in rows]
+
+        def clear(first: Float, second: Float) -> bool:
+            p, q = tuple(map(float, first)), tuple(map(float, second))
+            if any(_nearer(p, q, centre, half, least) for centre, half, least in capsules):
+                return False
+            count = max(2, int(np.ceil(norm(second - first) / APART)) + 1) if whole_arm else 4
+            points = first + np.linspace(0.0, 1.0, count)[:, None] * (second - first)
+            if (np.asarray(arm.reach_margin(points)) < 0.0).any():
+                return False
+            if not whole_arm:
+                return True
+            return bool(least_clearance(arm, points[None], scene, whole_arm=True)[0] > margin)
+
+        return clear
+
+
+class MotionPlannerMethod:
+    """The motion planner as a method of the table; its movements have as many via-points as they need.
+
+    What it decides in a scene is a row: number of via-points, total duration [s], and the via-points [m], then zeros.
+    """
+
+    name = "motion planner (OMPL)"
+
+    def __init__(self, trial: Trial, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
+        self._trial = trial
+        self._planner = MotionPlanner(trial.task, seed=seed, budget=budget)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """See :class:`~viapoint.training.planners.baselines.Method`."""
+        d = scenes.start.shape[-1]
+        rows = np.zeros((len(scenes.start), 2 + DENSE[-1] * d))
+        for i, row in enumerate(rows):
+            plan = self._planner(scenes.take([i]))
+            vias = plan.waypoints[0, 1:-1]
+            row[0], row[1] = len(vias), plan.durations.sum()
+            row[2 : 2 + vias.size] = vias.ravel()
+        return rows
+
+    def execute(self, scenes: Scenes, decided: Float) -> Trials:
+        """Simulate them, those with equally many via-points together."""
+        d, counts = scenes.start.shape[-1], decided[:, 0].astype(np.int64)
+        reward, info = np.zeros(len(decided)), dict[str, NDArray[Any]]()
+        for count in np.unique(counts):
+            rows = np.flatnonzero(counts == count)
+            some = scenes.take(rows)
+            vias = decided[rows, 2 : 2 + count * d].reshape(len(rows), count, d)
+            waypoints = np.concatenate((some.start[:, None], vias, some.goal[:, None]), axis=1)
+            durations = np.asarray(primitives.passage_durations(waypoints, decided[rows, 1]))
+            done = self._trial.execute_plan(some, Plan(waypoints, durations))
+            reward[rows] = done.reward
+            for name, values in done.info.items():
+                info.setdefault(name, np.zeros(len(decided), dtype=values.dtype))[rows] = values
+        return Trials(reward, info)
+
+
+def points_on(path: Float, count: int) -> Float:
+    """Start, `count` points and goal of a path of straight pieces.
+
+    Its corners where there are as many; otherwise points evenly spaced along it, and, where there are more, the corners
+    instead of the nearest.
+    """
+    if count == len(path) - 2:
+        return path
+    along = np.concatenate(([0.0], np.cumsum(norm(np.diff(path, axis=0)))))
+    places = along[-1] * np.arange(1, count + 1) / (count + 1)
+    if count > len(path) - 2:
+        for corner in along[1:-1]:
+            places[np.abs(places - corner).argmin()] = corner
+    places = np.concatenate(([0.0], np.sort(places), along[-1:]))
+    return np.stack([np.interp(places, along, path[:, i]) for i in range(path.shape[1])], axis=-1)
+
+
+def _search(ompl: Any, ends: Float, clear: Clear, seconds: float) -> Float | None:
+    """RRT-Connect and shortcuts in the box around start and goal; corners, shape (P, D), or None."""
+    base, geometric, d = ompl.base, ompl.geometric, ends.shape[-1]
+
+    def place(state: Any) -> Float:
+        return np.array([state[i] for i in range(d)])
+
+    class Lines(base.MotionValidator):  # type: ignore[misc, name-defined]
+        def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
+            return clear(place(first), place(second))
+
+    space, bounds = base.RealVectorStateSpace(d), base.RealVectorBounds(d)
+    for i in range(d):
+        bounds.setLow(i, float(ends[:, i].min()) - AROUND)
+        bounds.setHigh(i, float(ends[:, i].max()) + AROUND)
+    space.setBounds(bounds)
+    about = base.SpaceInformation(space)
+    about.setStateValidityChecker(lambda state: True)  # lines are looked at from end to end
+    about.setMotionValidator(Lines(about))
+    about.setup()
+    problem = base.ProblemDefinition(about)
+    start, goal = space.allocState(), space.allocState()
+    for i in range(d):
+        start[i], goal[i] = float(ends[0, i]), float(ends[1, i])
+    problem.setStartAndGoalStates(start, goal)
+    planner = geometric.RRTConnect(about)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    if not planner.solve(seconds) or not problem.hasExactSolution():
+        return None
+    path = problem.getSolutionPath()
+    geometric.PathSimplifier(about).simplify(path, seconds)
+    return np.stack([place(path.getState(i)) for i in range(path.getStateCount())])
+
+
+def _split(row: Float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    d = (len(row) - 1) // 2
+    return tuple(map(float, row[:d])), tuple(map(float, row[d : 2 * d]))
+
+
+def _nearer(
+    p: tuple[float, ...],
+    q: tuple[float, ...],
+    centre: tuple[float, ...],
+    half: tuple[float, ...],
+    least: float,
+) -> bool:
+    """Whether the segments from p to q and from centre - half to centre + half are nearer than `least`.
+
+    In plain numbers, as for a few of them NumPy takes ten times as long (C. Ericson, Real-Time Collision Detection,
+    2005, 5.1.9).
+    """
+    along = [b - a for a, b in zip(p, q, strict=True)]
+    apart = [a - c for a, c in zip(p, centre, strict=True)]
+    aa, hh = sum(a * a for a in along), sum(h * h for h in half)
+    ah = sum(a * h for a, h in zip(along, half, strict=True))
+    ar = sum(a * r for a, r in zip(along, apart, strict=True))
+    hr = sum(h * r for h, r in zip(half, apart, strict=True))
+    scale = aa * hh - ah * ah
+    s = min(max((ah * hr - ar * hh) / scale, 0.0), 1.0) if scale > 1e-15 else 0.0
+    t = (ah * s + hr) / hh if hh > 1e-12 else 0.0
+    t = min(max(t, -1.0), 1.0)
+    s = min(max((ah * t - ar) / aa, 0.0), 1.0) if aa > 1e-15 else 0.0
+    squared = sum((r + s * a - t * h) ** 2 for r, a, h in zip(apart, along, half, strict=True))
+    return squared < least * least

@@ -1,0 +1,227 @@
+"""Failures sorted by kind: how many there are of each, and what they look like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.evaluation.evaluator import MethodResult
+from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
+
+GRAZE = 0.005
+"""A plan that enters an obstacle by no more than this grazes it, [m]."""
+PICTURES = 8
+"""Of each kind, at most."""
+PROPOSALS = 16
+"""Most promising candidates of an agent that count as its proposals."""
+
+
+class Kind(NamedTuple):
+    """One way to fail."""
+
+    name: str
+    """As a file is called."""
+    words: str
+    """As a person says it."""
+
+
+KINDS = (
+    Kind("out_of_reach", "the plan leaves the arm's reach or its joint limits"),
+    Kind("off_goal", "nothing touched, but not at rest at the goal within the joint limits"),
+    Kind("tracking", "the plan is clear, the arm that follows it touches"),
+    Kind("graze", "the plan enters an obstacle by 5 mm or less"),
+    Kind("wrong_way", "a clear collision the wrong way round: another of its proposals would have succeeded"),
+    Kind("collision", "a clear collision, and no other proposal would have succeeded"),
+)
+"""In the order in which they are asked: each failure is of the first kind that fits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failures:
+    """The n failures of a method among the scenes of a set."""
+
+    method: str
+    frozen: FrozenScenes
+    """All scenes that it met."""
+    rows: NDArray[np.int64]
+    """In which of them it failed, shape (n,)."""
+    kind: NDArray[np.int64]
+    """Index into KINDS, shape (n,)."""
+    another: NDArray[np.bool_] | None
+    """Whether another proposal of the agent would have succeeded, shape (n,); None for agents without proposals."""
+    depth: NDArray[np.float64]
+    """How far the plan enters an obstacle, less than 0 where it is clear, shape (n,), [m]."""
+    actions: NDArray[np.float64]
+    """Shape (n, m)."""
+
+    def counts(self) -> dict[str, Any]:
+        """For each kind, how many there are, in which bands, and in how many another proposal would have succeeded."""
+        band = self.frozen.band[self.rows]
+        return {
+            each.name: {
+                "count": int((self.kind == i).sum()),
+                "by_band": {
+                    name: int(((self.kind == i) & (band == b)).sum()) for b, name in enumerate(BANDS)
+                },
+                "another": None if self.another is None else int(self.another[self.kind == i].sum()),
+            }
+            for i, each in enumerate(KINDS)
+        }
+
+
+def kinds(outcomes: Mapping[str, NDArray[Any]], another: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Index into KINDS of each of n failed movements.
+
+    Args:
+        outcomes: Of the movements, by the names of the environment's info, shape (n,) each.
+        another: Whether another proposal would have succeeded, shape (n,).
+    """
+    reachable, collision = (np.asarray(outcomes[name], dtype=bool) for name in ("reachable", "collision"))
+    clearance = np.asarray(outcomes["planned_clearance"], dtype=np.float64)
+    fits = (~reachable, ~collision, clearance > 0.0, clearance >= -GRAZE, another, np.ones_like(another))
+    return np.asarray(np.argmax(np.stack(fits), axis=0))
+
+
+def sort_out(
+    result: MethodResult, frozen: FrozenScenes, agent: Any, env_id: str, **env_kwargs: Any
+) -> Failures:
+    """The failures of an agent's evaluation.
+
+    Args:
+        result: Of the agent.
+        frozen: The scenes it met, in order.
+        agent: The model; of one that ranks candidates the PROPOSALS best ones are tried, too.
+        env_id: Of its environment.
+        **env_kwargs: Of its environment.
+    """
+    rows = np.flatnonzero(~result.success)
+    outcomes = {name: np.asarray(values)[rows] for name, values in result.outcomes.items()}
+    another = _another_succeeds(agent, frozen.scenes.take(rows), env_id, env_kwargs)
+    return Failures(
+        method=result.name,
+        frozen=frozen,
+        rows=rows,
+        kind=kinds(outcomes, np.zeros(len(rows), dtype=bool) if another is None else another),
+        another=another,
+        depth=-np.asarray(outcomes["planned_clearance"], dtype=np.float64),
+        actions=result.actions[rows],
+    )
+
+
+def _another_succeeds(
+    agent: Any, scenes: Scenes, env_id: str, env_kwargs: Mapping[str, Any]
+) -> NDArray[np.bool_] | None:
+    """Whether any of the agent's proposals succeeds in each of n scenes; None where it has none."""
+    number = len(scenes.start)
+    if not hasattr(agent.policy, "propose"):
+        return None
+    if not number:
+        return np.zeros(0, dtype=bool)
+    trial = Trial(env_id, **env_kwargs)
+    actions = proposals(agent.policy, trial.observe(scenes))
+    every = scenes.take(np.repeat(np.arange(number), actions.shape[1]))
+    success = trial(every, actions.reshape(-1, actions.shape[-1])).success
+    trial.close()
+    return np.asarray(success.reshape(number, -1).any(axis=-1))
+
+
+def proposals(policy: Any, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return the candidates of greatest value in each of B scenes, shape (B, PROPOSALS, m), best first."""
+    actions, values = policy.propose(observation)
+    best = np.argsort(-values, axis=1, kind="stable")[:, :PROPOSALS]
+    return np.take_along_axis(actions, best[..., None], axis=1).astype(np.float64)
+
+
+def write(failures: Failures, folder: Path, env_id: str, **env_kwargs: Any) -> list[Path]:
+    """Write the table of counts as Markdown and JSON, and a page of pictures for each kind that occurs.
+
+    The pictures of a kind are spread from its deepest collision to its mildest.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    table = markdown(failures.counts(), len(failures.rows), len(failures.frozen.share))
+    heading = f"# Failures of {failures.method} on {env_id}, scenes {failures.frozen.name}"
+    write_bytes(folder / "failures.md", f"{heading}\n\n{table}\n".encode())
+    write_json(folder / "failures.json", {"method": failures.method, "kinds": failures.counts()})
+    written = [folder / "failures.md", folder / "failures.json"]
+    for i, kind in enumerate(KINDS):
+        mine = np.flatnonzero(failures.kind == i)
+        if len(mine):
+            ordered = mine[np.argsort(-failures.depth[mine], kind="stable")]
+            chosen = ordered[
+                np.unique(np.linspace(0, len(mine) - 1, min(PICTURES, len(mine))).round().astype(int))
+            ]
+            entries = _entries(failures, chosen, env_id, env_kwargs)
+            heading = f"{kind.words}: {len(mine)} of {len(failures.rows)} failures"
+            written.append(gallery(folder / f"{kind.name}.png", entries, heading=heading))
+    return written
+
+
+def markdown(counts: Mapping[str, Any], failures: int, scenes: int) -> str:
+    """The table of counts."""
+    lines = [
+        ["kind", "failures", "of all scenes", *(f"share {band}" for band in BANDS), "another succeeds"],
+        ["---", *["---:"] * (3 + len(BANDS))],
+    ]
+    for kind in KINDS:
+        each = counts[kind.name]
+        another = "-" if each["another"] is None else str(each["another"])
+        numbers = [str(each["by_band"][band]) for band in BANDS]
+        part = f"{100.0 * each['count'] / scenes:.1f} %" if scenes else "-"
+        lines.append([kind.words, str(each["count"]), part, *numbers, another])
+    lines.append(
+        ["all", str(failures), f"{100.0 * failures / scenes:.1f} %" if scenes else "-", *_sums(counts)]
+    )
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _sums(counts: Mapping[str, Any]) -> Sequence[str]:
+    """The last columns of all kinds together."""
+    every = list(counts.values())
+    bands = [str(sum(each["by_band"][band] for each in every)) for band in BANDS]
+    return [
+        *bands,
+        "-" if any(e["another"] is None for e in every) else str(sum(e["another"] for e in every)),
+    ]
+
+
+def _entries(
+    failures: Failures, chosen: NDArray[np.int64], env_id: str, env_kwargs: Mapping[str, Any]
+) -> list[Entry]:
+    """Some of the failures, made again to be drawn."""
+    env = gym.make(env_id, **env_kwargs)
+    inner: Any = env.unwrapped
+    entries = []
+    for index in chosen:
+        scene = failures.frozen.scenes.take([failures.rows[index]])
+        env.reset(options=scene.as_options())
+        env.step(failures.actions[index].astype(np.float32))
+        entries.append(
+            Entry(
+                arm=inner.task.arm,
+                scene=scene,
+                plan=inner.last_plan,
+                rollout=inner.last_rollout,
+                title=_title(failures, index),
+                success=False,
+                whole_arm=inner.task.whole_arm,
+            )
+        )
+    env.close()
+    return entries
+
+
+def _title(failures: Failures, index: int) -> str:
+    depth = 1e3 * failures.depth[index]
+    where = f"{depth:.1f} mm deep" if depth > 0.0 else f"{-depth:.1f} mm clear"
+    band = failures.frozen.band[failures.rows[index]]
+    return where if band < 0 else f"{where}, share {BANDS[band]}"

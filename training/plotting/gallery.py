@@ -1,0 +1,103 @@
+"""Many movements on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.executor import Rollout
+from viapoint.training.plotting.top_view import draw_movement
+
+TILE = 2.6
+"""Width of one picture, [inches]."""
+RESOLUTION = 110
+"""[dots per inch]"""
+VIEW = ((-0.53, 0.45), (-0.09, 0.75))
+"""[m]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One movement of a gallery."""
+
+    arm: Arm
+    scene: Scenes
+    """One row."""
+    plan: Plan
+    """One row."""
+    rollout: Rollout
+    title: str
+    """What is said about it besides its outcome, such as the difficulty of the scene."""
+    success: bool
+    whole_arm: bool = False
+    """Whether the links can touch obstacles, too."""
+
+    @property
+    def outcome(self) -> str:
+        """In a word."""
+        if self.success:
+            return "success"
+        return "collision" if self.rollout.contact.any() else "missed"
+
+
+def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, heading: str = "") -> Path:
+    """Draw movements in a grid, each titled with its outcome, and save the page as a PNG.
+
+    Args:
+        path: Of the picture; its folder must exist.
+        entries: One or more movements.
+        columns: Pictures in a row.
+        heading: Above all of them.
+
+    Raises:
+        ValueError: There is nothing to draw, or no column to draw it in.
+    """
+    if not entries:
+        raise ValueError("entries must hold at least one movement")
+    if columns < 1:
+        raise ValueError(f"columns must be 1 or more, got {columns!r}")
+    columns = min(columns, len(entries))
+    rows = -(-len(entries) // columns)
+    tall = TILE * (VIEW[1][1] - VIEW[1][0]) / (VIEW[0][1] - VIEW[0][0]) + 0.3
+    margin = 0.75 if heading else 0.45
+    figure = Figure(figsize=(TILE * columns, tall * rows + margin), dpi=RESOLUTION)
+    figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat[len(entries) :]:
+        axes.set_axis_off()
+    for axes, entry in zip(grid.flat, entries, strict=False):
+        shown = entry.arm, entry.scene, entry.plan, entry.rollout
+        draw_movement(axes, *shown, whole_arm=entry.whole_arm, view=VIEW, scale=0.7)
+        colour = PALETTE.goal if entry.success else PALETTE.contact
+        axes.set_title(entry.outcome, loc="left", fontsize=8.5, color=colour, fontweight="bold", pad=3)
+        axes.set_title(entry.title, loc="right", fontsize=8, color=PALETTE.joint, pad=3)
+    _legend(figure, columns)
+    if heading:
+        figure.suptitle(heading, fontsize=11, color=PALETTE.executed)
+    path = Path(path)
+    figure.savefig(path)
+    return path
+
+
+def _legend(figure: Figure, columns: int) -> None:
+    """What the colours mean, once for all."""
+    kinds = {
+        "planned": Line2D([], [], color=PALETTE.plan, linewidth=4),
+        "executed": Line2D([], [], color=PALETTE.executed, linewidth=1.6),
+        "via-point": Line2D([], [], color=PALETTE.via, marker="o", linestyle="none", markersize=5),
+        "goal": Line2D([], [], color=PALETTE.goal, marker="o", linestyle="none", markersize=5),
+        "contact": Line2D([], [], color=PALETTE.contact, marker="x", linestyle="none", markersize=5),
+    }
+    handles, labels = list(kinds.values()), list(kinds)
+    across = 5 if columns > 1 else 3
+    figure.legend(handles, labels, loc="outside lower center", ncols=across, fontsize=8, frameon=False)

@@ -1,0 +1,108 @@
+"""Figures of a training and of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from viapoint.training.scene_sets.scene_set import BANDS
+
+BLUE = "#1f5fa8"
+DOTS_PER_INCH = 130
+AXES = (
+    ("decisions", "decisions", 1.0),
+    ("simulated_seconds", "simulated minutes", 1 / 60),
+    ("seconds", "minutes of training", 1 / 60),
+)
+"""What the learning curve is drawn against: key of the record, label, scale; a key that a record lacks is left out."""
+
+
+def learning_curve(
+    path: Path, curves: Mapping[str, Sequence[Mapping[str, Any]]], *, ceiling: float | None = None
+) -> Path:
+    """Draw success on the validation scenes against decisions, simulated and training time, with its Wilson band.
+
+    Args:
+        path: Of the picture, PNG.
+        curves: Records of a run's learning curve, by the label of the run.
+        ceiling: Success of the planner, drawn as a dashed line.
+
+    Raises:
+        ValueError: There is no record to draw.
+    """
+    if not any(curves.values()):
+        raise ValueError("there is no learning curve to draw: the run was never evaluated")
+    every = [record for records in curves.values() for record in records]
+    shown = [axis for axis in AXES if all(axis[0] in record for record in every)]
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for ax, (key, label, scale) in zip(axes, shown, strict=True):
+        for name, records in curves.items():
+            x = scale * np.array([record[key] for record in records])
+            rate, low, high = (
+                100.0 * np.array([record["success"][part] for record in records])
+                for part in ("rate", "low", "high")
+            )
+            line = ax.plot(
+                x, rate, marker="o", markersize=3.5, label=name, color=BLUE if len(curves) == 1 else None
+            )
+            ax.fill_between(x, low, high, alpha=0.2, linewidth=0.0, color=line[0].get_color())
+        if ceiling is not None:
+            ax.axhline(100.0 * ceiling, color="0.4", linestyle="--", linewidth=1.0, label="planner")
+        ax.set_xlabel(label)
+        ax.set_xlim(left=0.0)
+        ax.set_ylim(0.0, 102.0)
+        _tidy(ax)
+    axes[0].set_ylabel("success on validation scenes [%]\nband: 95 % Wilson interval")
+    axes[-1].legend(frameon=False, loc="lower right")
+    return _save(figure, path)
+
+
+def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
+    """Draw each method's success by the difficulty of the scenes, with Wilson intervals.
+
+    Args:
+        path: Of the picture, PNG.
+        record: Of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json`.
+    """
+    summaries = record["methods"]
+    figure = Figure(figsize=(8.0, 3.8), layout="constrained")
+    ax = figure.subplots()
+    width = 0.8 / len(summaries)
+    for i, (name, summary) in enumerate(summaries.items()):
+        shown = [(j, summary["success_by_band"][band]) for j, band in enumerate(BANDS) if _has(summary, band)]
+        x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
+        rate, low, high = (
+            100.0 * np.array([each[part] for _, each in shown]) for part in ("rate", "low", "high")
+        )
+        ax.bar(x, rate, width=0.9 * width, label=name)
+        ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
+    ax.set_xticks(range(len(BANDS)), BANDS)
+    ax.set_xlabel("solution share: random actions that solve the scene (easy to hard)")
+    ax.set_ylabel("success [%]")
+    ax.set_ylim(0.0, 102.0)
+    ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    _tidy(ax)
+    return _save(figure, path)
+
+
+def _has(summary: Mapping[str, Any], band: str) -> bool:
+    return band in summary["success_by_band"]
+
+
+def _tidy(ax: Any) -> None:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(axis="y", color="0.9")
+    ax.set_axisbelow(True)
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=DOTS_PER_INCH, metadata={"Software": None})
+    return path

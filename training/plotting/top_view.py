@@ -1,0 +1,151 @@
+"""Scenes and movements seen from above, drawn with Matplotlib: for figures, and where there is no OpenGL."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Polygon
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.rendering.overlay import Movement, Touch
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.executor import Rollout
+
+Float = NDArray[np.float64]
+
+VIEW = ((-0.56, 0.48), (-0.14, 0.90))
+"""What is seen of the plane, (x, y), [m]."""
+GOAL_RADIUS, START_RADIUS = 0.026, 0.018
+"""[m]"""
+
+
+def draw_movement(
+    axes: Axes,
+    arm: Arm,
+    scene: Scenes,
+    plan: Plan | None = None,
+    rollout: Rollout | None = None,
+    *,
+    whole_arm: bool = False,
+    step: int | None = None,
+    arm_shown: bool = True,
+    view: tuple[tuple[float, float], tuple[float, float]] = VIEW,
+    scale: float = 1.0,
+) -> None:
+    """Draw a scene and, where given, what was planned and what was done in it.
+
+    Args:
+        axes: What to draw on; its frame and ticks are taken away.
+        arm: The arm.
+        scene: One row.
+        plan: One row: the planned path and its via-points.
+        rollout: The executed path, the first contact, and the posture there or at the end.
+        whole_arm: Whether the links can touch obstacles, too.
+        step: Draw the movement up to this state only, 0 being the start; None is all of it.
+        arm_shown: Whether to draw the arm.
+        view: Limits of x and y, [m].
+        scale: Factor on the widths of lines.
+    """
+    _prepare(axes, view)
+    _draw_ends(axes, scene, scale)
+    if plan is not None:
+        _draw_plan(axes, plan, scale)
+    joints, hand, touch = np.asarray(arm.inverse_kinematics(scene.start))[0], scene.start[0], None
+    if plan is not None and rollout is not None:
+        movement = Movement.of(arm, scene, plan, rollout, whole_arm=whole_arm)
+        last = len(movement.hand) - 1 if step is None else step
+        _draw_done(axes, movement, last, scale)
+        touch = movement.touch if movement.touch is not None and last >= movement.touch.step else None
+        pose = touch.step if touch is not None and step is None else last
+        joints, hand = movement.joints[pose], movement.hand[pose]
+    _draw_obstacles(axes, arm, scene, None if touch is None else touch.obstacle)
+    if arm_shown:
+        _draw_arm(axes, arm, joints, above=not whole_arm)
+        colour = PALETTE.contact if touch is not None and touch.link is None else PALETTE.executed
+        axes.add_patch(Circle(_xy(hand), arm.hand_radius, color=colour, linewidth=0, zorder=7))
+    if touch is not None:
+        _draw_contact(axes, touch, scale)
+
+
+def capsule(first: Float, second: Float, radius: float) -> Float:
+    """Outline of a capsule in the plane, shape (66, 2), [m]."""
+    along = np.arctan2(*(second - first)[1::-1]) if np.any(first != second) else 0.0
+    angle = along + np.linspace(-np.pi / 2, np.pi / 2, 33)
+    arc = radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    return np.concatenate((second[:2] + arc, first[:2] - arc))
+
+
+def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) -> None:
+    axes.set(xlim=view[0], ylim=view[1], xticks=[], yticks=[], aspect="equal", facecolor=PALETTE.table)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    for axis, limits in zip("xy", view, strict=True):
+        lines: Any = axes.axvline if axis == "x" else axes.axhline
+        for place in np.arange(np.ceil(limits[0] * 10), np.floor(limits[1] * 10) + 1) / 10:
+            lines(place, color="black", alpha=0.045, linewidth=0.8, zorder=0)
+
+
+def _draw_obstacles(axes: Axes, arm: Arm, scene: Scenes, touched: int | None) -> None:
+    """The footprints, with a rim as wide as the hand's radius: where the hand's centre must not go."""
+    for row in np.flatnonzero(scene.present[0]):
+        numbers = scene.obstacles[0, row]
+        centre, half_axis = numbers[: arm.dimension], numbers[arm.dimension : 2 * arm.dimension]
+        colour: Colour = PALETTE.contact if row == touched else PALETTE.obstacle
+        ends = centre - half_axis, centre + half_axis
+        rim = capsule(*ends, numbers[-1] + arm.hand_radius)
+        axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
+        axes.add_patch(Polygon(capsule(*ends, numbers[-1]), facecolor=colour, linewidth=0, zorder=3))
+
+
+def _draw_ends(axes: Axes, scene: Scenes, scale: float) -> None:
+    start, goal = _xy(scene.start[0]), _xy(scene.goal[0])
+    axes.add_patch(
+        Circle(start, START_RADIUS, fill=False, color=PALETTE.start, linewidth=1.8 * scale, zorder=1)
+    )
+    axes.add_patch(Circle(goal, GOAL_RADIUS, fill=False, color=PALETTE.goal, linewidth=2.2 * scale, zorder=1))
+    axes.add_patch(Circle(goal, 0.6 * GOAL_RADIUS, color=PALETTE.goal, linewidth=0, zorder=1))
+
+
+def _draw_plan(axes: Axes, plan: Plan, scale: float) -> None:
+    """The planned path with its via-points, wide enough to show as a rim of the executed one."""
+    single = Plan(np.asarray(plan.waypoints).reshape(-1, plan.waypoints.shape[-1]), np.ravel(plan.durations))
+    path = np.asarray(single.trajectory()(np.linspace(0.0, float(single.durations.sum()), 121)))
+    axes.plot(*path[:, :2].T, color=PALETTE.plan, linewidth=4.6 * scale, solid_capstyle="round", zorder=4)
+    vias = single.waypoints[1:-1]
+    axes.plot(
+        *vias[:, :2].T, "o", color=PALETTE.via, markersize=7.5 * scale, markeredgecolor="white", zorder=6
+    )  # fmt: skip
+
+
+def _draw_done(axes: Axes, movement: Movement, step: int, scale: float) -> None:
+    """The executed path up to a step, red from contact on."""
+    free = step if movement.touch is None else min(step, movement.touch.step)
+    for first, last, colour in ((0, free, PALETTE.executed), (free, step, PALETTE.contact)):
+        done = movement.hand[first : last + 1, :2]
+        axes.plot(*done.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
+
+
+def _draw_arm(axes: Axes, arm: Arm, joints: Float, *, above: bool) -> None:
+    """The links, see-through where they pass above everything else."""
+    for (first, second), radius in zip(np.asarray(arm.links(joints)), arm.link_radii, strict=True):
+        outline = capsule(first[:2], second[:2], radius)
+        alpha = 0.38 if above else 0.75
+        axes.add_patch(Polygon(outline, facecolor=PALETTE.arm, alpha=alpha, linewidth=0, zorder=6.5))
+        axes.add_patch(Polygon(outline, fill=False, edgecolor=PALETTE.joint, linewidth=0.7, zorder=6.6))
+        axes.add_patch(Circle(_xy(first), 0.4 * radius, color=PALETTE.joint, linewidth=0, zorder=6.7))
+
+
+def _draw_contact(axes: Axes, touch: Touch, scale: float) -> None:
+    """A cross where the arm first touched an obstacle."""
+    for colour, size, width in (("white", 10.5, 4.4), (PALETTE.contact, 9.5, 2.4)):
+        (cross,) = axes.plot(*_xy(touch.place), "x", color=colour, zorder=8)
+        cross.set(markersize=size * scale, markeredgewidth=width * scale)
+
+
+def _xy(point: Float) -> tuple[float, float]:
+    return float(point[0]), float(point[1])

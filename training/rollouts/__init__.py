@@ -1,0 +1,1 @@
+"""Rollouts of agents and methods in environments."""

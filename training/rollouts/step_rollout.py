@@ -1,0 +1,76 @@
+"""Agents that act in every control step, measured beside those that decide once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.actions.velocity import Motion
+from viapoint.envs.registration import STEP_TASKS, twin_of
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.velocity_env import StepReachVectorEnv
+from viapoint.training.rollouts.rollout import Trials
+
+Float = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+
+def is_step_wise(env_id: str) -> bool:
+    """Whether an action lasts one control step only."""
+    return env_id in STEP_TASKS
+
+
+def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Id and keyword arguments of the task in which one action is a whole movement; of most, themselves."""
+    if not is_step_wise(env_id):
+        return env_id, dict(kwargs)
+    known = {name: value for name, value in kwargs.items() if name != "control_step"}
+    if isinstance(known.get("reward_weights"), Mapping):
+        weights = known["reward_weights"]
+        known["reward_weights"] = {name: value for name, value in weights.items() if name != "progress"}
+    return twin_of(env_id), known
+
+
+class StepAgentMethod:
+    """A trained agent that acts in every control step, in environments of its own.
+
+    What it decides is the first action; the rest follows while it is carried out. A decision time is that of one
+    control step, of which a movement has some twenty.
+    """
+
+    def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+        self.name, self._model, self._env_id, self._kwargs = name, model, env_id, dict(env_kwargs)
+        self._envs: dict[int, StepReachVectorEnv] = {}
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Actions for the next control step, shape (N, D), from observations of the step-wise task or its twin."""
+        if "time_left" not in observation:
+            env: Any = self._env(len(scenes.start))
+            rest, time = Motion.at_rest(scenes.start), np.zeros(len(scenes.start))
+            observation = env.observation_layout.moving(observation, scenes, rest, time)
+        actions, _ = self._model.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=np.float64)
+
+    def execute(self, scenes: Scenes, decided: Float) -> Trials:
+        """Begin with the actions that were decided and play every episode to its end."""
+        env = self._env(len(decided))
+        env.reset(options=scenes.as_options())
+        running, reward = np.ones(len(decided), dtype=bool), np.zeros(len(decided))
+        kept: dict[str, NDArray[Any]] = {}
+        while running.any():
+            observation, earned, info = env.execute_actions(decided)
+            reward += np.where(running, earned, 0.0)
+            kept = {name: np.where(running, now, kept.get(name, now)) for name, now in info.items()}
+            running &= ~(env.terminated | env.truncated)
+            decided = self.decide(observation, scenes)
+        return Trials(reward, kept)
+
+    def _env(self, number: int) -> StepReachVectorEnv:
+        if number not in self._envs:
+            env: Any = gym.make_vec(self._env_id, num_envs=number, **self._kwargs)
+            self._envs[number] = env
+        return self._envs[number]

@@ -1,0 +1,248 @@
+"""The environment as Stable-Baselines3 wants it, without one Python environment per copy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+
+import viapoint.envs
+from viapoint.envs.mdp.rewards import RewardTerms
+from viapoint.envs.registration import check_registered
+from viapoint.training.config.discount import ELAPSED
+
+assert viapoint.envs.TASKS, "importing it registers the environments"
+
+Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
+
+REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration", "reachable")
+"""What of an episode's outcome goes into the info dictionaries."""
+TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
+"""Terms of a decision's reward, which go into the info dictionaries."""
+
+
+class ViaVecEnv(VecEnv):
+    """A native vector environment of Gymnasium behind the interface of SB3's `VecEnv`.
+
+    All copies live in one vectorised environment; each step makes one short info dictionary per copy and
+    nothing else per copy. Episodes may be of one step or of many and may end at different times.
+
+    Args:
+        env_id: Of a registered environment.
+        num_envs: Number of copies N.
+        seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
+        **kwargs: Of the environment.
+
+    Raises:
+        ValueError: The environment does not start its next episode in the step that ends the last one.
+    """
+
+    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
+        check_registered(env_id)
+        native = gym.spec(env_id).vector_entry_point is not None
+        same_step: dict[str, Any] = (
+            {} if native else {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
+        )
+        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **same_step, **kwargs)
+        if self.venv.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
+            )
+        self.env_id, self.env_kwargs = env_id, dict(kwargs)
+        super().__init__(num_envs, self.venv.single_observation_space, self.venv.single_action_space)
+        self.last_outcome: dict[str, NDArray[Any]] = {}
+        """What came of the episodes that ended in the last step, one entry of each array per episode."""
+        self._batched_options: Mapping[str, Any] | None = None
+        self._actions: NDArray[Any] | None = None
+        self._returns = np.zeros(num_envs)
+        self._lengths = np.zeros(num_envs, dtype=np.int64)
+        self._began = time.monotonic()
+        self._steps_before = 0
+        if seed is not None:
+            self.seed(seed)
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far; 0 where the environment does not count them."""
+        return self._steps_before + int(getattr(self.venv.unwrapped, "physics_steps", 0))
+
+    def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
+        """Options of the next reset: batched as the environment takes them, or a list of one per copy.
+
+        Raises:
+            ValueError: There is not one mapping per copy, or they give different things.
+        """
+        if options is None or isinstance(options, Mapping):
+            self._batched_options = options
+        else:
+            self._batched_options = _batched(options, self.num_envs)
+
+    def reset(self) -> Observation:
+        """Start new episodes everywhere."""
+        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        options, self._batched_options = self._batched_options, None  # refused ones must not be met again
+        observation, _ = self.venv.reset(seed=seeds, options=options)
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        started: Observation = observation
+        return started
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Remember the actions, shape (N, m)."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step; where an episode ended, the observation is the next one's first.
+
+        Returns:
+            Observation, reward (N,), done (N,) and N info dictionaries. These hold `elapsed` [s], how long the
+            decision took, where the environment tells it. At the end of an episode they hold besides
+            `terminal_observation`, `TimeLimit.truncated`, `episode` (return r, length l, seconds t since the
+            start) and what of :data:`REPORTED` the environment tells.
+        """
+        observation, reward, terminated, truncated, info = self.venv.step(self._actions)
+        done = terminated | truncated
+        self._returns += reward
+        self._lengths += 1
+        infos = self._began_infos(info, done)
+        self.last_outcome = {}
+        rows = np.flatnonzero(done)
+        if rows.size:
+            self._close_episodes(rows, infos, info, truncated & ~terminated)
+        return observation, np.asarray(reward, dtype=np.float32), done, infos
+
+    def _began_infos(self, info: Mapping[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
+        """Return one info per copy, with the time that its decision took and the terms of its reward, where known."""
+        final = info.get("final_info", {})
+        columns = {}
+        for name in (ELAPSED, *TERMS):
+            told = [part[name] for part in (info, final) if name in part]
+            if told:
+                columns[name] = np.where(done, told[-1], told[0]).tolist()
+        if not columns:
+            return [{} for _ in range(self.num_envs)]
+        names = tuple(columns)
+        return [dict(zip(names, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+    def _close_episodes(
+        self,
+        rows: NDArray[np.int64],
+        infos: list[dict[str, Any]],
+        info: Mapping[str, Any],
+        cut: NDArray[np.bool_],
+    ) -> None:
+        final = info.get("final_info", {})
+        names = [name for name in REPORTED if name in final]
+        self.last_outcome = {name: np.asarray(final[name])[rows] for name in names}
+        columns = [self.last_outcome[name].tolist() for name in names]
+        seconds = round(time.monotonic() - self._began, 6)
+        statistics = zip(self._returns[rows].tolist(), self._lengths[rows].tolist(), strict=True)
+        values = zip(*columns, strict=True) if names else iter([()] * len(rows))
+        for row, (r, length), value in zip(rows.tolist(), statistics, values, strict=True):
+            infos[row].update(zip(names, value, strict=True))
+            infos[row]["terminal_observation"] = info["final_obs"][row]
+            infos[row]["TimeLimit.truncated"] = bool(cut[row])
+            infos[row]["episode"] = {"r": r, "l": length, "t": seconds}
+        self._returns[rows], self._lengths[rows] = 0.0, 0
+
+    def state(self) -> dict[str, Any]:
+        """Random generators, running episodes and counters, as values and arrays for :meth:`restore`."""
+        env = self.venv.unwrapped
+        return {
+            "generators": [generator.bit_generator.state for generator in env._generators],
+            "scenes": env.scenes.as_options(),
+            "returns": self._returns.copy(),
+            "lengths": self._lengths.copy(),
+            "physics_steps": self.physics_steps,
+            "episodes": env.episodes_state() if hasattr(env, "episodes_state") else None,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where :meth:`state` was taken, in this environment or another of the same kind and number."""
+        env = self.venv.unwrapped
+        env.reset(options=state["scenes"])
+        if state.get("episodes"):
+            env.restore_episodes(state["episodes"])
+        for generator, saved in zip(env._generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+        self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
+        self._steps_before = int(state["physics_steps"]) - int(env.physics_steps)
+
+    def close(self) -> None:
+        """Let the environment go."""
+        self.venv.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The vector environment's attribute, the same for every copy asked for."""
+        return [getattr(self.venv.unwrapped, attr_name)] * len(self._rows(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the vector environment, which all copies share."""
+        if len(self._rows(indices)) != self.num_envs:
+            raise ValueError(
+                f"the copies share {attr_name}: it can be set for all of them only, not for {indices}"
+            )
+        setattr(self.venv.unwrapped, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the vector environment once; the answer is the same for every copy asked for."""
+        answer = getattr(self.venv.unwrapped, method_name)(*method_args, **method_kwargs)
+        return [answer] * len(self._rows(indices))
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Whether the copies do what a wrapper would: infos tell of episodes as SB3's `Monitor` has them do.
+
+        They have no other wrappers: the vector environment is a native one.
+        """
+        return [wrapper_class is Monitor] * len(self._rows(indices))
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Rendered frames, one for each copy."""
+        frames = self.venv.render()
+        return [None] * self.num_envs if frames is None else list(frames)
+
+    def _rows(self, indices: Any) -> list[int]:
+        chosen: Iterable[int] = self._get_indices(indices)
+        rows = list(chosen)
+        if any(not -self.num_envs <= row < self.num_envs for row in rows):
+            raise IndexError(f"indices must be of {self.num_envs} copies, got {indices!r}")
+        return rows
+
+
+def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
+    """Options of each copy as those of all together."""
+    listed = isinstance(options, Sequence) and len(options) == num_envs
+    if not listed or not all(isinstance(each, Mapping) for each in options):
+        raise ValueError(
+            f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
+        )
+    names = list(options[0])
+    for copy, each in enumerate(options):
+        if set(each) != set(names):
+            raise ValueError(
+                f"options must give the same for every copy: {_listed(names)} for copy 0, "
+                f"but {_listed(each)} for copy {copy}"
+            )
+    batched = {}
+    for name in names:
+        parts = [np.asarray(each[name]) for each in options]
+        shapes = [part.shape for part in parts]
+        if len(set(shapes)) > 1:
+            raise ValueError(
+                f"options[{name!r}] must have the same shape for every copy, got {', '.join(map(str, shapes))}"
+            )
+        batched[name] = np.stack(parts)
+    return batched
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(map(repr, names)) or "nothing"

@@ -1,0 +1,285 @@
+"""What happens besides learning: watching, validating, keeping."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from tqdm.auto import tqdm  # a bar of its own kind in a notebook
+
+from viapoint.training.evaluation.evaluator import MethodResult, evaluate
+from viapoint.training.planners.baselines import agent_method
+from viapoint.training.rollouts.step_rollout import whole_task
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, drawn, frozen_fit, load
+
+LOG_EVERY = 1_000
+"""Decisions between two entries of the log."""
+RECENT = 20
+"""Steps of all environments over which outcomes are averaged for log and progress bar."""
+TIMED_DECISIONS = 11
+"""Single decisions that are timed at each validation."""
+OUTCOMES = {
+    "rollout/collision_rate": "collision",
+    "rollout/reachable_rate": "reachable",
+    "rollout/min_clearance": "min_clearance",
+    "rollout/jerk_ratio": "jerk_ratio",
+    "rollout/duration": "duration",
+}
+"""Tags of the TensorBoard log besides SB3's own, and what of the outcomes of training they average."""
+VALIDATED = {
+    "validation/success_rate": "success",
+    "validation/collision_rate": "collision",
+    "validation/min_clearance": "min_clearance",
+    "validation/goal_error": "goal_error",
+    "validation/jerk_ratio": "jerk_ratio",
+    "validation/duration": "duration",
+    "validation/decision_time": "decision_time",
+}
+"""Tags, and what of a record of the learning curve they show; medians in m and s."""
+BAND_TAGS = {
+    band: f"validation/success_rate_share_{words}"
+    for band, words in zip(BANDS, ("above_20", "5_to_20", "1_to_5", "below_1"), strict=True)
+}
+"""Tags of the success by band."""
+
+
+class TrainingStoppedError(Exception):
+    """Training was stopped by Ctrl-C after its state was saved."""
+
+    exit_code = 130
+    """As shells count an end by Ctrl-C."""
+
+
+class Monitor(BaseCallback):
+    """Validates, keeps the best model, writes checkpoints, logs, and shows progress.
+
+    All of it happens between two collections of experience, when the state of a run is whole. None of it
+    draws from the learner's random generators, so a run is the same with it and without. It is entered as a
+    context around `learn`: inside, the first Ctrl-C saves and leaves, the second leaves at once.
+    """
+
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self.run, self.config = run, run.config
+        self.curve: list[dict[str, Any]] = []
+        """One record for each evaluation so far."""
+        self._best = (-1.0, 0.0)
+        self._seconds_before, self._began = 0.0, time.monotonic()
+        self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_interval, "evaluation": 0}
+        self._every = {
+            "log": LOG_EVERY,
+            "checkpoint": self.config.checkpoint_interval,
+            "evaluation": self.config.evaluation_interval,
+        }
+        self._validation = validation_scenes(run) if self.config.evaluation_interval else None
+        self._recent: list[dict[str, float]] = []
+        self._stop = False
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`restore` needs, as plain values."""
+        return {
+            "curve": self.curve,
+            "best": list(self._best),
+            "seconds": self.seconds,
+            "next": dict(self._next),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state` was taken."""
+        self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
+        self._best = (float(state["best"][0]), float(state["best"][1]))
+        self._next = {name: int(state["next"][name]) for name in self._next}
+
+    @property
+    def seconds(self) -> float:
+        """Trained so far, earlier parts of the run included, validation excluded, [s]."""
+        return self._seconds_before + time.monotonic() - self._began
+
+    @property
+    def _title(self) -> str:
+        return f"{self.config.algo} on {self.config.env.rpartition('/')[2]}"
+
+    @contextmanager
+    def _showing(self, work: str) -> Iterator[None]:
+        """Show in the progress bar what learning waits for."""
+        self._bar.set_description(work)
+        try:
+            yield
+        finally:
+            self._bar.set_description(self._title)
+
+    def __enter__(self) -> Monitor:
+        self._bar = tqdm(
+            total=self.config.total_timesteps,
+            unit=" decisions",
+            desc=self._title,
+            disable=not self.config.progress,
+            file=sys.stderr,
+            dynamic_ncols=True,
+        )
+        self._listens = threading.current_thread() is threading.main_thread()
+        if self._listens:
+            self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._listens:
+            signal.signal(signal.SIGINT, self._handler)
+        self._bar.close()
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._stop = True
+        self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
+
+    def _on_training_start(self) -> None:
+        self._began = time.monotonic()
+        self._show_progress()
+
+    def _on_step(self) -> bool:
+        env = self.training_env
+        if isinstance(env, ViaVecEnv) and env.last_outcome:
+            self._recent.append({name: float(np.mean(env.last_outcome[name])) for name in env.last_outcome})
+            del self._recent[:-RECENT]
+        self._show_progress()
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self._between(final=False)
+        if self._stop:
+            self._keep()
+            self.run.save("final", self.model)
+            raise TrainingStoppedError(
+                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
+                "goes on from there (viapoint train --resume, or viapoint demo again)"
+            )
+
+    def _on_training_end(self) -> None:
+        self._between(final=True)
+
+    def _between(self, *, final: bool) -> None:
+        validates = self._validation is not None and (self._due("evaluation") or final)
+        if self._validation is not None and validates:
+            self._validate(self._validation)
+        if self._due("log") or validates or final:
+            self._log()
+        if self._due("checkpoint") or final:
+            self._keep()
+
+    def _due(self, what: str) -> bool:
+        """Whether it is time; if so, when the next time comes."""
+        if self.num_timesteps < self._next[what]:
+            return False
+        self._next[what] = (self.num_timesteps // self._every[what] + 1) * self._every[what]
+        return True
+
+    def _keep(self) -> None:
+        with self._showing("saving a checkpoint"):
+            self.run.checkpoint(self.model, self.state())
+
+    def _validate(self, frozen: FrozenScenes) -> None:
+        """Measure the policy alone, add to the learning curve, keep the model if it is the best so far."""
+        if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
+            return
+        seconds, began = self.seconds, time.monotonic()
+        with self._showing(f"validating in {len(frozen.share)} scenes"):
+            result = evaluate(
+                [agent_method("agent", self.model)],
+                frozen,
+                frozen.env_id,
+                env_kwargs=whole_task(self.config.env, self.config.env_kwargs)[1],
+                time_decisions=False,
+            ).results[0]
+        if result.partial:
+            return
+        self.curve.append(self._record(result, seconds))
+        self.run.write_curve(self.curve)
+        summary = result.summary()
+        ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
+        if ranking > self._best:
+            self._best = ranking
+            with self._showing("saving the best model"):
+                self.run.save("best", self.model)
+        self._show_progress()
+        self._began += time.monotonic() - began
+
+    def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
+        env, summary = self.training_env, result.summary()
+        steps = env.physics_steps if isinstance(env, ViaVecEnv) else 0
+        record = {
+            "decisions": self.num_timesteps,
+            "physics_steps": steps,
+            "simulated_seconds": round(steps * _timestep(env), 6) if steps else 0.0,
+            "seconds": round(seconds, 3),
+            "decision_time": self._decision_time(),
+            "success_by_band": summary["success_by_band"],
+            **{name: summary[name] for name in VALIDATED.values() if name != "decision_time"},
+        }
+        for tag, name in VALIDATED.items():
+            self._note(tag, record[name])
+        for band, rate in record["success_by_band"].items():
+            self._note(BAND_TAGS[band], rate)
+        return record
+
+    def _decision_time(self) -> float:
+        """Median time of single decisions, of which the first does not count, [s]."""
+        observation: Any = self.model._last_obs
+        one = {name: part[:1] for name, part in observation.items()}
+        times = []
+        for _ in range(TIMED_DECISIONS):
+            began = time.perf_counter()
+            self.model.predict(one, deterministic=True)
+            times.append(time.perf_counter() - began)
+        return float(np.median(times[1:]))
+
+    def _note(self, tag: str, value: Any) -> None:
+        """Log a number, or a rate; a median of successes is None where there is none."""
+        number = value["rate"] if isinstance(value, dict) else value
+        if number is not None:
+            self.logger.record(tag, number)
+
+    def _log(self) -> None:
+        for tag, name in OUTCOMES.items() if self._recent else ():
+            self.logger.record(tag, self._average(name))
+        env = self.training_env
+        if isinstance(env, ViaVecEnv) and env.physics_steps:
+            self.logger.record("time/simulated_seconds", env.physics_steps * _timestep(env))
+        self.model.dump_logs()
+
+    def _average(self, name: str) -> float:
+        return float(np.mean([each[name] for each in self._recent if name in each]))
+
+    def _show_progress(self) -> None:
+        self._bar.update(min(self.num_timesteps, self.config.total_timesteps) - self._bar.n)
+        shown = {}
+        if self._recent:
+            shown["success"] = f"{100.0 * self._average('is_success'):.0f} %"
+        if self.curve:
+            shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
+        self._bar.set_postfix(shown, refresh=False)
+
+
+def _timestep(env: Any) -> float:
+    """Of the physics, [s]."""
+    return float(env.get_attr("model", [0])[0].opt.timestep)
+
+
+def validation_scenes(run: Run) -> FrozenScenes:
+    """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
+    config = run.config
+    env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
+    if frozen_fit("validation", env_id, env_kwargs):
+        return load("validation", env_id).take(slice(0, config.eval_scenes))
+    return drawn("validation", env_id, env_kwargs, config.eval_scenes)

@@ -1,0 +1,263 @@
+"""Everything that training needs to go on as if it had never stopped.
+
+A checkpoint is taken between the collection of experience and the next, when SB3 holds nothing in local
+variables. It is a folder of `state.json` and `tensors.safetensors`, written whole or not at all, and like a
+model it holds no code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+
+from viapoint.training.io.files import (
+    BadFileError,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_folder,
+    write_json,
+)
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.model_io import describe
+
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats that can be read; the first did not vouch for the numbers in `state.json`."""
+COUNTERS = (
+    "seed",
+    "num_timesteps",
+    "_total_timesteps",
+    "_episode_num",
+    "_n_updates",
+    "_current_progress_remaining",
+)
+"""Numbers of SB3's algorithms that training continues from."""
+ARRAYS = ("_last_obs", "_last_episode_starts")
+DEQUES = ("ep_info_buffer", "ep_success_buffer")
+
+
+def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any]) -> None:
+    """Write the whole state of a training run; `extra` comes back from :func:`read_checkpoint`."""
+    tensors: dict[str, Any] = {}
+    state = {
+        "format": FORMAT,
+        "model": describe(model),
+        "counters": {name: getattr(model, name) for name in COUNTERS},
+        "recent": {name: list(getattr(model, name) or ()) for name in DEQUES},
+        "parameters": _take(model.get_parameters(), "parameters", tensors),
+        "variables": _take(_variables(model), "variables", tensors),
+        "arrays": _take({name: getattr(model, name) for name in ARRAYS}, "arrays", tensors),
+        "buffer": _take(_buffer_state(model), "buffer", tensors),
+        "random": _take(_random_state(model), "random", tensors),
+        "env": _take(_env(model).state(), "env", tensors),
+        "extra": dict(extra),
+    }
+
+    def fill(temporary: Path) -> None:
+        write_arrays(temporary / "tensors.safetensors", tensors)
+        state["sha256"] = _file_digest(temporary / "tensors.safetensors")
+        state["digest"] = _digest(state)
+        write_json(temporary / "state.json", state)
+
+    write_folder(folder, fill)
+
+
+def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
+    """Put a newly built model of the same kind and its environment into the state of a checkpoint.
+
+    Returns:
+        What `extra` was.
+
+    Raises:
+        BadFileError: The checkpoint is torn, foreign, or of another model.
+    """
+    state = _whole(folder)
+    written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
+    difference = _difference(state["model"], describe(model))
+    if difference:
+        raise BadFileError(folder / "state.json", f"{written_by} is of another model: {difference}")
+    tensors = read_arrays(folder / "tensors.safetensors")
+    try:
+        _restore(model, state, tensors)
+        extra: dict[str, Any] = dict(state["extra"])
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
+        raise BadFileError(folder, reason) from None
+    return extra
+
+
+def _whole(folder: Path) -> dict[str, Any]:
+    """What `state.json` says, after both files were found to be as they were written."""
+    path, tensors = folder / "state.json", folder / "tensors.safetensors"
+    state = read_json(path)
+    if state.get("format") not in READABLE or not isinstance(state.get("model"), dict):
+        known = " or ".join(map(str, READABLE))
+        raise BadFileError(path, f"must have format {known}, got {state.get('format')!r}")
+    if state["format"] != 1 and state.get("digest") != _digest(state):
+        raise BadFileError(path, "is damaged: it does not have the hash that it states")
+    if _file_digest(tensors) != state.get("sha256"):
+        raise BadFileError(tensors, "is torn: its hash is not the one that state.json states")
+    return state
+
+
+def _digest(state: Mapping[str, Any]) -> str:
+    """Hash of everything else in a state."""
+    rest = {name: value for name, value in state.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _file_digest(path: Path) -> str:
+    if not path.is_file():
+        raise BadFileError(path, "is no regular file" if path.exists() else "is missing")
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
+
+
+def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:
+    """Set what a checkpoint holds; which attributes these are is said here, never by the file."""
+    model.set_parameters(_torch(_put(state["parameters"], tensors)), exact_match=True)
+    variables, arrays = _put(state["variables"], tensors), _put(state["arrays"], tensors)
+    for name in _variables(model):
+        recursive_setattr(model, f"{name}.data", torch.from_numpy(variables[name]))
+    for name in COUNTERS:
+        setattr(model, name, state["counters"][name])
+    for name in ARRAYS:
+        setattr(model, name, arrays[name])
+    for name in DEQUES:
+        setattr(model, name, deque(state["recent"][name], maxlen=model._stats_window_size))
+    _restore_buffer(model, _put(state["buffer"], tensors))
+    _env(model).restore(_put(state["env"], tensors))
+    _restore_random(model, _put(state["random"], tensors))  # last: nothing may be drawn after it
+
+
+def _variables(model: BaseAlgorithm) -> dict[str, Any]:
+    """Tensors outside of modules and optimisers, such as SAC's entropy coefficient."""
+    return {name: recursive_getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
+
+
+def _buffer(model: BaseAlgorithm) -> BaseBuffer | None:
+    """The replay buffer; a rollout buffer is empty between two collections."""
+    return getattr(model, "replay_buffer", None)
+
+
+def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
+    """The filled part of the replay buffer's arrays."""
+    buffer = _buffer(model)
+    if buffer is None:
+        return {}
+    size = buffer.size()
+    arrays = {name: _cut(value, size) for name, value in vars(buffer).items() if _is_storage(value)}
+    return {"pos": buffer.pos, "full": buffer.full, "arrays": arrays}
+
+
+def _restore_buffer(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    buffer = _buffer(model)
+    if buffer is None:
+        return
+    for name, kept in vars(buffer).items():
+        if not _is_storage(kept):
+            continue
+        saved = state["arrays"][name]
+        pairs = [(kept[key], saved[key]) for key in kept] if isinstance(kept, dict) else [(kept, saved)]
+        for mine, theirs in pairs:
+            if mine.shape[1:] != theirs.shape[1:] or mine.dtype != theirs.dtype or len(theirs) > len(mine):
+                must, got = (f"{array.dtype} {array.shape}" for array in (mine, theirs))
+                raise ValueError(f"{name} of the replay buffer must fit into {must}, is {got}")
+            mine[: len(theirs)] = theirs
+    if not 0 <= state["pos"] < buffer.buffer_size:
+        raise ValueError(f"the replay buffer has {buffer.buffer_size} rows, no row {state['pos']}")
+    buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
+
+
+def _is_storage(value: Any) -> bool:
+    return isinstance(value, np.ndarray) or (
+        isinstance(value, dict) and bool(value) and all(isinstance(v, np.ndarray) for v in value.values())
+    )
+
+
+def _cut(value: Any, size: int) -> Any:
+    return {key: array[:size] for key, array in value.items()} if isinstance(value, dict) else value[:size]
+
+
+def _random_state(model: BaseAlgorithm) -> dict[str, Any]:
+    version, words, gauss = random.getstate()
+    return {
+        "python": [version, list(words), gauss],
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3 draws from it
+        "torch": torch.get_rng_state(),
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def _restore_random(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words), gauss))
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(torch.from_numpy(state["torch"]))
+    model.action_space.np_random.bit_generator.state = state["actions"]
+
+
+def _env(model: BaseAlgorithm) -> ViaVecEnv:
+    env = model.get_env()
+    assert isinstance(env, ViaVecEnv)
+    return env
+
+
+def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
+    """A copy of nested values whose arrays went into `tensors` and left {"tensor": name} behind."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        tensors[name] = value
+        return {"tensor": name}
+    if isinstance(value, Mapping):
+        whole = [str(key) for key in value if isinstance(key, int)]
+        entries = {str(key): _take(each, f"{name}/{key}", tensors) for key, each in value.items()}
+        return {"whole_numbers": entries} if whole else entries
+    if isinstance(value, list | tuple):
+        return [_take(each, f"{name}/{i}", tensors) for i, each in enumerate(value)]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _put(value: Any, tensors: Mapping[str, Any]) -> Any:
+    """The inverse of :func:`_take`, but for arrays in place of torch's tensors."""
+    if isinstance(value, list):
+        return [_put(each, tensors) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"tensor"}:
+        return tensors[value["tensor"]]
+    if set(value) == {"whole_numbers"}:
+        return {int(key): _put(each, tensors) for key, each in value["whole_numbers"].items()}
+    return {key: _put(each, tensors) for key, each in value.items()}
+
+
+def _torch(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _torch(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_torch(each) for each in value]
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+
+def _difference(saved: Any, mine: Any, name: str = "the model") -> str:
+    """The first thing that differs between two descriptions, in words; empty where nothing does."""
+    if isinstance(saved, dict) and isinstance(mine, dict):
+        names = [each for each in sorted({*saved, *mine}) if each not in ("num_timesteps", "viapoint")]
+        return next(filter(None, (_difference(saved.get(each), mine.get(each), each) for each in names)), "")
+    return "" if saved == mine else f"{name} was {saved!r}, is {mine!r}"

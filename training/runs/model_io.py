@@ -1,0 +1,436 @@
+"""Model files: saving, loading and importing models of Stable-Baselines3."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import inspect
+import json
+import sys
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from sb3_contrib import TQC
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from viapoint.training.algorithms.extractors import EXTRACTORS
+from viapoint.training.algorithms.minimum_critic import POLICIES as MINIMUM
+from viapoint.training.algorithms.smdp_buffers import timed, unit_of
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.config.configs import ImportConfig
+from viapoint.training.config.discount import check_discount_unit
+from viapoint.training.io.files import (
+    BadFileError,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_folder,
+    write_json,
+)
+from viapoint.training.io.model_limits import (
+    LARGEST_MODEL_JSON,
+    LARGEST_WEIGHTS,
+    check_env_arguments,
+    parameter_budget,
+)
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "viaq": ViaQ,
+    "sac": SAC,
+    "td3": TD3,
+    "ppo": PPO,
+    "tqc": TQC,
+}
+"""The learning algorithms by the name the command line knows them by."""
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+}
+MINIMUM_CRITIC = "MinimumCriticPolicy"
+"""Name of the policies with a minimum critic."""
+FORMAT = 1
+"""Version of the two files."""
+NOT_STORED = frozenset(
+    {
+        "self",
+        "policy",
+        "env",
+        "seed",
+        "device",
+        "verbose",
+        "tensorboard_log",
+        "_init_setup_model",
+        "stats_window_size",
+    }
+    | {"monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
+    | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
+)
+"""Arguments of an algorithm that belong to one process, or that are not used here."""
+
+
+def save_model(model: BaseAlgorithm, folder: Path) -> None:
+    """Write what is needed to decide with a model and to train it on from its weights.
+
+    Raises:
+        ValueError: It is of a class that is not in ALGORITHMS, or was not trained on a :class:`ViaVecEnv`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "weights.safetensors"
+    write_arrays(path, weights(model))
+    write_json(folder / "model.json", {**describe(model), "weights_sha256": _digest(path)})
+
+
+def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
+    """Read a model.
+
+    Args:
+        folder: That :func:`save_model` wrote.
+        env: To train it on; without one it gets a single environment of its own kind, and is fit for
+            decisions.
+
+    Raises:
+        BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
+    """
+    path, tensors = folder / "model.json", folder / "weights.safetensors"
+    record = read_json(path, LARGEST_MODEL_JSON)
+    if record.get("format") != FORMAT:
+        found, mine = record.get("format"), importlib.metadata.version("viapoint")
+        writer = f"was written by viapoint {record.get('viapoint')} and this is {mine}"
+        raise BadFileError(path, f"must have format {FORMAT}, got {found!r}; it {writer}")
+    arrays = read_arrays(tensors, LARGEST_WEIGHTS)
+    try:
+        hyperparameters = dict(record["hyperparameters"])
+        if env is None:  # to decide, hardly any room is needed for experience
+            buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
+            hyperparameters[buffer] = 2
+        with warnings.catch_warnings(), parameter_budget(arrays):
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # PPO finds that its batches do not fill one environment
+            chosen = env or _own_environment(record["env"])
+            unit = record.get("discount_unit")
+            model = build(record["algorithm"], record["policy"], chosen, hyperparameters, discount_unit=unit)
+        model.num_timesteps = int(record["num_timesteps"])
+    except BadFileError:
+        raise
+    except Exception as error:
+        reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
+        raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
+    put_weights(model, arrays, tensors)
+    if record.get("weights_sha256", "") not in ("", _digest(tensors)):
+        raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
+    return model
+
+
+def build(
+    algorithm: str,
+    policy: str,
+    env: ViaVecEnv,
+    hyperparameters: Mapping[str, Any],
+    *,
+    discount_unit: float | None = None,
+    seed: int | None = None,
+) -> BaseAlgorithm:
+    """A new model from plain values.
+
+    Args:
+        algorithm: One of ALGORITHMS.
+        policy: One of the algorithm's policies.
+        env: To learn on.
+        hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
+            writes them.
+        discount_unit: Time that counts gamma [s]; None where a decision does, whatever it takes.
+        seed: Of the algorithm.
+
+    Raises:
+        ValueError: There is no such algorithm or policy, or it cannot discount by time.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
+    kind, policies = ALGORITHMS[algorithm], _policies(algorithm)
+    if policy not in policies:
+        raise ValueError(f"policy of {algorithm} must be one of {', '.join(policies)}, got {policy!r}")
+    allowed = _argument_names(kind)
+    unknown = sorted(set(hyperparameters) - allowed)
+    if unknown:
+        raise ValueError(
+            f"{algorithm} has no hyperparameter {unknown[0]!r}; it has {', '.join(sorted(allowed))}"
+        )
+    size = int(np.prod(env.action_space.shape or ()))
+    arguments = {name: _decode(value, size) for name, value in hyperparameters.items()}
+    if discount_unit is not None:
+        arguments |= _by_time(algorithm, env, arguments, discount_unit)
+    network = dict(arguments.get("policy_kwargs") or {})
+    if "critic" in network:
+        policy = _policy_with(network.pop("critic"), algorithm)
+        arguments["policy_kwargs"] = network
+    return kind(policies[policy], env, seed=seed, device="cpu", **arguments)
+
+
+def _policies(algorithm: str) -> dict[str, type[BasePolicy]]:
+    """Return the policies of an algorithm by name."""
+    policies = dict(ALGORITHMS[algorithm].policy_aliases)
+    return policies | ({MINIMUM_CRITIC: MINIMUM[algorithm]} if algorithm in MINIMUM else {})
+
+
+def _policy_with(critic: Any, algorithm: str) -> str:
+    """Return the name of the policy with a critic of this name.
+
+    Raises:
+        ValueError: There is no such critic, or none for the algorithm.
+    """
+    if critic != "minimum" or algorithm not in MINIMUM:
+        raise ValueError(
+            f"critic in policy_kwargs must be minimum, with algo one of {', '.join(MINIMUM)}, "
+            f"got {critic!r} with {algorithm}"
+        )
+    return MINIMUM_CRITIC
+
+
+def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
+    """Return a model like this one before its training, with weights of seed 0."""
+    record, env = describe(model), model.get_env()
+    assert isinstance(env, ViaVecEnv)
+    hyperparameters = dict(record["hyperparameters"])
+    hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
+    return build(
+        record["algorithm"],
+        record["policy"],
+        env,
+        hyperparameters,
+        discount_unit=record["discount_unit"],
+        seed=0,
+    )
+
+
+def describe(model: BaseAlgorithm) -> dict[str, Any]:
+    """Everything but the weights, as JSON can hold it."""
+    names = {kind: name for name, kind in ALGORITHMS.items()}
+    env = model.get_env()
+    if type(model) not in names or not isinstance(env, ViaVecEnv):
+        raise ValueError(
+            f"only {', '.join(kind.__name__ for kind in names)} on a ViaVecEnv can be saved, "
+            f"not {type(model).__name__} on {type(env).__name__}"
+        )
+    policies = {kind: name for name, kind in _policies(names[type(model)]).items()}
+    stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
+    return {
+        "format": FORMAT,
+        "viapoint": importlib.metadata.version("viapoint"),
+        "algorithm": names[type(model)],
+        "policy": policies[model.policy_class],
+        "env": {"id": env.env_id, "kwargs": _encode(env.env_kwargs)},
+        "num_timesteps": model.num_timesteps,
+        "discount_unit": unit_of(model),
+        "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
+    }
+
+
+def weights(model: BaseAlgorithm) -> dict[str, Any]:
+    """The policy's tensors by name, targets and critics included."""
+    return {name: tensor.detach().cpu().numpy() for name, tensor in model.policy.state_dict().items()}
+
+
+def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
+    """Set the policy's tensors after checking every one of them.
+
+    Raises:
+        BadFileError: Names, shapes or types differ, or a value is not finite.
+    """
+    wanted = model.policy.state_dict()
+    if set(arrays) != set(wanted):
+        name = sorted(set(arrays) ^ set(wanted))[0]
+        raise BadFileError(
+            path, f"tensor {name!r} is {'missing' if name in wanted else 'unknown to the model'}"
+        )
+    for name, array in arrays.items():
+        expected = wanted[name].cpu().numpy()
+        if array.shape != expected.shape or array.dtype != expected.dtype:
+            got, must = (f"{a.dtype} {a.shape}" for a in (array, expected))
+            raise BadFileError(path, f"tensor {name!r} must be {must}, is {got}")
+        if not np.isfinite(array).all():
+            raise BadFileError(path, f"tensor {name!r} holds values that are not finite")
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
+    if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
+        raise ValueError(f"environment {record['id']!r} is not known")
+    check_env_arguments(record["kwargs"])
+    return ViaVecEnv(record["id"], 1, **record["kwargs"])
+
+
+def _by_time(algorithm: str, env: ViaVecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
+    """Arguments that make an algorithm discount by time."""
+    check_discount_unit(algorithm, unit, env.env_id)
+    if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
+        raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
+    kind = ALGORITHMS[algorithm]
+    known = inspect.signature(kind).parameters
+    gamma = arguments["gamma"] if "gamma" in arguments else known["gamma"].default
+    return timed(kind, env.observation_space, gamma=gamma, unit=unit)
+
+
+def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
+    """Arguments of an algorithm, through its bases as far as `**kwargs` hands them on."""
+    names: set[str] = set()
+    for each in kind.__mro__:
+        parameters = inspect.signature(vars(each).get("__init__", object.__init__)).parameters.values()
+        names |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    return names - NOT_STORED
+
+
+def _encode(value: Any) -> Any:
+    """A value as JSON can hold it; what is not a plain value is written as {"kind": ..., ...}."""
+    if isinstance(value, FloatSchedule):
+        return _encode(value.value_schedule)
+    if isinstance(value, ConstantSchedule):
+        return value.val
+    if isinstance(value, LinearSchedule):
+        return {"kind": "linear", "start": value.start, "end": value.end, "end_fraction": value.end_fraction}
+    if isinstance(value, VectorizedActionNoise):
+        return _encode(value.base_noise)
+    if isinstance(value, NormalActionNoise):
+        return {"kind": "normal", "sigma": float(np.max(value._sigma))}
+    if isinstance(value, type) and value in ACTIVATIONS.values():
+        return {"kind": "activation", "name": value.__name__}
+    if isinstance(value, type) and value in EXTRACTORS.values():
+        return {"kind": "extractor", "name": value.__name__}
+    if isinstance(value, Mapping):
+        return {str(name): _encode(each) for name, each in value.items()}
+    if hasattr(value, "frequency"):  # SB3's TrainFreq
+        return [value.frequency, value.unit.value]
+    if isinstance(value, list | tuple):
+        return [_encode(each) for each in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if hasattr(value, "reach_margin"):
+        return value.name  # of an arm; whoever loads the model makes it known first
+    raise ValueError(f"a {type(value).__name__} cannot be written as JSON: {value!r}")
+
+
+def _decode(value: Any, size: int) -> Any:
+    """The inverse of :func:`_encode`; `size` is that of an action."""
+    if isinstance(value, Mapping):
+        kind = value.get("kind")
+        if kind == "linear":
+            return LinearSchedule(float(value["start"]), float(value["end"]), float(value["end_fraction"]))
+        if kind == "normal":
+            return NormalActionNoise(np.zeros(size), np.full(size, float(value["sigma"])))
+        if kind == "activation":
+            return ACTIVATIONS[value["name"]]
+        if kind == "extractor":
+            return EXTRACTORS[value["name"]]
+        if kind is not None:
+            raise ValueError(f"kind must be linear, normal, activation or extractor, got {kind!r}")
+        return {name: _decode(each, size) for name, each in value.items()}
+    if isinstance(value, list) and len(value) == 2 and isinstance(value[1], str):
+        return tuple(value)
+    return [_decode(each, size) for each in value] if isinstance(value, list) else value
+
+
+WARNING = (
+    "{file} is an archive of Stable-Baselines3. Opening one runs whatever code its author put into it, with your "
+    "rights. Open only archives that you made or whose author you trust."
+)
+LARGEST_DATA = 64 << 20
+"""Size of an archive's description at most, [bytes]."""
+TELLTALE = {
+    "tqc": "top_quantiles_to_drop_per_net",
+    "sac": "target_entropy",
+    "td3": "policy_delay",
+    "ppo": "clip_range",
+}
+"""A name that is in the description of each algorithm's archives, and of none below it."""
+
+
+class NotTrustedError(Exception):
+    """Nobody said that the archive may be opened."""
+
+
+def run(config: ImportConfig) -> None:
+    """Convert an archive and say where the model is.
+
+    Raises:
+        NotTrustedError: Neither `--trust` was given nor the question answered with yes.
+        BadFileError: It is no such archive, or not of a model for the environment; or the folder is in use.
+    """
+    if config.out.exists() and (not config.out.is_dir() or any(config.out.iterdir())):
+        raise BadFileError(config.out, "is not empty; name another folder")
+    algo = config.algo or algorithm_of(config.file)
+    print(WARNING.format(file=config.file), file=sys.stderr)
+    if not (config.trust or _answered_yes()):
+        raise NotTrustedError(f"{config.file} was not opened; --trust says that it may be")
+    model = convert(config.file, algo, config.env, config.out)
+    print(f"{algo} of {model.num_timesteps} decisions on {config.env}: {config.out}")
+    print(f"measure it with: viapoint evaluate {config.out}")
+
+
+def algorithm_of(path: Path) -> str:
+    """The algorithm of an archive by what its description names; nothing in it is opened.
+
+    Raises:
+        BadFileError: It is no archive of Stable-Baselines3, or of an algorithm that is not known here.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.getinfo("data").file_size > LARGEST_DATA:
+                raise BadFileError(path, f"has a description of more than {LARGEST_DATA} bytes")
+            names = set(json.loads(archive.read("data")))
+            archive.getinfo("policy.pth")
+    except FileNotFoundError:
+        raise BadFileError(path, "is missing") from None
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise BadFileError(path, f"is no archive of Stable-Baselines3 ({error})") from None
+    for algo, telltale in TELLTALE.items():
+        if telltale in names:
+            return algo
+    raise BadFileError(path, f"is of none of {', '.join(TELLTALE)}")
+
+
+def convert(path: Path, algo: str, env_id: str, out: Path) -> Any:
+    """Open an archive, which runs its code, and write its model; the model as it is read back.
+
+    Raises:
+        BadFileError: It cannot be opened, is not for the environment, or has parts of its own making.
+    """
+    kind = ALGORITHMS[algo]
+    try:
+        model: Any = (
+            kind.load(path, device="cpu", buffer_size=1) if algo != "ppo" else kind.load(path, device="cpu")
+        )
+    except Exception as error:  # whatever the archive does
+        raise BadFileError(path, f"cannot be opened as {algo} ({type(error).__name__}: {error})") from None
+    env = ViaVecEnv(env_id, model.n_envs or 1)
+    try:
+        model.set_env(env)
+        write_folder(out, lambda temporary: save_model(model, temporary))
+    except (ValueError, KeyError) as error:
+        if isinstance(error, BadFileError):
+            raise
+        raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
+    finally:
+        env.close()
+    return load_model(out)
+
+
+def _answered_yes() -> bool:
+    return sys.stdin.isatty() and input("open it? [yes/no] ").strip().lower() == "yes"

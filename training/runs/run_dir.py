@@ -1,0 +1,260 @@
+"""A run folder: everything about one training, in files that outlive it.
+
+config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
+learning_curve.jsonl              one line for each evaluation on the validation scenes
+checkpoints/<decisions>/          for an exact continuation; the last two are kept
+best/  final/                     models: best on the validation scenes, last
+evaluations/<name>.json           what `viapoint evaluate` and `viapoint demo` measured
+tensorboard/                      logs
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from viapoint.training.config.checks import check_folder
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.io.config_json import as_json, from_json
+from viapoint.training.io.files import (
+    UNFINISHED,
+    BadFileError,
+    read_json,
+    tidy,
+    write_bytes,
+    write_folder,
+    write_json,
+)
+from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
+from viapoint.training.runs.model_io import load_model, save_model
+
+__all__ = ["BadFileError", "Run", "check_free", "find_model", "load_model", "save_model", "versions"]
+
+KEPT_CHECKPOINTS = 2
+PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+
+
+class Run:
+    """One run folder.
+
+    Args:
+        folder: An existing run.
+
+    Raises:
+        BadFileError: The folder is not a run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            what = "it is a file" if folder.exists() else "there is no such folder"
+            raise BadFileError(folder, f"is no run folder: {what}")
+        if not (folder / "config.json").is_file():
+            raise BadFileError(folder, "is no run folder: it holds no config.json")
+        self.folder = folder
+        try:
+            self.config: TrainConfig = from_json(TrainConfig, read_json(folder / "config.json"))
+        except (TypeError, ValueError) as error:
+            if isinstance(error, BadFileError):
+                raise
+            reason = f"is no configuration of a training by viapoint {versions()['viapoint']} ({error})"
+            writer = self.versions.get("viapoint")
+            raise BadFileError(
+                folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
+            ) from None
+
+    def __repr__(self) -> str:
+        config, curve = self.config, self.curve
+        success = (
+            f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
+        )
+        return (
+            f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
+            f"{self.decisions} of {config.total_timesteps} decisions{success})"
+        )
+
+    @classmethod
+    def create(cls, config: TrainConfig) -> Run:
+        """Make the folder of a new run.
+
+        Raises:
+            BadFileError: There is a run in it already, or something else.
+        """
+        folder = config.folder
+        check_free(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with _held(folder):
+            check_free(folder)  # another process may have been faster
+            write_json(folder / "versions.json", versions())
+            _write_config(folder, config)
+        return cls(folder)
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """Versions that the run began with; empty where they cannot be read."""
+        try:
+            return read_json(self.folder / "versions.json")
+        except BadFileError:
+            return {}
+
+    def write_config(self) -> None:
+        """Write the configuration as it is now."""
+        _write_config(self.folder, self.config)
+
+    @property
+    def curve(self) -> list[dict[str, Any]]:
+        """The learning curve: one record for each evaluation; a torn last line is left out."""
+        path = self.folder / "learning_curve.jsonl"
+        records = []
+        for line in path.read_text().splitlines() if path.exists() else []:
+            try:
+                records.append(json.loads(line))
+            except ValueError:
+                break
+        return records
+
+    def write_curve(self, records: list[dict[str, Any]]) -> None:
+        """Replace the learning curve."""
+        content = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
+        write_bytes(self.folder / "learning_curve.jsonl", content.encode())
+
+    @property
+    def decisions(self) -> int:
+        """Decisions that the newest checkpoint was trained for; 0 without one."""
+        checkpoints = self.checkpoints()
+        return int(checkpoints[-1].name) if checkpoints else 0
+
+    @property
+    def model_folder(self) -> Path:
+        """The best model where there is one, otherwise the last.
+
+        Raises:
+            BadFileError: There is none yet.
+        """
+        for name in ("best", "final"):
+            replaced = sorted(self.folder.glob(f".{name}.*.old"))  # there is one amid a replacement only
+            for folder in (self.folder / name, *replaced):
+                if (folder / "model.json").is_file():
+                    return folder
+        raise BadFileError(self.folder, "holds no model yet")
+
+    def save(self, name: str, model: BaseAlgorithm) -> None:
+        """Write a model as `best` or `final`."""
+        write_folder(self.folder / name, lambda temporary: save_model(model, temporary))
+
+    def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
+        """Write a checkpoint and remove those that are outdated."""
+        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
+        for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
+            shutil.rmtree(outdated)
+
+    def checkpoints(self) -> list[Path]:
+        """Folders of the checkpoints, oldest first."""
+        return sorted(path for path in self._checkpoints.glob("[0-9]*") if path.is_dir())
+
+    def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
+        """Put a model into the state of the newest checkpoint that is whole.
+
+        Returns:
+            What the checkpoint carried besides, None where there is no checkpoint at all; and why newer ones
+            were passed over.
+
+        Raises:
+            BadFileError: There are checkpoints, but none is whole; the message is about the newest.
+        """
+        passed_over: list[BadFileError] = []
+        for path in reversed(self.checkpoints()):
+            try:
+                return read_checkpoint(model, path), [str(error) for error in passed_over]
+            except BadFileError as error:
+                passed_over.append(error)
+        if passed_over:
+            raise passed_over[0]
+        return None, []
+
+    def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
+        """Keep the result of an evaluation under a name."""
+        path = self.folder / "evaluations" / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        write_json(path, record)
+        return path
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for this process; the system lets go when the process ends, however it ends.
+
+        Raises:
+            BadFileError: Another process trains in the folder.
+        """
+        with _held(self.folder):
+            for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
+                tidy(folder)
+            yield
+
+    @property
+    def _checkpoints(self) -> Path:
+        return self.folder / "checkpoints"
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold a folder for this process; see :meth:`Run.locked`."""
+    lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        pid = owner.read_text() if owner.exists() else "unknown"
+        raise BadFileError(folder, f"is in use by the process with number {pid}") from None
+    try:
+        owner.write_text(str(os.getpid()))
+        yield
+    finally:
+        owner.unlink(missing_ok=True)
+        lock.release()
+
+
+def check_free(folder: Path) -> None:
+    """Refuse a folder that cannot take a new run.
+
+    Raises:
+        BadFileError: It holds more than a start left that got no further, or is a file.
+        ValueError: It cannot be written to.
+    """
+    if (folder / "config.json").exists():
+        raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
+    check_folder("run folder", folder)
+    names = {path.name for path in folder.iterdir()} if folder.exists() else set()
+    begun = {name for name in names if UNFINISHED.fullmatch(name)}
+    if names - begun - {"versions.json", "lock", "lock.pid"}:
+        raise BadFileError(folder, "is not empty and is no run folder")
+
+
+def _write_config(folder: Path, config: TrainConfig) -> None:
+    """The last file to be written: a folder is a run from then on. What is of one call only is left out."""
+    write_json(folder / "config.json", {**as_json(config), "out": None, "resume": False})
+
+
+def find_model(folder: Path) -> Path:
+    """The folder of the model that a user means: of the model itself, or of a run.
+
+    Raises:
+        BadFileError: It is neither.
+    """
+    return folder if (folder / "model.json").is_file() else Run(folder).model_folder
+
+
+def versions() -> dict[str, str]:
+    """Versions of what results depend on."""
+    return {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }

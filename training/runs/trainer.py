@@ -1,0 +1,255 @@
+"""Training an agent, from a configuration to a run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+
+from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.discount import ELAPSED
+from viapoint.training.io.config_json import as_json
+from viapoint.training.io.files import BadFileError
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.callback import Monitor, TrainingStoppedError
+from viapoint.training.runs.model_io import build
+from viapoint.training.runs.run_dir import Run, check_free, versions
+
+__all__ = [
+    "TrainingFailedError", "TrainingStoppedError", "check_unchanged", "new_model", "one_thread", "resolved", "train",
+]  # fmt: skip
+
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
+"""What a call that resumes a run may tell anew."""
+UNFIT = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip
+"""What libraries raise where a network or a buffer cannot be as it was asked for."""
+
+
+class TrainingFailedError(Exception):
+    """Training could not go on, for example for want of disk space; what was saved before is whole."""
+
+
+def train(config: TrainConfig) -> Run:
+    """Train an agent and leave everything in a run folder.
+
+    With `config.resume` the run in the folder goes on with its own configuration, from its last checkpoint,
+    to the same result as if it had never stopped; `n_timesteps` may extend it.
+
+    Raises:
+        BadFileError: The folder cannot take the run, or does not hold the one to resume.
+        ValueError: There is no such environment or model; nothing is left in the folder.
+        TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
+        TrainingFailedError: A file could not be written.
+    """
+    with one_thread():
+        if config.resume:
+            run = Run(config.folder)
+            with run.locked():
+                _take_up(run, config)
+                with _built(run.config) as model:
+                    _carry_on(run, model)
+            return run
+        check_free(config.folder)
+        begun = resolved(config)
+        with _built(begun) as model:  # before there is a folder: what cannot be built leaves none
+            _check_tells_time(begun)
+            run = Run.create(begun)
+            with run.locked():
+                _carry_on(run, model)
+        return run
+
+
+def resolved(config: TrainConfig) -> TrainConfig:
+    """A configuration with everything that it left to the preset written out, as a run keeps it."""
+    return dataclasses.replace(
+        config,
+        n_timesteps=config.total_timesteps,
+        n_envs=config.copies,
+        eval_every=config.evaluation_interval,
+        checkpoint_every=config.checkpoint_interval,
+        discount_unit=config.time_unit,
+        hyperparameters={**config.preset.arguments(), **config.hyperparameters},
+    )
+
+
+def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
+    """The untrained model that a resolved configuration asks for."""
+    return build(
+        config.algo,
+        config.preset.policy,
+        env,
+        config.hyperparameters,
+        discount_unit=config.discount_unit,
+        seed=config.seed,
+    )
+
+
+def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
+    """Refuse to resume a run with settings that are not its own.
+
+    Args:
+        run: To be resumed.
+        config: What was asked for.
+        usual: What stands for everything that was not.
+
+    Raises:
+        BadFileError: Something was asked for that the run did not begin with.
+    """
+    begun, asked, default = (as_json(each) for each in (run.config, config, usual))
+    others = []
+    for name in asked.keys() - MAY_CHANGE:
+        values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}
+        known = begun[name] if isinstance(asked[name], dict) else begun
+        if asked[name] != default[name]:
+            others += [(name, each) for each in values if each not in known or known[each] != values[each]]
+    if others:
+        had = ", ".join(_told(begun, *each) for each in sorted(others))
+        wanted = ", ".join(_told(asked, *each) for each in sorted(others))
+        raise BadFileError(
+            run.folder,
+            f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
+            "leave these flags out, or name another folder",
+        )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: fastest for small networks, and the same numbers on any number of cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
+    """The untrained model that a resolved configuration asks for, on environments of its own.
+
+    Raises:
+        ValueError: There is no such environment or model.
+    """
+    try:
+        env = ViaVecEnv(config.env, config.copies, **config.env_kwargs)
+    except TypeError as error:
+        raise ValueError(f"env_kwargs of {config.env}: {error}") from error
+    try:
+        try:
+            model = new_model(config, env)
+        except UNFIT as error:
+            usual, asked = config.preset.arguments(), config.hyperparameters
+            given = [
+                f"{name}={json.dumps(asked[name], default=str)}"
+                for name in asked
+                if usual.get(name) != asked[name]
+            ]
+            made = f"made with {', '.join(given)}" if given else f"made for {config.env}"
+            raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
+        yield model
+    finally:
+        env.close()
+
+
+def _check_tells_time(config: TrainConfig) -> None:
+    """Refuse discounts by time where the first decision does not tell how long it took."""
+    if config.discount_unit is None:
+        return
+    env = ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)
+    try:
+        env.reset()
+        *_, infos = env.step(np.zeros((1, *(env.action_space.shape or ())), dtype=np.float32))
+    finally:
+        env.close()
+    if ELAPSED not in infos[0]:
+        raise ValueError(
+            f"discount_unit must be left out for {config.env}: its info does not tell as {ELAPSED!r} how long a "
+            f"decision took; that of {', '.join(ONLINE_TASKS)} does"
+        )
+
+
+def _carry_on(run: Run, model: BaseAlgorithm) -> None:
+    """Train from where the run is to its end.
+
+    Raises:
+        TrainingFailedError: A file could not be written.
+    """
+    try:
+        with _logging(model, run), Monitor(run) as monitor:
+            _learn(model, run, monitor)
+    except OSError as error:
+        raise TrainingFailedError(
+            f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
+            f"{run.decisions}, and viapoint train --resume goes on from there"
+        ) from error
+
+
+def _told(record: dict[str, Any], field: str, name: str) -> str:
+    """A setting as it is said: a field, or one name in a field of several."""
+    values = record if field == name else record[field]
+    return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
+
+
+def _take_up(run: Run, config: TrainConfig) -> None:
+    """Go on with a run's own configuration but for what this call may change.
+
+    Raises:
+        BadFileError: The call asks for something else, or for fewer decisions than there are.
+    """
+    check_unchanged(run, config, TrainConfig())
+    if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
+        if config.n_timesteps < run.decisions:
+            raise BadFileError(
+                run.folder,
+                f"holds a run of {run.decisions} decisions already; n_timesteps must be as many or more, "
+                f"got {config.n_timesteps}",
+            )
+        run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
+        run.write_config()
+    run.config = dataclasses.replace(run.config, progress=config.progress)
+    began, now = run.versions, versions()
+    others = [
+        f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]
+    ]
+    if others:
+        print(
+            f"the run began with {', '.join(others)}: it may end otherwise than it would have",
+            file=sys.stderr,
+        )
+
+
+def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:
+    restored, passed_over = run.restore(model)
+    for reason in passed_over:
+        print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
+    if restored is not None:
+        monitor.restore(restored)
+    run.write_curve(monitor.curve)
+    remaining = run.config.total_timesteps - model.num_timesteps
+    if remaining > 0:
+        callbacks = [monitor, ElapsedTimeCallback()]
+        model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
+    run.save("final", model)
+
+
+@contextmanager
+def _logging(model: BaseAlgorithm, run: Run) -> Iterator[None]:
+    folder = str(run.folder / "tensorboard")
+    logger = Logger(folder, [TensorBoardOutputFormat(folder)])
+    model.set_logger(logger)
+    try:
+        yield
+    finally:
+        logger.close()

@@ -1,0 +1,1 @@
+"""Frozen scene sets for validation and tests."""

@@ -1,0 +1,205 @@
+"""Finding scenes of given difficulty: drawn, estimated, measured and certified until there are enough of each kind."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planners.difficulty import planned_share, solution_share
+from viapoint.training.rollouts.rollout import Trial
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SPARE, SAFE = 1.2, 1.1
+"""How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
+AT_ONCE = 64
+"""Scenes measured together."""
+QUICK = PlannerBudget(generations=4)
+"""In space, where simulation takes longer."""
+MOST_DRAWN, MOST_ROUNDS = 1 << 18, 20
+"""Scenes drawn, and how often more are measured or planned, before giving up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where scenes come from."""
+
+    draw: Callable[[int], Scenes]
+    """The next so many."""
+    block: int
+    """Scenes drawn together, before the next look at what is missing."""
+    levels: tuple[tuple[float, int], ...] = ()
+    """Where the estimated share is below the first number, it is estimated again from so many plans."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kinds:
+    """Which scenes are looked for."""
+
+    of_share: Callable[[Float], Index]
+    """The kind of each share, -1 for none, shape (N,)."""
+    names: tuple[str, ...]
+    quota: int
+    """Scenes of each kind."""
+
+
+class Found(NamedTuple):
+    """N certified scenes."""
+
+    scenes: Scenes
+    share: Float
+    """Solution shares, shape (N,)."""
+    solution: Float
+    """What the planner found, shape (N, m)."""
+    number: Index
+    """Which of the drawn scenes they are, shape (N,)."""
+
+
+def search(
+    trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str, most_drawn: int = MOST_DRAWN
+) -> Found:
+    """As many scenes of each kind as asked for: the first ones that random actions and the planner solve.
+
+    Args:
+        trial: Simulates.
+        source: Of the scenes; what is found depends on it and the seed alone.
+        kinds: Looked for.
+        seed: Of the random actions.
+        label: Shown beside the progress.
+        most_drawn: Scenes drawn before giving up.
+
+    Raises:
+        RuntimeError: One kind is too rare.
+    """
+    pool = _Pool(trial, source, kinds, most_drawn)
+    scenes, share, number = pool.empty, np.zeros(0), np.zeros(0, dtype=np.int64)
+    solution, tried, failed = np.zeros((0, trial.task.action.size)), np.zeros(0, bool), np.zeros(0, bool)
+    for _ in range(MOST_ROUNDS):
+        good = np.where((share > 0.0) & ~failed, kinds.of_share(share), -1)
+        chosen = _first(good, kinds)
+        untried = chosen[~tried[chosen]]
+        if len(chosen) == kinds.quota * len(kinds.names):
+            if not len(untried):
+                return Found(scenes.take(chosen), share[chosen], solution[chosen], number[chosen])
+            tried[untried] = True
+            solution[untried], solved = _planned(trial, scenes.take(untried), label)
+            failed[untried] = ~solved
+            continue
+        more, numbers = pool.more(kinds.quota - _counts(good, kinds))
+        scenes, number = _joined(scenes, more), np.concatenate((number, numbers))
+        share = np.concatenate((share, measured(trial, more, seed, label)))
+        solution = np.concatenate((solution, np.zeros((len(more.start), solution.shape[1]))))
+        tried, failed = (np.concatenate((each, np.zeros(len(more.start), bool))) for each in (tried, failed))
+    missing = kinds.quota - _counts(good, kinds)
+    raise RuntimeError(
+        f"{label}: after {MOST_ROUNDS} rounds there still lack {_named(missing, kinds)} scenes"
+    )
+
+
+def redrawn(source: Source, number: Index) -> Scenes:
+    """The scenes of given numbers, drawn again."""
+    kept = []
+    for first in range(0, int(number.max()) + 1, source.block):
+        block, rows = source.draw(source.block), number - first
+        here = (rows >= 0) & (rows < source.block)
+        kept.append((np.flatnonzero(here), block.take(rows[here])))
+    order = np.argsort(np.concatenate([rows for rows, _ in kept]))
+    scenes = Scenes(*(np.concatenate(f) for f in zip(*(block for _, block in kept), strict=True)))
+    return scenes.take(order)
+
+
+class _Pool:
+    """Scenes that are drawn but not measured, with their estimated kinds."""
+
+    def __init__(self, trial: Trial, source: Source, kinds: Kinds, most_drawn: int) -> None:
+        self._trial, self._source, self._kinds, self._most_drawn = trial, source, kinds, most_drawn
+        self._scenes = self.empty = source.draw(0)
+        self._kind = self._number = np.zeros(0, dtype=np.int64)
+        self._drawn = 0
+
+    def more(self, missing: Index) -> tuple[Scenes, Index]:
+        """Some of each kind that is missing, by the estimate, in turn, a few to spare, and their numbers.
+
+        They leave the pool.
+        """
+        wanted = np.ceil(SPARE * missing).astype(np.int64)
+        while (_counts(self._kind, self._kinds) < wanted).any():
+            if self._drawn >= self._most_drawn:
+                lacking = _named(wanted - _counts(self._kind, self._kinds), self._kinds)
+                raise RuntimeError(f"there lack {lacking} scenes by estimate after {self._drawn} drawn")
+            block = self._source.draw(self._source.block)
+            numbers = self._drawn + np.arange(self._source.block)
+            self._drawn += self._source.block
+            kind = self._kinds.of_share(SAFE * self._estimate(block))
+            self._scenes, self._kind = _joined(self._scenes, block), np.concatenate((self._kind, kind))
+            self._number = np.concatenate((self._number, numbers))
+        rank = _ranks(self._kind, self._kinds)
+        taken = np.flatnonzero((self._kind >= 0) & (rank < wanted[self._kind]))
+        taken = taken[np.lexsort((-self._kind[taken], rank[taken]))]
+        some = self._scenes.take(taken), self._number[taken]
+        rest = np.setdiff1d(np.flatnonzero(self._kind >= 0), taken)
+        self._scenes, self._kind, self._number = self._scenes.take(rest), self._kind[rest], self._number[rest]
+        return some
+
+    def _estimate(self, scenes: Scenes) -> Float:
+        """Planned shares, more exact where they are small, shape (N,)."""
+        share = planned_share(self._trial, scenes, draws=256)
+        for below, draws in self._source.levels:
+            for row in np.flatnonzero(share < below):
+                share[row] = planned_share(self._trial, scenes.take([row]), seed=draws, draws=draws)[0]
+        return share
+
+
+def measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
+    """Solution shares, shape (N,)."""
+    return np.concatenate(
+        [solution_share(trial, scenes.take(rows), seed=seed) for rows in _lots(scenes, f"{label}: shares")]
+    )
+
+
+def _planned(trial: Trial, scenes: Scenes, label: str) -> tuple[Float, NDArray[np.bool_]]:
+    """The planner's solutions, and which of them are."""
+    planner = Planner(trial, budget=QUICK if trial.task.arm.dimension == 3 else None)
+    planned = [planner(scenes.take(rows)) for rows in _lots(scenes, f"{label}: planner")]
+    return np.concatenate([p.action for p in planned]), np.concatenate([p.success for p in planned])
+
+
+def _lots(scenes: Scenes, label: str) -> tqdm[slice]:
+    lots = [slice(i, i + AT_ONCE) for i in range(0, len(scenes.start), AT_ONCE)]
+    return tqdm(lots, desc=label, unit=f"x{AT_ONCE} scenes", file=sys.stderr, leave=False)
+
+
+def _first(kind: Index, kinds: Kinds) -> Index:
+    """Where the first scenes of each kind are."""
+    return np.flatnonzero((kind >= 0) & (_ranks(kind, kinds) < kinds.quota))
+
+
+def _ranks(kind: Index, kinds: Kinds) -> Index:
+    """How many scenes of its kind stand before each scene."""
+    rank = np.zeros(len(kind), dtype=np.int64)
+    for index in range(len(kinds.names)):
+        rank[kind == index] = np.arange((kind == index).sum())
+    return rank
+
+
+def _counts(kind: Index, kinds: Kinds) -> Index:
+    return np.bincount(kind[kind >= 0], minlength=len(kinds.names))
+
+
+def _joined(first: Scenes, second: Scenes) -> Scenes:
+    return Scenes(*(np.concatenate(fields) for fields in zip(first, second, strict=True)))
+
+
+def _named(missing: Index, kinds: Kinds) -> str:
+    return ", ".join(
+        f"{number} {name}" for number, name in zip(missing, kinds.names, strict=True) if number > 0
+    )

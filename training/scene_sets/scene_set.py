@@ -1,0 +1,264 @@
+"""Scene sets: frozen ones in files and ones drawn anew."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.rollouts.rollout import new_trial
+
+Float = NDArray[np.float64]
+
+SETS = ("validation", "test", "hard")
+"""Names of the sets; an environment need not have all."""
+BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
+"""Bands of the solution share, from easy to hard."""
+BAND_EDGES = (0.2, 0.05, 0.01)
+DRAWN = ""
+"""Family of the scenes that are drawn from the training distribution."""
+MEASURED = ("share", "solution")
+"""What is known of each scene."""
+LARGEST = 1 << 30
+"""Bytes that a file's arrays may take in memory: a million scenes and more; a small archive can claim any number."""
+
+
+def bands(share: Float) -> NDArray[np.int64]:
+    """Index into BANDS of each solution share, shape (N,)."""
+    return np.searchsorted(-np.array(BAND_EDGES), -share, side="right").astype(np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenScenes:
+    """A set of N scenes."""
+
+    name: str
+    """Of the set, or the path of its file."""
+    env_id: str
+    scenes: Any
+    """N :class:`~viapoint.envs.scenes.scene.Scenes`, or :class:`~viapoint.envs.scenes.dynamic_scene.ChangingScenes`."""
+    share: Float
+    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,); NaN where
+    nobody measured it."""
+    solution: Float
+    """An action that the planner found and the simulation confirmed, shape (N, m)."""
+    family: Any = DRAWN
+    """Name of each scene's family, shape (N,), or one for all; DRAWN for the training distribution."""
+    number: Any = -1
+    """Which scene it is of those drawn for the set, shape (N,); -1 where nobody counted."""
+
+    def __post_init__(self) -> None:
+        """One name and one number for each scene."""
+        for name, kind in (("family", np.str_), ("number", np.int64)):
+            values = np.broadcast_to(np.asarray(getattr(self, name), dtype=kind), self.share.shape)
+            object.__setattr__(self, name, values)
+
+    @property
+    def band(self) -> NDArray[np.int64]:
+        """Index into BANDS, shape (N,); -1 where the share is unknown."""
+        return np.where(np.isnan(self.share), -1, bands(self.share))
+
+    @property
+    def sha256(self) -> str:
+        """Hash of scenes, shares and families, whatever the file's packing and the solutions that were found."""
+        digest = hashlib.sha256(self.env_id.encode())
+        content = self.arrays()
+        del content["solution"]
+        for name, array in content.items():
+            digest.update(f"{name}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        digest.update("\n".join(("family", *self.family)).encode())
+        return digest.hexdigest()
+
+    def arrays(self) -> dict[str, Float]:
+        """The numbers by name."""
+        return {**self.scenes._asdict(), **{name: getattr(self, name) for name in MEASURED}}
+
+    def save(self, path: Path) -> None:
+        """Write the set with its hash."""
+        names = ("env_id", "sha256", "family", "number")
+        rest = {name: np.array(getattr(self, name)) for name in names}
+        np.savez_compressed(path, **rest, **self.arrays())  # type: ignore[arg-type]
+
+    def take(self, rows: Any) -> FrozenScenes:
+        """The scenes at `rows`, an index array, slice or mask."""
+        return FrozenScenes(
+            name=self.name,
+            env_id=self.env_id,
+            scenes=self.scenes.take(rows),
+            share=self.share[rows],
+            solution=self.solution[rows],
+            family=self.family[rows],
+            number=self.number[rows],
+        )
+
+
+def shipped_path(name: str, env_id: str) -> Path:
+    """Where a set of an environment lies in the package."""
+    task = env_id.removeprefix("viapoint/").partition("-")[0]
+    stem = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+    return Path(str(files("viapoint.training") / "scenes" / f"{stem}_{name}.npz"))
+
+
+def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
+    """Read a set of scenes and check that it is whole.
+
+    Args:
+        name_or_path: One of SETS, or the path of a file.
+        env_id: The environment that the scenes must be for.
+
+    Raises:
+        ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
+    """
+    path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
+    if str(name_or_path) in SETS and not path.is_file():
+        there = [name for name in SETS if shipped_path(name, env_id).is_file()]
+        raise ValueError(
+            f"no {name_or_path} scenes are shipped for {env_id}; there are: {', '.join(there) or 'none'}"
+        )
+    if not path.is_file():
+        raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
+    kind, content = _read(path)
+    frozen = FrozenScenes(
+        name=str(name_or_path),
+        env_id=str(content["env_id"]),
+        scenes=kind(*(content[name] for name in kind._fields)),
+        share=content["share"],
+        solution=content["solution"],
+        family=content["family"],
+        number=content["number"],
+    )
+    if frozen.sha256 != str(content["sha256"]):
+        raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
+    if frozen.env_id != env_id:
+        raise ValueError(f"{path} holds scenes for {frozen.env_id}, not for {env_id}")
+    return frozen
+
+
+def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """Which kind of scenes a file holds, and its arrays, whose shapes fit together.
+
+    Raises:
+        ValueError: It is no such file.
+    """
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise ValueError("it is no archive of arrays, or a part of one")
+            with zipfile.ZipFile(file) as packed:
+                size = sum(part.file_size for part in packed.infolist())
+            if size > LARGEST:
+                raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                kind: Any = ChangingScenes if "jumps" in archive else Scenes
+                names = (*kind._fields, *MEASURED, "env_id", "sha256", "family", "number")
+                content = {name: archive[name] for name in names}
+        _check_content(kind, content)
+    except Exception as error:  # an archive can be broken in any of its layers
+        raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
+    return kind, content
+
+
+def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
+    """Refuse arrays that are not of N scenes in the same D dimensions, N > 0."""
+    number, d = content["start"].shape if content["start"].ndim == 2 else (0, 0)
+    obstacles = content["obstacles"].shape[1:2]
+    wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("start", "goal"), (number, d))
+    wanted |= dict.fromkeys(("obstacles", "courses"), (number, *obstacles, 2 * d + 1))
+    wanted |= {"jumps": (number, *content.get("jumps", content["goal"]).shape[1:2], d + 1)}
+    wanted |= dict.fromkeys(("share", "family", "number"), (number,))
+    wanted |= {"solution": (number, *content["solution"].shape[1:2])}
+    for name in (*kind._fields, *MEASURED, "family", "number"):
+        shape, numbers = content[name].shape, content[name].dtype.kind in "fi"
+        if shape != wanted[name] or not number or numbers is (name == "family"):
+            raise ValueError(f"{name} of {number} scenes is {content[name].dtype} of shape {shape}")
+    if not (np.isnan(content["share"]) | ((content["share"] >= 0.0) & (content["share"] <= 1.0))).all():
+        raise ValueError("a solution share is not between 0 and 1")
+
+
+ACTION_ARGUMENTS = frozenset(
+    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
+)
+"""Arguments of an environment that leave its scenes as they are; so does `duration_range` where nothing changes
+on the way."""
+SEEDS = {"validation": 1_000_003, "test": 2_000_003}
+"""Of the sets that can be drawn; far from the seeds people train with, and from each other."""
+NUMBERS = {"validation": 500, "test": 1_000}
+"""How many scenes such a set has."""
+
+
+def scene_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Those arguments of an environment that its scenes depend on."""
+    others = ACTION_ARGUMENTS if env_id in ONLINE_TASKS else ACTION_ARGUMENTS | {"duration_range"}
+    return {name: value for name, value in env_kwargs.items() if name not in others}
+
+
+def frozen_fit(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> bool:
+    """Whether a set is shipped whose scenes are those of an environment made with these arguments."""
+    return shipped_path(name, env_id).is_file() and not scene_arguments(env_id, env_kwargs)
+
+
+def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) -> FrozenScenes:
+    """Scenes in place of a set, without shares and solutions; the same for the same arguments."""
+    trial = new_trial(env_id, 64 if env_id in ONLINE_TASKS else 1, **env_kwargs)
+    scenes = trial.draw(number, SEEDS[name])
+    trial.close()
+    return FrozenScenes(
+        name="drawn",
+        env_id=env_id,
+        scenes=scenes,
+        share=np.full(number, np.nan),
+        solution=np.zeros((number, trial.task.action.size)),
+    )
+
+
+def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) -> FrozenScenes:
+    """The scenes that a command names; drawn ones, with a line that says so, where no frozen ones fit.
+
+    Raises:
+        ValueError: There is no such set, or its scenes cannot be those of the environment.
+    """
+    others = scene_arguments(env_id, env_kwargs)
+    if name_or_path not in SETS:
+        frozen = load(name_or_path, env_id)
+        _check_shapes(frozen, env_kwargs)
+        return frozen
+    if frozen_fit(name_or_path, env_id, env_kwargs) or not (others or env_id in OWN_ARM_TASKS):
+        return load(name_or_path, env_id)
+    made = f"{env_id} with {', '.join(f'{name}={value}' for name, value in others.items())}"
+    where = made if others else env_id
+    if name_or_path not in SEEDS:
+        raise ValueError(
+            f"there are no {name_or_path} scenes for {where}; scenes must be {', '.join(SEEDS)}, which are drawn "
+            "for it, or a file"
+        )
+    print(f"no frozen {name_or_path} scenes are for {where}: they are drawn", file=sys.stderr)
+    return drawn(name_or_path, env_id, env_kwargs, NUMBERS[name_or_path])
+
+
+def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
+    """Refuse a file whose scenes have other rows of obstacles or another dimension than the environment."""
+    trial = new_trial(frozen.env_id, 1, **env_kwargs)
+    layout = trial.task.observation
+    trial.close()
+    mine, theirs = (
+        (layout.n_rows, layout.dimension),
+        (frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]),
+    )
+    if mine != theirs:
+        raise ValueError(
+            f"{frozen.name} holds scenes of {theirs[0]} obstacles at most in {theirs[1]} dimensions; the "
+            f"environment, made with {dict(env_kwargs)}, has {mine[0]} in {mine[1]}"
+        )

@@ -1,0 +1,1 @@
+"""Search for plans by computed geometry."""

@@ -1,0 +1,75 @@
+"""Candidate actions that are spread evenly over the action space, the same ones in every scene."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viapoint.envs.mdp.task import Task
+
+Single = NDArray[np.float32]
+
+
+def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
+    """Return candidate actions, shape (number, m), of which the first is the zero action.
+
+    From rest, clearance and reach do not depend on the duration. So all candidates but the first have the duration of
+    the greatest reward, and only their via-points and the split of their duration differ.
+
+    Args:
+        task: Of the environment.
+        number: How many candidates, 1 or more.
+        replanning: Whether a movement may be under way; then candidates differ in their duration, too.
+    """
+    size, at = task.action.size, task.action.n_via * task.action.dimension
+    if replanning or not at:
+        return sobol_actions(number, size)
+    actions = np.insert(sobol_actions(number, size - 1), at, np.float32(best_duration(task)), axis=1)
+    actions[0] = 0.0
+    return actions
+
+
+def best_duration(task: Task) -> float:
+    """Return the duration component of the greatest reward.
+
+    It is where 5 w_smoothness log(T) - w_duration T is greatest, for T relative to the duration of the zero action.
+    """
+    weights, (low, high) = task.weights, task.action.duration_range
+    relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
+    return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
+
+
+@functools.cache
+def sobol_actions(number: int, size: int) -> Single:
+    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
+    points = 2.0 * sobol_points(max(number - 1, 1), size)[: number - 1] - 1.0
+    actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
+    actions.flags.writeable = False
+    return actions
+
+
+@functools.cache
+def normal_steps(number: int, size: int, seed: int) -> Single:
+    """Return evenly spread steps of the standard normal distribution, shape (number, size)."""
+    import torch
+
+    kind: Any = torch.quasirandom.SobolEngine
+    engine = kind(size, scramble=True, seed=seed)
+    uniform = engine.draw(number).clamp(1e-4, 1.0 - 1e-4)
+    steps: Single = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
+    steps.flags.writeable = False
+    return steps
+
+
+def sobol_points(number: int, size: int) -> Single:
+    """Return points of the Sobol sequence in the unit cube, shape (number, size), without its corner and its middle."""
+    import torch
+
+    kind: Any = torch.quasirandom.SobolEngine
+    engine = kind(size)
+    engine.fast_forward(2)
+    points: Single = engine.draw(number).numpy()
+    return points

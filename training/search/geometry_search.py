@@ -1,0 +1,248 @@
+"""Search for a movement with computed geometry: no network and no simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.mdp.task import Task
+from viapoint.envs.registration import check_registered
+from viapoint.envs.scenes.scene import Scenes, problems
+from viapoint.training.search.candidates import candidate_actions, sobol_actions
+from viapoint.training.search.plan_checks import (
+    CLEARANCE_MARGIN,
+    OUTSIDE,
+    REACH_MARGIN,
+    check_plans,
+    merit,
+    worth_of_best,
+)
+from viapoint.training.search.planned_movements import Numbers, Observation, is_replanning, part
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+CENTRES = 4
+"""Best candidates that a round of refinement samples around."""
+KEEP = 0.1
+"""Reward by which another plan must be better than the one under way, as each change of plan costs jerk."""
+HORIZONS = (1.2, 0.9, 0.6, 0.3)
+"""Times for which a plan shall at least be clear where none is clear to its end, [s]: obstacles may change course."""
+SHORTER = 1e3
+"""Merit lost with each of these horizons, more than any reward."""
+SPREAD = 0.25
+"""Half the side of the cube around each of them, in the action space; each round halves it."""
+
+
+class GeometrySearch:
+    """Planner that checks a fixed set of actions with computed geometry and takes the best one.
+
+    The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. Their plans
+    are ordered by :func:`~viapoint.training.search.plan_checks.best_plan`. Where nothing moves, clearance does not
+    depend on the duration; then all candidates but the first have the duration of the greatest reward. Candidates
+    that jerk, duration or reach rule out count as checked, though their clearance is not computed.
+
+    Where plans are revised, the plan under way is kept as long as it is clear and no other one is better by KEEP. Where
+    none is clear to its end, one that is clear for the next HORIZONS seconds is taken.
+
+    Args:
+        task: The task of an environment, or the id of a registered one.
+        n_checks: Candidates checked before any refinement, 1 or more.
+        refinements: Rounds in which `per_round` more candidates are checked around the best ones.
+        per_round: Candidates of each round.
+        clearance_margin: Clearance that the chosen plan exceeds if any candidate does, [m].
+        reach_margin: Reach margin that it exceeds likewise, [m].
+        **kwargs: Of the environment, if an id is given.
+
+    Raises:
+        ValueError: A number is out of range.
+
+    Example:
+        >>> import viapoint.envs
+        >>> search = GeometrySearch("viapoint/PlanarObstacles-v0", n_checks=64)
+        >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
+        >>> plan.waypoints.shape, plan.durations.shape
+        ((3, 2), (2,))
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        n_checks: int = 512,
+        *,
+        refinements: int = 0,
+        per_round: int = 64,
+        clearance_margin: float = CLEARANCE_MARGIN,
+        reach_margin: float = REACH_MARGIN,
+        **kwargs: Any,
+    ) -> None:
+        for name, value, least in (
+            ("n_checks", n_checks, 1),
+            ("refinements", refinements, 0),
+            ("per_round", per_round, 1),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+        self.task = task_of(task, **kwargs) if isinstance(task, str) else task
+        self.n_checks, self.refinements, self.per_round = int(n_checks), int(refinements), int(per_round)
+        self._margins = float(clearance_margin), float(reach_margin)
+
+    @property
+    def total_checks(self) -> int:
+        """Number of candidates that are checked for one decision."""
+        return self.n_checks + self.refinements * self.per_round
+
+    @property
+    def name(self) -> str:
+        """Name in tables of results."""
+        return f"search, {self.total_checks} checks"
+
+    def decide(self, observation: Observation, scenes: Any = None) -> Float:
+        """Return the best action of each of B observations, shape (B, m).
+
+        Args:
+            observation: Parts of shape (B, .) each.
+            scenes: Not looked at; part of the protocol :class:`~viapoint.training.planners.baselines.Method`.
+        """
+        number = len(observation["hand"])
+        replanning = is_replanning(observation)
+        actions = candidate_actions(self.task, self.n_checks, replanning=replanning)
+        tried = np.broadcast_to(actions, (number, *actions.shape))
+        best, value = _top(tried, worth_of_plans(observation, tried, self.task, self._margins))
+        for each in range(self.refinements):
+            steps = SPREAD * 0.5**each * self._steps(replanning)
+            centres = best[:, np.arange(self.per_round) % best.shape[1]]
+            near = np.clip(centres + steps, -1.0, 1.0)
+            every = np.concatenate((best, near), axis=1)
+            best, value = _top(
+                every,
+                np.concatenate((value, worth_of_plans(observation, near, self.task, self._margins)), axis=1),
+            )
+        return best[:, 0].astype(np.float64)
+
+    def predict(
+        self,
+        observation: Mapping[str, Any],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Single, None]:
+        """Return the best action of one observation, shape (m,), or of a batch, shape (B, m), and no state.
+
+        The signature is that of Stable-Baselines3's `predict`; only the observation is used.
+        """
+        parts = {name: np.asarray(part) for name, part in observation.items()}
+        if parts["hand"].ndim > 1:
+            return self.decide(parts).astype(np.float32), None
+        return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
+
+    def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
+        """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
+
+        Where no candidate stays clear and in reach, it is the one that comes nearest to that.
+
+        Args:
+            start: Place of the hand, shape (D,), [m].
+            goal: Shape (D,), [m].
+            obstacles: Any number of rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; None for none.
+
+        Raises:
+            ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
+                or an obstacle is too large.
+        """
+        d = self.task.arm.dimension
+        first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
+        given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
+        scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
+        for wrong, reason in problems(scene, self.task.arm, whole_arm=self.task.whole_arm):
+            if wrong.any():
+                raise ValueError(reason(0))
+        rows: Float = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1)
+        observation: dict[str, Float] = {"hand": first, "goal": last}
+        if rows.size:
+            observation["obstacles"] = rows.reshape(1, -1)
+        return self.task.action.decode(self.decide(observation), first, last).take(0)
+
+    def _steps(self, replanning: bool) -> Single:
+        """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""
+        task, at = self.task, self.task.action.n_via * self.task.action.dimension
+        if replanning or not at:
+            return sobol_actions(self.per_round + 1, task.action.size)[1:]
+        return np.insert(sobol_actions(self.per_round + 1, task.action.size - 1)[1:], at, 0.0, axis=1)
+
+
+def worth_of_plans(
+    observation: Observation, actions: Numbers, task: Task, margins: tuple[float, float]
+) -> Float:
+    """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse.
+
+    On the way a first action of zero, which keeps the plan, is worth KEEP more, and where no plan is clear to its end,
+    plans are compared by how long they stay clear.
+
+    Args:
+        observation: Parts of B observations, shape (B, .) each.
+        actions: Shape (B, H, m), in [-1, 1].
+        task: The environment's.
+        margins: Of clearance and reach, [m].
+    """
+    replanning = is_replanning(observation)
+    bonus = KEEP if replanning and not actions[:, 0].any() else 0.0
+    worth = worth_of_best(observation, actions, task, margins, bonus=bonus)
+    for rank, horizon in enumerate(HORIZONS if replanning else (), start=1):
+        rows = np.flatnonzero(worth.max(axis=-1) < 0.5 * OUTSIDE)
+        if rows.size:
+            some = part(observation, rows)
+            shorter = worth_of_best(some, actions[rows], task, margins, horizon, bonus)
+            solved = shorter.max(axis=-1) > 0.5 * OUTSIDE
+            worth[rows[solved]] = shorter[solved] - rank * SHORTER
+    rows = np.flatnonzero(np.isneginf(worth).all(axis=-1))
+    if rows.size:
+        checks = check_plans(part(observation, rows), actions[rows], task)
+        worth[rows] = merit(checks, *margins)
+    return worth
+
+
+def task_of(env_id: str, **kwargs: Any) -> Task:
+    """Return the task of a registered environment made with `kwargs`."""
+    check_registered(env_id)
+    env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
+    task: Task = env.unwrapped.task
+    env.close()
+    return task
+
+
+def _top(actions: Numbers, worth: Float) -> tuple[Single, Float]:
+    """Return the CENTRES best of H actions in each of B scenes, shape (B, CENTRES, m), and their merit.
+
+    The best one stands in for those of which nothing is known.
+    """
+    each = np.arange(len(worth))[:, None]
+    order = np.argsort(-worth, axis=-1, kind="stable")[:, :CENTRES]
+    order = np.where(np.isneginf(worth[each, order]), order[:, :1], order)
+    return np.asarray(actions[each, order], np.float32), worth[each, order]
+
+
+def _numbers(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float:
+    """Return finite numbers of a shape.
+
+    Raises:
+        ValueError: They are something else.
+    """
+    wanted = f"({', '.join('n' if size is None else str(size) for size in shape)}{',' * (len(shape) == 1)})"
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers [m] of shape {wanted}, got {value!r}") from None
+    fits = array.ndim == len(shape) and all(
+        size in (None, n) for size, n in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    return array
