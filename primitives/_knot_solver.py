@@ -195,6 +195,7 @@ def _scaled_coefficients(
 
 
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
+    """Return the coefficients (..., 2m, S, D) in unit time, by the table of `_hermite_tables`."""
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     pieces = [steps[..., s, :] for s in range(segments)]

@@ -99,6 +99,7 @@ def namespace_of(array: Array) -> Namespace:
 
 
 def _numpy_floats(named: dict[str, Any]) -> list[Any]:
+    """Return the arguments as NumPy arrays of their widest floating dtype."""
     floating = [v.dtype for v in named.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f"]
     dtype = floating[0] if floating else np.dtype(np.float64)
     for other in floating[1:]:
@@ -119,6 +120,7 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
 
 
 def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
+    """Return the arguments in the library, widest floating dtype and device of the tensors among them."""
     from array_api_compat import array_namespace, device, is_array_api_obj
 
     foreign = {n: v for n, v in named.items() if not isinstance(v, _PLAIN) and is_array_api_obj(v)}

@@ -120,10 +120,12 @@ def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, F
 
 
 def _outer(p: Floats, q: Floats) -> Floats:
+    """Return the outer products (n, n, N) of vectors (n, N)."""
     return p[:, None] * q[None, :]
 
 
 def _softmax(z: Floats) -> Floats:
+    """Return the durations h (n, N) of z, without overflow of the exponential."""
     h = np.exp(z - z.max(axis=0))
     shares: Floats = h / ordered_sum(h)
     return shares
