@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint import primitives
-from viapoint.envs.common.arrays import namespace_of
+from viapoint.primitives.array_api import namespace_of
 
 MIN_GOAL_DISTANCE = 0.02
 """Least distance between start and goal, [m]."""

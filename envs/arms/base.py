@@ -6,7 +6,7 @@ from typing import Protocol
 
 import mujoco
 
-from viapoint.envs.common.arrays import Array
+from viapoint.primitives.array_api import Array
 
 
 class Arm(Protocol):

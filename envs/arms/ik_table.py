@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.kinematics import Chain, Constants
-from viapoint.envs.common.arrays import Array, clamp, namespace_of
+from viapoint.envs.common.arrays import clamp
+from viapoint.primitives.array_api import Array, namespace_of
 
 Float = NDArray[np.float64]
 Box = tuple[tuple[float, ...], tuple[float, ...]]

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import Array, cosine_and_sine, namespace_of
+from viapoint.envs.common.arrays import cosine_and_sine
+from viapoint.primitives.array_api import Array, namespace_of
 
 Vector = Array
 """Three components, an array of shape (3, ...) or three arrays."""

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from viapoint.envs.arms.serial_arm import serial_arm
-from viapoint.envs.common.arrays import Array, clamp, cosine_and_sine, namespace_of
+from viapoint.envs.common.arrays import clamp, cosine_and_sine
+from viapoint.primitives.array_api import Array, namespace_of
 
 SHOULDER, UPPER, FORE, ELBOW, WRIST = 0.333, 0.316, 0.384, 0.0825, 0.088
 """Height of the shoulder, length of upper arm and forearm, and how far the axes of elbow and wrist stand off, [m]."""

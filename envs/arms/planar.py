@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.mjcf import add_obstacles
-from viapoint.envs.common.arrays import Array, clamp, last, namespace_of
+from viapoint.envs.common.arrays import clamp, last
+from viapoint.primitives.array_api import Array, namespace_of
 
 
 @dataclass(frozen=True, kw_only=True)

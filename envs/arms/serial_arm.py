@@ -18,7 +18,7 @@ from viapoint.envs.arms.mjcf import (
     moving_with,
     read_spec,
 )
-from viapoint.envs.common.arrays import Array, namespace_of
+from viapoint.primitives.array_api import Array, namespace_of
 
 STEP = 1e-3
 """Over which differences of postures are taken for the joints' rates and accelerations, [s]."""

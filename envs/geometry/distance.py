@@ -10,7 +10,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 
-from viapoint.envs.common.arrays import Array, clamp, namespace_of
+from viapoint.envs.common.arrays import clamp
+from viapoint.primitives.array_api import Array, namespace_of
 
 MAX_CLEARANCE = 1.0
 """Clearance is reported up to this distance, [m]: also where there is no obstacle."""
