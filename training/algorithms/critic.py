@@ -13,6 +13,7 @@ obstacle is the union of its parts.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +27,8 @@ PART = {2: 0.0625, 3: 0.15}
 """Greatest half-length of an obstacle part in plane and space, [m]."""
 SCALE = 8.0
 """Lengths are multiplied by this before they enter a network, [1/m]."""
-COLUMNS = 4_096
-"""Pairs of each body that pass through the networks together: few enough for the hidden layers to stay in the cache."""
+HIDDEN = 1 << 17
+"""Hidden numbers of each body that are computed together: few enough to stay in the cache."""
 UNIT = 0.05
 """Length that one unit of a pair network's output stands for, [m]."""
 NOTHING = 1.0
@@ -151,16 +152,19 @@ class PairNetworks(nn.Module):
 
     def forward(self, features: Tensor, distance: Tensor) -> Tensor:
         """Return values of shape (L, N) for features (L, F, N) and distances of the centres (L, N), [m]."""
-        if features.shape[2] > COLUMNS and not torch.is_grad_enabled():
-            several = (torch.split(each, COLUMNS, dim=-1) for each in (features, distance))
-            return torch.cat([self(*each) for each in zip(*several, strict=True)], dim=1)
-        hidden = features
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            hidden = torch.baddbmm(bias, weight, hidden)
-            if layer < len(self.weights) - 1:
+        layers = list(zip(self.weights, self.biases, strict=True))
+        columns = features.shape[2]
+        if not torch.is_grad_enabled():
+            columns = min(columns, HIDDEN // layers[0][0].shape[1])
+        pieces = []
+        for hidden in torch.split(features, max(columns, 1), dim=2):
+            for weight, bias in layers[:-1]:
+                hidden = torch.baddbmm(bias, weight, hidden)
                 hidden = hidden.relu_() if not hidden.requires_grad else hidden.relu()
+            pieces.append(torch.baddbmm(layers[-1][1], layers[-1][0], hidden))
+        values = torch.cat(pieces, dim=2)[:, 0] if len(pieces) > 1 else pieces[0][:, 0]
         slope, offset = self.nearness[:, :1], self.nearness[:, 1:]
-        return hidden[:, 0] + slope * (distance / UNIT) + offset
+        return values + slope * (distance / UNIT) + offset
 
 
 class PairMinimum(nn.Module):
@@ -191,8 +195,10 @@ class PairMinimum(nn.Module):
         if until is not None:
             late = poses.time > until[..., None]
             late[..., 0] = False
-        least, where = self._search(poses, parts, late)
-        if torch.is_grad_enabled():
+        if not torch.is_grad_enabled():
+            least = self._least(poses, parts, late)
+        else:
+            least, where = self._search(poses, parts, late)
             scene, plan = (each.reshape(-1) for each in torch.meshgrid(
                 *(torch.arange(n) for n in least.shape), indexing="ij"))  # fmt: skip
             body, part, instant = (each.reshape(-1) for each in where)
@@ -201,25 +207,38 @@ class PairMinimum(nn.Module):
             least = torch.where(parts.present.any(dim=1)[:, None], values, least)
         return torch.where(parts.present.any(dim=1)[:, None], least * UNIT, torch.full_like(least, NOTHING))
 
+    def _least(self, poses: Poses, parts: Parts, late: Tensor | None) -> Tensor:
+        """Return the least value of each plan, shape (B, H)."""
+        least = torch.full((*parts.present.shape, poses.centre.shape[3]), torch.inf)
+        for b, k, values in self._blocks(poses, parts, late):
+            least[b, k] = values.amin(dim=(2, 3))
+        return least.amin(dim=1)
+
     @torch.no_grad()
     def _search(
         self, poses: Poses, parts: Parts, late: Tensor | None
     ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Find the least value of each plan, shape (B, H), and its body, part and instant."""
-        bodies, _, scenes, plans, instants = poses.centre.shape
-        least = torch.full((scenes, parts.present.shape[1], plans), torch.inf)
+        plans, instants = poses.centre.shape[3:]
+        least = torch.full((*parts.present.shape, plans), torch.inf)
         at = torch.zeros(least.shape, dtype=torch.long)
+        for b, k, values in self._blocks(poses, parts, late):
+            least[b, k], at[b, k] = values.reshape(len(b), plans, -1).min(dim=-1)
+        lowest, nearest = least.min(dim=1)
+        found = at.gather(1, nearest[:, None])[:, 0]
+        return lowest, (found // instants, nearest, found % instants)
+
+    def _blocks(
+        self, poses: Poses, parts: Parts, late: Tensor | None
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield scenes b and parts k, shape (P,), with the values of their pairs, shape (P, H, L, T)."""
+        bodies, _, _, plans, instants = poses.centre.shape
         scene, part = torch.nonzero(parts.present, as_tuple=True)
         several = max(ROWS // (bodies * plans * instants), 1)
         for first in range(0, len(scene), several):
             b, k = scene[first : first + several], part[first : first + several]
             values = self._values(poses, parts, b, k)
-            if late is not None:
-                values = values.masked_fill(late[b][:, :, None], torch.inf)
-            least[b, k], at[b, k] = values.reshape(len(b), plans, -1).min(dim=-1)
-        lowest, nearest = least.min(dim=1)
-        found = at.gather(1, nearest[:, None])[:, 0]
-        return lowest, (found // instants, nearest, found % instants)
+            yield b, k, values if late is None else values.masked_fill(late[b][:, :, None], torch.inf)
 
     def _values(self, poses: Poses, parts: Parts, b: Tensor, k: Tensor) -> Tensor:
         """Values of pairs of scene b and part k for every plan, body and instant, shape (P, H, L, T)."""

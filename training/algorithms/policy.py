@@ -39,6 +39,8 @@ BEST = 8
 """Number of the best candidates that are refined in each round."""
 SPREAD = 0.15
 """Standard deviation of the first round of refinement; each further round halves it."""
+CHECKED_INSTANTS = 16
+"""Instants of a plan that are enough to rank it where the best plans are checked exactly."""
 PLACES = 1 << 16
 """Places of plans that are computed together, so that temporary arrays stay in the cache."""
 
@@ -314,10 +316,22 @@ class ViaQPolicy(BasePolicy):
         return SceneInputs(_tensor(ends), _tensor(rows), torch.from_numpy(present), parts)
 
     def inputs(
-        self, observation: Observation, actions: Numbers, scene: SceneInputs | None = None
+        self,
+        observation: Observation,
+        actions: Numbers,
+        scene: SceneInputs | None = None,
+        shares: Numbers | None = None,
     ) -> PlanInputs:
-        """Return what the critic sees of H actions in each of B scenes, shape (B, H, m)."""
-        moves = planned(observation, actions, self.task, self.shares)
+        """Return the critic's inputs for H actions in each of B scenes.
+
+        Args:
+            observation: Parts of B observations, shape (B, .) each.
+            actions: Shape (B, H, m).
+            scene: Inputs that belong to the scenes; computed if not given.
+            shares: Shares of the duration at which the arm's planned places are taken; those of training if not given.
+        """
+        shares = self.shares if shares is None else shares
+        moves = planned(observation, actions, self.task, shares)
         relative = moves.duration / self.task.action.centre_duration
         spare = np.zeros_like(relative)
         if self.replanning:
@@ -326,17 +340,23 @@ class ViaQPolicy(BasePolicy):
         reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
         poses = None
         if self.settings["form"] == "places":
-            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * self.shares)
+            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * shares)
         scene = scene or self.scene(observation)
         return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
 
     @torch.no_grad()
-    def values(self, observation: Observation, actions: Numbers, scene: SceneInputs | None = None) -> Numbers:
+    def values(
+        self,
+        observation: Observation,
+        actions: Numbers,
+        scene: SceneInputs | None = None,
+        shares: Numbers | None = None,
+    ) -> Numbers:
         """Return the critic's merit of H actions in each of B scenes, shape (B, H): Q, but where success is unlikely.
 
         On the way the first action, which keeps the plan, is worth KEEP more: a plan is not revised for less.
         """
-        values: Numbers = self.critic.merit(self.critic(self.inputs(observation, actions, scene))).numpy()
+        values: Numbers = self.critic.merit(self.critic(self.inputs(observation, actions, scene, shares))).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
@@ -351,11 +371,12 @@ class ViaQPolicy(BasePolicy):
             return actions, values
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
         actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
-        values = self.values(observation, actions, scene)
+        shares = self.shares[:: max(self.instants // CHECKED_INSTANTS, 1)] if self.checks else self.shares
+        values = self.values(observation, actions, scene, shares)
         for each in range(self.refinements):
             near = self._near(actions, values, each)
             actions = np.concatenate((actions, near), axis=1)
-            values = np.concatenate((values, self.values(observation, near, scene)), axis=1)
+            values = np.concatenate((values, self.values(observation, near, scene, shares)), axis=1)
         return actions, values
 
     def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
