@@ -8,8 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import Float, Observation, ReachVectorEnv
+from viapoint.envs.vector_env import ReachVectorEnv
 
 
 class ManyStepVectorEnv(ReachVectorEnv):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Reviser
 from viapoint.envs.actions.via_points import Plan, Timing, checked_plan
 from viapoint.envs.arms import ADULT, Arm
+from viapoint.envs.common.types import Bool, Observation
 from viapoint.envs.common.validation import as_given, checked_actions, fewest_and_most, refuse_unknown
 from viapoint.envs.mdp.observation import OnlineObservationLayout
 from viapoint.envs.mdp.rewards import OnlineRewardWeights, online_rewards
@@ -26,9 +27,7 @@ from viapoint.envs.sim.executor import SETTLING, Rollout
 from viapoint.envs.sim.replan_triggers import TRIGGERS, DecisionEnds, Event, Trigger
 from viapoint.envs.sim.replanning_episodes import OnlineEpisodes
 from viapoint.envs.sim.replanning_executor import OnlineExecutor
-from viapoint.envs.vector_env import METADATA, Decision, Observation, ReachVectorEnv
-
-Bool = NDArray[np.bool_]
+from viapoint.envs.vector_env import METADATA, Decision, ReachVectorEnv
 
 
 class OnlineReachVectorEnv(ManyStepVectorEnv):

@@ -9,9 +9,10 @@ import gymnasium as gym
 from gymnasium.utils import EzPickle
 
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.types import Observation
 from viapoint.envs.common.validation import as_given, real_numbers
 from viapoint.envs.sim.executor import Rollout
-from viapoint.envs.vector_env import METADATA, Observation, ReachVectorEnv
+from viapoint.envs.vector_env import METADATA, ReachVectorEnv
 
 __all__ = ["ReachEnv", "ReachVectorEnv"]
 

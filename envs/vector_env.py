@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.via_points import ActionLayout, Plan, Timing, checked_plan
 from viapoint.envs.arms import ADULT, Arm, arm_of
 from viapoint.envs.common.background_worker import BackgroundWorker
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.common.validation import (
     as_given,
     checked_actions,
@@ -36,8 +37,6 @@ from viapoint.envs.sim.executor import Executor, PendingExecution, Rollout
 from viapoint.envs.sim.outcome import Outcome
 from viapoint.envs.sim.simulator import Simulator
 
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 Weights = RewardWeights | Mapping[str, float] | None
 
 METADATA: dict[str, Any] = {

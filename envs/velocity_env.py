@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.velocity import Motion, Steering
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms import ADULT, Arm
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.common.validation import as_given, checked_actions, refuse_unknown
 from viapoint.envs.mdp.observation import FARTHEST, ObservationLayout
 from viapoint.envs.mdp.rewards import StepRewardWeights, step_rewards
@@ -23,9 +24,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import SETTLING, Rollout
 from viapoint.envs.sim.simulator import SimulationLog
 from viapoint.envs.sim.velocity_episodes import StepEpisodes
-from viapoint.envs.vector_env import Decision, Float, Observation, ReachVectorEnv
-
-Bool = NDArray[np.bool_]
+from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from study import work
 from study.plan import ABLATIONS, FREEDOM, FREEDOM_LABELS, WHOLE, Cell, Study, Variant, sets_of
 from study.work import ALONE, CHECKED, WAYS
+from viapoint.envs.common.types import Bool
 from viapoint.training.evaluation.statistics import across_seeds, mcnemar, probability_of_improvement
 from viapoint.training.io.files import read_json
 from viapoint.training.planners.baselines import METHODS as BASELINE_METHODS
@@ -18,7 +19,6 @@ from viapoint.training.plotting.failure_report import KINDS
 from viapoint.training.runs.run_dir import Run, versions
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 
-Bool = NDArray[np.bool_]
 Numbers = dict[str, Any]
 
 

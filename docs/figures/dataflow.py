@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.plotting.top_view import draw_movement
-
-Float = NDArray[np.float64]
 
 SIZE = (12.4, 6.5)
 """[inches]"""

@@ -10,15 +10,12 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from dataflow import draw_flow
-from numpy.typing import NDArray
 from PIL import Image
 
+from viapoint.envs.common.types import Float, Frame
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.runs.agents import load_agent
 from viapoint.training.scene_sets.scene_set import load
-
-Float = NDArray[np.float64]
-Frame = NDArray[np.uint8]
 
 SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
 """Scenes that show what a task is about."""

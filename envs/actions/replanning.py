@@ -16,9 +16,7 @@ from viapoint import primitives
 from viapoint.envs.actions.velocity import Motion
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, ActionLayout, Plan, frame
 from viapoint.envs.common.arrays import norm
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from viapoint.envs.common.types import Bool, Float
 
 
 class MovingPlan(NamedTuple):

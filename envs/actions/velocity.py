@@ -16,11 +16,9 @@ from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import frame
-
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 AXES = ("along", "across", "above")
 STEP_TOLERANCE = 1e-6

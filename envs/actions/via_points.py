@@ -8,15 +8,14 @@ from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint import primitives
-from viapoint.primitives.array_api import namespace_of
+from viapoint.envs.common.types import Float
+from viapoint.primitives.array_api import Array, namespace_of
 
 MIN_GOAL_DISTANCE = 0.02
 """Least distance between start and goal, [m]."""
 
-Array = Any
 Timing = Literal["optimal", "learned"]
 
 LOG_SPLIT = float(np.log(4.0))
@@ -270,9 +269,6 @@ def check_increasing_pair(name: str, pair: Any) -> None:
         raise ValueError(f"{name} must be two numbers, got {pair!r}")
     if not (0.0 < low < high < float("inf")):
         raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
-
-
-Float = NDArray[np.float64]
 
 
 MAX_START_OFFSET = 1e-3

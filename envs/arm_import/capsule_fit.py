@@ -6,9 +6,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 Geom = mujoco.mjtGeom
 MIN_LENGTH = 1e-3

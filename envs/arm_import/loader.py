@@ -8,7 +8,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arm_import.capsule_fit import around_points, surface
 from viapoint.envs.arm_import.mjcf_reader import (
@@ -30,7 +29,6 @@ from viapoint.envs.arm_import.reachability import (
     good_map,
     postures_at_corners,
 )
-from viapoint.envs.arms.ik_table import Box
 from viapoint.envs.arms.kinematics import Chain
 from viapoint.envs.arms.mjcf import (
     at_zero,
@@ -42,8 +40,8 @@ from viapoint.envs.arms.mjcf import (
     read_spec,
 )
 from viapoint.envs.arms.serial_arm import SerialArm, serial_arm
+from viapoint.envs.common.types import Box, Float
 
-Float = NDArray[np.float64]
 Frames = list[tuple[Float, Float]]
 
 STAGE = "stage.xml"

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 FLATTEST = 1e-3
 """Least width of a workspace, in which places are drawn, [m]."""

@@ -7,18 +7,15 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arm_import.mjcf_reader import BOUND, ParsedMjcf
-from viapoint.envs.arms.ik_table import Box, PostureMap, hand_pose, solve_map, solve_postures
+from viapoint.envs.arms.ik_table import PostureMap, hand_pose, solve_map, solve_postures
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.serial_arm import RESERVE, SerialArm
+from viapoint.envs.common.types import Bool, Box, Float
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.spatial import SpaceSampler
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 SPACING, SEARCH_RADIUS = 0.05, 0.45
 """Of the places that are tried, and how far from home, [m]."""

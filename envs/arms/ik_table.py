@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.common.arrays import clamp
+from viapoint.envs.common.types import Box, Float
 from viapoint.primitives.array_api import Array, namespace_of
-
-Float = NDArray[np.float64]
-Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 DEGREE = 5
 """Of the polynomials along each axis."""

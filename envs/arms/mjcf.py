@@ -8,11 +8,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.kinematics import Chain, Constants, Hinge
-
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 SMALLEST = 1e-12
 """Principal moment of inertia of a link, [kg m^2]."""

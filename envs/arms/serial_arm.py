@@ -18,6 +18,7 @@ from viapoint.envs.arms.mjcf import (
     moving_with,
     read_spec,
 )
+from viapoint.envs.common.types import Box
 from viapoint.primitives.array_api import Array, namespace_of
 
 STEP = 1e-3
@@ -236,8 +237,6 @@ def _straight_between(knots: Array, number: int) -> Array:
     flat = xp.reshape(between, (*knots.shape[:-2], -1, knots.shape[-1]))
     return flat[..., :number, :]
 
-
-Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 BANDWIDTH = 20.0
 """Natural frequency of the joints' springs, critically damped, [rad/s]: weak beside the hand's."""

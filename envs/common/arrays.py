@@ -6,11 +6,9 @@ import functools
 import operator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.primitives.array_api import Array, namespace_of
-
-Float = NDArray[np.float64]
 
 
 def clamp(values: Array, low: float, high: float) -> Array:

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 
 def whole_number(name: str, value: Any, least: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Single = NDArray[np.float32]
+from viapoint.envs.common.types import Single
 
 CACHED = 48_000
 """Bounds that are computed together: few enough for the cache."""

@@ -12,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.geometry.broad_phase import Single, ball_bounds, lift_quadratic
+from viapoint.envs.common.types import Float, Int, Single
+from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, segment_distance_squared
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 STRETCH = 8
 """Times of a stretch."""
@@ -30,8 +28,8 @@ class LinkPositions(NamedTuple):
     places: Float
     """Shape (N, T, P, 3), [m]."""
     hand: int
-    """Index of the hand's."""
-    links: Index
+    """Int of the hand's."""
+    links: Int
     """Indices of both ends of each link's axis, shape (L, 2)."""
 
 
@@ -47,7 +45,7 @@ def nearest_approach(
     radii: tuple[float, ...],
     obstacles: Float,
     present: NDArray[np.bool_],
-    last: Index | None = None,
+    last: Int | None = None,
 ) -> Float:
     """Least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.
 
@@ -56,7 +54,7 @@ def nearest_approach(
         radii: Of the L links, [m].
         obstacles: Shape (N, n, 7), [m].
         present: Whether a row is an obstacle, shape (N, n), bool.
-        last: Index of each movement's last time, shape (N,); all by default.
+        last: Int of each movement's last time, shape (N,); all by default.
     """
     least = np.full(len(obstacles), MAX_CLEARANCE)
     if not present.any():
@@ -75,7 +73,7 @@ def nearest_approach(
     bounds = ball_bounds(lift_quadratic(centres), around.reshape(len(least), -1), shown)
     size = np.array(radii)
 
-    def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:
+    def clearance(each: Int, row: Int, link: Int, times: Int) -> Float:
         """Of links from obstacles, shape (M, .), one after the other, at times of that shape."""
         first, second = (_picked(places, each[:, None], times, links[link, end, None]) for end in (0, 1))
         squared = segment_distance_squared(first, second, obstacles[each, row][:, None])[:, 0]
@@ -97,7 +95,7 @@ def nearest_approach(
     return least
 
 
-def _picked(places: Float, each: Index, times: Index, place: Index) -> Float:
+def _picked(places: Float, each: Int, times: Int, place: Int) -> Float:
     """The same as `places[each, times, place]`, several times as fast where these are one after the other in memory."""
     if not places.flags.c_contiguous:
         return np.asarray(places[each, times, place])

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import NominalPlan
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
 from viapoint.envs.scenes.scene import LARGEST_HALF_AXIS, LARGEST_RADIUS, Scenes
-
-Array = Any
+from viapoint.primitives.array_api import Array
 
 FARTHEST = 1.0
 """Bound of every coordinate, [m]."""
@@ -95,9 +95,6 @@ class ObservationLayout:
         d = self.dimension
         return ObstacleRows(rows[..., :d], rows[..., d : 2 * d], rows[..., 2 * d], rows[..., 2 * d + 1])
 
-
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 
 GREATEST_SPEED = 5.0
 """Bound of the commanded velocity along any axis, [m/s]."""

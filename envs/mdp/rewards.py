@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
-
-Float = NDArray[np.float64]
 
 CLEARANCE_RANGE = (-0.05, 0.01)
 """Clearance beyond which nothing more is lost or won, [m]."""
@@ -110,9 +109,6 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
         smoothness=-weights.smoothness * log_jerk,
         duration=-weights.duration * (relative - 1.0),
     )
-
-
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,9 +16,8 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Frame = NDArray[np.uint8]
+from viapoint.envs.common.types import Frame
 
 OFF = ("disable", "disabled", "off", "false", "0")
 """What MUJOCO_GL says to forbid rendering."""

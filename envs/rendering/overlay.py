@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, point_distance_squared
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
-
-Float = NDArray[np.float64]
-
 
 TOUCHING = 0.01
 """Clearance up to which an obstacle is what was touched, [m]."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float, Frame
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.scene_view import SPACING, Stage
@@ -23,7 +24,6 @@ from viapoint.envs.sim.simulator import Simulator
 
 __all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame_steps"]
 
-Frame = NDArray[np.uint8]
 
 STILL_SUPERSAMPLING = 2
 """How many times larger a single picture is rendered than it is shown; the frames of a film are not."""
@@ -139,7 +139,6 @@ class MovementRenderer:
                 return
 
 
-Float = NDArray[np.float64]
 History = list[tuple[float, MovingPlan]]
 
 FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]

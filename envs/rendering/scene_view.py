@@ -7,15 +7,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.shapes import GLOWING, Pencil, in_space, resampled
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import Simulator
-
-Float = NDArray[np.float64]
 
 CAMERA = "view"
 HIDDEN = 5

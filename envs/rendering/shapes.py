@@ -7,11 +7,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float
 
-Float = NDArray[np.float64]
 Geom = Any
 """A shape in a scene."""
 Shape = mujoco.mjtGeom

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, clearance_profile
 from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
-
-Float = NDArray[np.float64]
 
 MOST_JUMPS = 4
 """Jumps of a target in one episode at most."""

@@ -6,17 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint import primitives
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.planar_draws import Uniforms, between
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, Scenes, rest_clearance
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Index = NDArray[np.int64]
 
 CANDIDATES, ATTEMPTS = 8, 40
 """Jumps and courses that are drawn at once, and how often jumps are drawn until some fit."""
@@ -92,7 +88,7 @@ class ChangeSampler:
         jumps: Float | None = None,
         courses: Float | None = None,
         *,
-        again: Callable[[Index], Scenes] | None = None,
+        again: Callable[[Int], Scenes] | None = None,
     ) -> ChangingScenes:
         """What will become of N scenes.
 
@@ -127,7 +123,7 @@ class ChangeSampler:
         scenes: Scenes,
         jumps: Float | None,
         courses: Float | None,
-    ) -> tuple[ChangingScenes, Index]:
+    ) -> tuple[ChangingScenes, Int]:
         """What will become of N scenes, and those in which no jump fits."""
         number, dimension = scenes.start.shape
         still = np.zeros((number, scenes.obstacles.shape[1], 2 * dimension + 1))
@@ -142,7 +138,7 @@ class ChangeSampler:
             return changing, np.arange(0)
         return changing, self._jump(generators, changing)
 
-    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> Index:
+    def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> Int:
         """Draw jumps into scenes, all of an episode at once, until all fit; which are left."""
         fewest, most = self.distribution.n_jumps
         pending = np.arange(len(scenes.start))

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.sampler import Sampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
-
-Float = NDArray[np.float64]
 
 GIVEN = ("start", "goal", "obstacles")
 """What options may give."""

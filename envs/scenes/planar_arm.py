@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import hand_clearance, segment_distance_squared
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.planar_draws import PHASES, FeasiblePath, Uniforms, left, turned, unit
 from viapoint.envs.scenes.planar_hand import Choice, choose, in_the_way, on_path, shapes
-
-Float = NDArray[np.float64]
 
 CANDIDATES, CHOICES, BLOCKING = 56, 24, 4
 """How many obstacles are drawn at once, how many of them are looked at closely, and how many of these are in the way

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms.base import Arm
-
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 ENDS, WITNESSES, PHASES = 16, 6, 40
 """How many pairs of ends and witnesses are drawn at once, and at how many times a movement is looked at."""

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import hand_clearance, segment_distance_squared
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.planar_draws import PHASES, FeasiblePath, Uniforms, between, left, unit
-
-Float = NDArray[np.float64]
 
 CANDIDATES, WAYS = 32, 15
 """How many obstacles are drawn at once, and how many ways round are told apart."""

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.planar_arm import CANDIDATES, CHOICES, WholeArmObstacles
 from viapoint.envs.scenes.planar_draws import PHASES, FeasiblePath, Uniforms, between, left, turned, unit
 from viapoint.envs.scenes.planar_hand import in_the_way, on_path
-
-Float = NDArray[np.float64]
 
 ROWS = 5
 """Obstacles of a scene at most."""

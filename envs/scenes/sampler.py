@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.planar_arm import WholeArmObstacles
 from viapoint.envs.scenes.planar_draws import ENDS, WITNESSES, Uniforms, draw_ends, draw_witness
 from viapoint.envs.scenes.planar_hand import HandObstacles, ObstacleSampler
 from viapoint.envs.scenes.scene import Scenes
-
-Float = NDArray[np.float64]
 
 
 class Sampler(Protocol):

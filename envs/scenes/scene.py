@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
-
-Float = NDArray[np.float64]
 
 LARGEST_HALF_AXIS = 0.3
 """Greatest half length of a bar, [m]."""

@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import squared_length
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.scenes.config import BOARDS, FAMILIES, SpaceDistribution
 from viapoint.envs.scenes.scene import LARGEST_HALF_AXIS, Scenes
 from viapoint.envs.scenes.spatial_draws import ENDS, GROUPS, PHASES, WITNESSES, Numbers, draw_ends, draw_path
 from viapoint.envs.scenes.spatial_structures import NUMBERS, PARTS, Course, single, structure
 from viapoint.envs.scenes.swept_volume import Bodies, Swept
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Index = NDArray[np.int64]
 
 STRUCTURES, OTHERS = 4, 14
 """How many structures and other obstacles are drawn at once."""
@@ -87,7 +84,7 @@ class SpaceSampler:
             )
         return scenes
 
-    def _draw(self, u: Float, pending: Index, ends: tuple[Float, Float] | None, scenes: Scenes) -> Index:
+    def _draw(self, u: Float, pending: Int, ends: tuple[Float, Float] | None, scenes: Scenes) -> Int:
         """Put the scene of the first good attempt of each; which that was, shape (P,), -1 for none.
 
         Args:
@@ -212,7 +209,7 @@ class SpaceSampler:
     def _others_of(
         self,
         u: Float,
-        order: Index,
+        order: Int,
         course: tuple[Float, Float, Float],
         hardness: Float,
         swept: Swept,
@@ -231,7 +228,7 @@ class SpaceSampler:
         return good.sum(axis=-1) >= missing, chosen
 
     def _which(self, u: Float) -> NDArray[np.int64]:
-        """Index of the family that a uniform number stands for."""
+        """Int of the family that a uniform number stands for."""
         return np.minimum((u * len(self._families)).astype(np.int64), len(self._families) - 1)
 
     def _course(

@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.scenes.config import SpaceDistribution
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 GROUPS = (1, 2, 4, *[8] * 400)
 """How many attempts follow one another: few are left after the first, but one in a hundred makes a tunnel."""
@@ -37,7 +34,7 @@ class Numbers:
         """How many attempts at each scene there have been."""
         return sum(GROUPS[: self._group])
 
-    def draw(self, scenes: Index) -> Float:
+    def draw(self, scenes: Int) -> Float:
         """Of the next attempts at P scenes, shape (P, attempts, size); none after the last group."""
         self._groups = GROUPS[self._group :][:1]
         ahead = GROUPS[self._group + 1 :] if self._apart else ()
@@ -52,7 +49,7 @@ class Numbers:
         ]
         return drawn
 
-    def put_back(self, scenes: Index, first: Index) -> None:
+    def put_back(self, scenes: Int, first: Int) -> None:
         """Have the generators of P scenes as the group of the first good attempt left them, shape (P,); -1 for none."""
         ends = np.cumsum(self._groups)
         for i, states, attempt in zip(scenes, self._states, first, strict=True):
@@ -69,8 +66,6 @@ class Numbers:
             begin += attempts
         return states
 
-
-Bool = NDArray[np.bool_]
 
 ENDS, WITNESSES, PHASES = 12, 8, 16
 """How many pairs of ends and witnesses are drawn at once, and at how many times a movement is looked at."""

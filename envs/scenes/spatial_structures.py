@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.config import BEAMS, BOARDS, SpaceDistribution
-
-Float = NDArray[np.float64]
 
 PARTS = 6
 """Rows of a structure at most."""

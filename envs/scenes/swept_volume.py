@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
-from viapoint.envs.geometry.broad_phase import Single, ball_bounds, lift_quadratic
+from viapoint.envs.common.types import Float, Int, Single
+from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 OUTER = 5
 """Links next to the hand: what is drawn near it concerns them first, and only what is chosen concerns the others."""
@@ -78,7 +76,7 @@ class Bodies(NamedTuple):
         bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows).reshape(len(least), -1)
         nearest = bound.argmin(axis=-1)
 
-        def look(one: Index, ball: Index) -> None:
+        def look(one: Int, ball: Int) -> None:
             row, ball = np.divmod(one * bound.shape[-1] + ball, places)
             clearance = self._between(rows, row, ball) - margins.reshape(-1)[ball]
             np.minimum.at(least, one, clearance)
@@ -97,11 +95,11 @@ class Bodies(NamedTuple):
         """The same at every other time."""
         return self._replace(ends=self.ends[..., ::2], balls=self.balls[..., ::2])
 
-    def take(self, movements: Index) -> Bodies:
+    def take(self, movements: Int) -> Bodies:
         """Some of the movements."""
         return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
 
-    def _between(self, rows: Float, row: Index, ball: Index) -> Float:
+    def _between(self, rows: Float, row: Int, ball: Int) -> Float:
         """Clearance of obstacles, the index of each among all rows, each from one link at one time, shape (M,), [m]."""
         links, times = self.balls.shape[2:]
         ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
@@ -137,7 +135,7 @@ class Swept(NamedTuple):
         """Height of what of the links near the hand stands above it, at K times of each movement.
 
         Args:
-            phase: Index of the times, shape (N, K).
+            phase: Int of the times, shape (N, K).
             place: The hand then, shape (N, K, 3), [m].
 
         Returns:
@@ -149,6 +147,6 @@ class Swept(NamedTuple):
         high = there[..., 2, :] + self.outer.radii
         return np.asarray(np.where(apart < ABOVE, high, z).max(axis=(-2, -1)))
 
-    def take(self, movements: Index) -> Swept:
+    def take(self, movements: Int) -> Swept:
         """Some of the movements."""
         return Swept(*(bodies.take(movements) for bodies in self))

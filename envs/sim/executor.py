@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.background_worker import BackgroundWorker
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome, add_terminal_metrics, empty_outcome, least_clearance, measure
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
 from viapoint.envs.sim.time_scaling import LOOK_EVERY, pace_of
-
-Float = NDArray[np.float64]
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""

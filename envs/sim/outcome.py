@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import norm, squared_length
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import SimulationLog
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 GOAL_TOLERANCE = 0.01
 """Greatest distance from the goal that counts as success, [m]."""

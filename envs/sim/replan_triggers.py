@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Int
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
 from viapoint.envs.sim.executor import SETTLING
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 Trigger = Literal["horizon", "target", "course", "clearance"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)

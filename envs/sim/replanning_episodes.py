@@ -12,15 +12,12 @@ from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
 from viapoint.envs.sim.executor import Rollout
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, LIMIT_TOLERANCE, REST_SPEED, Outcome, empty_outcome
 from viapoint.envs.sim.simulator import SimulationLog
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 class EpisodeState(NamedTuple):

@@ -5,22 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan, timed
 from viapoint.envs.actions.velocity import Motion
 from viapoint.envs.arms.serial_arm import EVERY
 from viapoint.envs.common.background_worker import BackgroundWorker
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
 from viapoint.envs.sim.executor import GROUP
 from viapoint.envs.sim.replanning_episodes import DecisionRollout, jerk_cost_between
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.envs.sim.time_scaling import LOOK_EVERY, pace_of
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 PROLONGED, ENOUGH = 6, 1.002
 """How often the time of a plan in motion is prolonged at most, and by which factor it need not be once more."""

@@ -10,9 +10,8 @@ from mujoco import batch
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.narrow_phase import LinkPositions
-
-Float = NDArray[np.float64]
 
 OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
 """Where an absent obstacle waits, [m]."""

@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from viapoint.envs.common.types import Bool, Float
 
 LOOK_EVERY = 0.008
 """Clearance and reach of the plan are looked at that often, which is every few millimetres, [s]."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from viapoint.envs.actions.velocity import Motion
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import SETTLING, Rollout
@@ -23,8 +24,6 @@ from viapoint.envs.sim.outcome import (
     least_clearance,
 )
 from viapoint.envs.sim.simulator import SimulationLog
-
-Float = NDArray[np.float64]
 
 
 class EpisodeState(NamedTuple):

@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer
 
+from viapoint.envs.common.types import Single
+from viapoint.primitives.array_api import Array
 from viapoint.training.algorithms.smdp_buffers import TimedDictReplayBuffer
 from viapoint.training.config.discount import ELAPSED, TimeDiscount
 from viapoint.training.rollouts.vec_env import TERMS
 
-Single = NDArray[np.float32]
-Array = Any
 """A NumPy array or a torch tensor."""
 
 LOWER = 1e-6

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
@@ -18,7 +19,6 @@ from viapoint.training.planners.baselines import Method
 from viapoint.training.rollouts.rollout import Trial, new_trial
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes
 
-Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 """Is told the method's name, the scenes that are done and the scenes that there are."""
 

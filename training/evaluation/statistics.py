@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
 
 
 class Interval(NamedTuple):

@@ -7,9 +7,9 @@ from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from viapoint.envs.common.types import Float
+
 Polynomial = list[Fraction]
 
 

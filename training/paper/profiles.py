@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory
 from viapoint.training.paper.simulated import Performed
-
-Float = NDArray[np.float64]
 
 EDGE = 0.08
 """Part of the duration left out at both ends: there the curvature of a movement from rest has no bound

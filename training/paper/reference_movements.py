@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import TARGETS
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
-
-Float = NDArray[np.float64]
 
 
 def target(name: str) -> Float:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT, PlanarArm
+from viapoint.envs.common.types import Float
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.primitives import Trajectory
-
-Float = NDArray[np.float64]
 
 TIMESTEP = 0.002
 """Of the physics, as the arm's model file sets it, [s]."""

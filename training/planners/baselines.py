@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
@@ -18,9 +18,6 @@ from viapoint.training.planners.replanning_baselines import OnlinePlanner, OpenL
 from viapoint.training.rollouts.rollout import Trial, Trials, new_trial
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
 from viapoint.training.search.geometry_search import GeometrySearch
-
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 
 
 class Method(Protocol):

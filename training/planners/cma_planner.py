@@ -13,11 +13,10 @@ import numpy as np
 from cmaes import CMA
 from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.difficulty import screen
 from viapoint.training.rollouts.rollout import Trial
-
-Float = NDArray[np.float64]
 
 HOPELESS = -3.0
 """Reward put down for an action that fails for certain and is not simulated: by default weights, less than any."""

@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.search.plan_checks import check_plans
-
-Float = NDArray[np.float64]
 
 CERTAIN = 0.002
 """How deep a plan must cut into an obstacle, or leave the reach, to fail for certain, [m].

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import least_clearance
 from viapoint.training.rollouts.rollout import Trial, Trials
 
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 Clear = Callable[[Float, Float], bool]
 """Whether the straight line between two positions of the hand is clear."""
 

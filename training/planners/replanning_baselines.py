@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.dynamic_scene import clearance_over_time
 from viapoint.training.rollouts.rollout import OnlineTrial, Trials
 from viapoint.training.search.candidates import sobol_actions
 from viapoint.training.search.planned_movements import planned
-
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 
 ENOUGH = 0.004
 """Clearance from which on more of it is worth nothing to the planner, [m]."""

@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float
 from viapoint.envs.rendering.overlay import Movement, Touch
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
-
-Float = NDArray[np.float64]
 
 VIEW = ((-0.56, 0.48), (-0.14, 0.90))
 """What is seen of the plane, (x, y), [m]."""

@@ -16,17 +16,14 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Frame, Observation
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.plotting.top_view import draw_movement
 
-Float = NDArray[np.float64]
-Frame = NDArray[np.uint8]
-Observation = dict[str, NDArray[np.float32]]
 Decide = Callable[[Observation, Scenes], Any]
 
 CAPTION = 48

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import ONLINE_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
-
-Float = NDArray[np.float64]
 
 
 class Trials(NamedTuple):
@@ -96,9 +95,6 @@ class Trial:
 def repeated(values: Float, number: int) -> Float:
     """The first repeated at the end until there are `number`."""
     return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))
-
-
-Observation = dict[str, NDArray[np.float32]]
 
 
 class OnlineTrial(Trial):

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.velocity import Motion
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import STEP_TASKS, twin_of
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.velocity_env import StepReachVectorEnv
 from viapoint.training.rollouts.rollout import Trials
-
-Float = NDArray[np.float64]
-Observation = dict[str, NDArray[np.float32]]
 
 
 def is_step_wise(env_id: str) -> bool:

@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.mdp.task import Task, family_sampler
 from viapoint.envs.scenes.config import NARROW, SpaceDistribution
@@ -31,8 +30,6 @@ from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.scene_sets.scene_search import Kinds, Source, measured, redrawn, search
 from viapoint.training.scene_sets.scene_set import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands
 from viapoint.training.scene_sets.scene_set_diff import add_arguments, compare_with_shipped, shipped
-
-Float = NDArray[np.float64]
 
 SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017}
 """First seeds of the sets; training draws from seeds below a million."""

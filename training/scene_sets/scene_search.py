@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import Trial
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 SPARE, SAFE = 1.2, 1.1
 """How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
@@ -45,7 +43,7 @@ class Source:
 class Kinds:
     """Which scenes are looked for."""
 
-    of_share: Callable[[Float], Index]
+    of_share: Callable[[Float], Int]
     """The kind of each share, -1 for none, shape (N,)."""
     names: tuple[str, ...]
     quota: int
@@ -60,7 +58,7 @@ class Found(NamedTuple):
     """Solution shares, shape (N,)."""
     solution: Float
     """What the planner found, shape (N, m)."""
-    number: Index
+    number: Int
     """Which of the drawn scenes they are, shape (N,)."""
 
 
@@ -105,7 +103,7 @@ def search(
     )
 
 
-def redrawn(source: Source, number: Index) -> Scenes:
+def redrawn(source: Source, number: Int) -> Scenes:
     """The scenes of given numbers, drawn again."""
     kept = []
     for first in range(0, int(number.max()) + 1, source.block):
@@ -126,7 +124,7 @@ class _Pool:
         self._kind = self._number = np.zeros(0, dtype=np.int64)
         self._drawn = 0
 
-    def more(self, missing: Index) -> tuple[Scenes, Index]:
+    def more(self, missing: Int) -> tuple[Scenes, Int]:
         """Some of each kind that is missing, by the estimate, in turn, a few to spare, and their numbers.
 
         They leave the pool.
@@ -178,12 +176,12 @@ def _lots(scenes: Scenes, label: str) -> tqdm[slice]:
     return tqdm(lots, desc=label, unit=f"x{AT_ONCE} scenes", file=sys.stderr, leave=False)
 
 
-def _first(kind: Index, kinds: Kinds) -> Index:
+def _first(kind: Int, kinds: Kinds) -> Int:
     """Where the first scenes of each kind are."""
     return np.flatnonzero((kind >= 0) & (_ranks(kind, kinds) < kinds.quota))
 
 
-def _ranks(kind: Index, kinds: Kinds) -> Index:
+def _ranks(kind: Int, kinds: Kinds) -> Int:
     """How many scenes of its kind stand before each scene."""
     rank = np.zeros(len(kind), dtype=np.int64)
     for index in range(len(kinds.names)):
@@ -191,7 +189,7 @@ def _ranks(kind: Index, kinds: Kinds) -> Index:
     return rank
 
 
-def _counts(kind: Index, kinds: Kinds) -> Index:
+def _counts(kind: Int, kinds: Kinds) -> Int:
     return np.bincount(kind[kind >= 0], minlength=len(kinds.names))
 
 
@@ -199,7 +197,7 @@ def _joined(first: Scenes, second: Scenes) -> Scenes:
     return Scenes(*(np.concatenate(fields) for fields in zip(first, second, strict=True)))
 
 
-def _named(missing: Index, kinds: Kinds) -> str:
+def _named(missing: Int, kinds: Kinds) -> str:
     return ", ".join(
         f"{number} {name}" for number, name in zip(missing, kinds.names, strict=True) if number > 0
     )

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import new_trial
-
-Float = NDArray[np.float64]
 
 SETS = ("validation", "test", "hard")
 """Names of the sets; an environment need not have all."""

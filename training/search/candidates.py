@@ -6,11 +6,9 @@ import functools
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Single
 from viapoint.envs.mdp.task import Task
-
-Single = NDArray[np.float32]
 
 
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:

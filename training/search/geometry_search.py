@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.types import Float, Numbers, Single
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes, problems
@@ -22,10 +23,7 @@ from viapoint.training.search.plan_checks import (
     merit,
     worth_of_best,
 )
-from viapoint.training.search.planned_movements import Numbers, Observation, is_replanning, part
-
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
+from viapoint.training.search.planned_movements import Observation, is_replanning, part
 
 CENTRES = 4
 """Best candidates that a round of refinement samples around."""

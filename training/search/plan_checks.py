@@ -11,22 +11,19 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import squared_length
+from viapoint.envs.common.types import Index, Numbers, Single
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, point_distance_squared, segment_distance_squared
 from viapoint.envs.mdp.observation import ObservationLayout, ObstacleRows
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, GOAL_ERROR_UNIT
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.training.search.planned_movements import (
-    Numbers,
     Observation,
     PlannedMovements,
     is_replanning,
     part,
     planned,
 )
-
-Single = NDArray[np.float32]
-Index = NDArray[np.intp]
 
 CLEARANCE_MARGIN = 0.001
 """Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""

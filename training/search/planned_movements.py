@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from viapoint import primitives
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, ActionLayout, frame
+from viapoint.envs.common.types import Numbers
 from viapoint.envs.mdp.task import Task
 from viapoint.primitives._passage.rest_to_rest import nearer_fraction
 
-Numbers = NDArray[np.floating[Any]]
 Observation = Mapping[str, Numbers]
 
 NOMINAL = 0.3

@@ -6,9 +6,9 @@ import functools
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory
 from viapoint.training.paper.figures.style import ARM, MODEL, THIRD, dot, letters, path, plane, sheet
 from viapoint.training.paper.profiles import EDGE, arm_profile, model_profile
@@ -18,8 +18,6 @@ from viapoint.training.paper.rows.obstacles import Decided, features
 from viapoint.training.paper.rows.timing import FAST, SLOW, THREE_POINTS
 from viapoint.training.paper.simulated import Performed, perform
 from viapoint.training.plotting.top_view import capsule
-
-Float = NDArray[np.float64]
 
 ROWS = ("$T$ [m/s]", "$C$ [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]")
 

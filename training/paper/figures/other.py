@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Float
 from viapoint.primitives import point_to_point
 from viapoint.training.paper.figures.style import (
     ARM,
@@ -30,8 +30,6 @@ from viapoint.training.paper.rows.obstacles import Decided, features
 from viapoint.training.paper.rows.online import ARRIVAL, SWITCH, jump, perform_jump
 from viapoint.training.paper.rows.timing import HEIGHT, LENGTHS, SHARES, TYPICAL, arm_shares
 from viapoint.training.paper.simulated import perform
-
-Float = NDArray[np.float64]
 
 DOTS = {"linestyle": "none", "marker": "o", "markersize": 2.2, "color": PALETTE.executed, "zorder": 5}
 FAINT = {

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory
 from viapoint.training.paper.figures.style import ARM, MODEL, SECOND, THIRD, dot, path, plane, sheet
 from viapoint.training.paper.profiles import EDGE, model_profile
@@ -17,8 +17,6 @@ from viapoint.training.paper.reference_movements import curved, straight
 from viapoint.training.paper.rows.curved import ENDS, EXAMPLE
 from viapoint.training.paper.rows.straight import DURATION
 from viapoint.training.paper.simulated import Performed, joint_velocity, perform, required_torque
-
-Float = NDArray[np.float64]
 
 
 def model() -> Figure:

@@ -11,12 +11,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import TARGETS
-
-Float = NDArray[np.float64]
 
 WIDTH = 8.5 / 2.54
 """Of a column, [inch]."""

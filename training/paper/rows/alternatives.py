@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.common.types import Float
 from viapoint.primitives import point_to_point
 from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
 from viapoint.training.paper.reference_movements import target
 from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, bow, diagonals, same_movement_elsewhere
 from viapoint.training.paper.simulated import Performed, follow, instants, perform
-
-Float = NDArray[np.float64]
 
 PEAKS = {2: ("acceleration", 1.5), 3: ("jerk", 1.875), 4: ("snap", 2.1875)}
 """What is minimised, and the peak speed in units of A / t_f, by the order of the derivative."""

@@ -8,8 +8,8 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.primitives import speed_valleys
 from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
 from viapoint.training.paper.passage_polynomial import closed_form, count_roots, passage_polynomial, root_of
@@ -22,8 +22,6 @@ from viapoint.training.paper.reference_movements import (
     via_waypoints,
 )
 from viapoint.training.paper.simulated import Performed, perform
-
-Float = NDArray[np.float64]
 
 ENDS = ("T1", "T4")
 """Of the family of curved movements; Fig. 1B shows one between these targets."""

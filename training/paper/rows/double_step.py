@@ -19,14 +19,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point, retarget
 from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
 from viapoint.training.paper.reference_movements import straight, target
 from viapoint.training.paper.simulated import Performed, follow, instants
-
-Float = NDArray[np.float64]
 
 DURATION = 0.7
 """Of the first movement, and of the second one, [s]."""

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.reference_movements import curved, smoothest, straight, target
 from viapoint.training.paper.simulated import perform, required_torque
-
-Float = NDArray[np.float64]
 
 TOUR = ("T3", "T4", "T5", "T6", "T1")
 """Start, three via-points and goal."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.types import Float
 from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
@@ -23,8 +24,6 @@ from viapoint.training.planners.baselines import Method, PlannerMethod
 from viapoint.training.planners.cma_planner import PlannerBudget
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.runs.agents import load_agent, pretrained_folder
-
-Float = NDArray[np.float64]
 
 LENGTHS = (0.15, 0.2, 0.25)
 """Of the rows of lights, [m]; the paper's were up to 25 cm."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, retarget
 from viapoint.training.paper.claim import Claim, at_most
 from viapoint.training.paper.reference_movements import straight, target
 from viapoint.training.paper.simulated import Performed, follow, instants
-
-Float = NDArray[np.float64]
 
 SWITCH = 0.3
 """When the target jumps, [s]."""

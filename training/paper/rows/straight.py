@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.reference_movements import smoothest, straight, target
 from viapoint.training.paper.simulated import Performed, joint_velocity, perform, required_torque
-
-Float = NDArray[np.float64]
 
 DIAGONALS = (("T3", "T6"), ("T1", "T4"), ("T2", "T5"))
 """The straight movements of Figs. 3 and 4."""

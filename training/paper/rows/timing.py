@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from viapoint.envs.common.types import Float
 from viapoint.training.paper.claim import Claim, at_most, near
 from viapoint.training.paper.reference_movements import curved, passage_share, target, via_waypoints
 from viapoint.training.paper.rows.curved import ENDS, closest_approach
 from viapoint.training.paper.simulated import perform
-
-Float = NDArray[np.float64]
 
 SHARES = np.linspace(0.1, 0.9, 17)
 """d1 / (d1 + d2) on the abscissa of Fig. 10A."""
