@@ -1,325 +1,191 @@
-"""Critic of viaq: the value of a plan as a minimum over obstacles, bodies of the arm and instants of the plan.
-
-A collision is a minimum: a movement touches something if it does so anywhere, at any time, with any link. A critic with
-this structure learns from the outcome of single movements which pair of obstacle and body was responsible:
-
-    m(s, a) = min over obstacle parts i, bodies h, instants t of q_h(i seen from h at t)
-
-No distance is computed. Each q_h is a small network whose input is the position and orientation of an obstacle in the
-frame of a body, and the body's own planned pose follows from the plan alone. Long obstacles are cut into parts, as an
-obstacle is the union of its parts.
-"""
+"""Critic of viaq: predictions of success, contact, clearance and effort for plans, and their value Q."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.mdp.task import Task
+from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses, bodies_of, dense
 
-PART = {2: 0.0625, 3: 0.15}
-"""Greatest half-length of an obstacle part in plane and space, [m]."""
-SCALE = 8.0
-"""Lengths are multiplied by this before they enter a network, [1/m]."""
-HIDDEN = 1 << 17
-"""Hidden numbers of each body that are computed together: few enough to stay in the cache."""
-UNIT = 0.05
-"""Length that one unit of a pair network's output stands for, [m]."""
-NOTHING = 1.0
-"""Margin where there is no obstacle, [m]."""
-ROWS = 65_536
-"""Pairs that are evaluated together: few enough for the processor's cache."""
+Form = Literal["places", "action"]
+Pooling = Literal["minimum", "sum"]
+
+EFFORT = 4
+"""Number of effort features: log jerk, duration, log duration, and spare time if time is limited."""
+IN_TIME = 20.0
+"""Logits of arrival for each second of spare time in tasks with a time limit, [1/s]."""
+UNLIKELY = 10.0
+"""Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q."""
 
 
-class Parts(NamedTuple):
-    """Parts of the obstacles of B scenes, at most R in each."""
+class Values(NamedTuple):
+    """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
 
-    centre: Tensor
-    """Shape (B, R, D), [m]."""
-    half_axis: Tensor
-    """Shape (B, R, D), [m]."""
-    radius: Tensor
-    """Shape (B, R), [m]."""
-    velocity: Tensor
-    """Shape (B, R, D), [m/s]."""
+    margin: Tensor
+    """Predicted clearance, [m]."""
+    clear: Tensor
+    """Logit of the probability of no contact."""
+    arrives: Tensor
+    """Logit of the probability of success given no contact."""
+    clearance: Tensor
+    """Predicted clearance term of the reward."""
+    rest: Tensor
+    """Predicted sum of the terms for smoothness and duration."""
+
+
+class SceneInputs(NamedTuple):
+    """Inputs of the critic that depend on B scenes only."""
+
+    ends: Tensor
+    """Start, goal and, in replanning tasks, the present motion, shape (B, E)."""
+    rows: Tensor
+    """Obstacles in the frame of start and goal, shape (B, n, F)."""
     present: Tensor
-    """Shape (B, R), bool."""
+    """Mask of the rows that hold an obstacle, shape (B, n), bool."""
+    parts: Parts | None
+    """Parts of the obstacles; None for the form `action`."""
 
 
-class Poses(NamedTuple):
-    """Planned poses of the arm's L bodies at T instants of H plans in each of B scenes."""
+class PlanInputs(NamedTuple):
+    """Inputs of the critic for H plans in each of B scenes."""
 
-    centre: Tensor
-    """Shape (L, D, B, H, T), [m]."""
-    axis: Tensor | None
-    """Unit vectors along the bodies, shape (L, D, B, H, T); None where the only body is a sphere."""
-    time: Tensor
-    """Since the beginning of the plan, shape (B, H, T), [s]."""
-
-
-def cut_obstacles(
-    rows: NDArray[np.floating], present: NDArray[np.bool_], velocity: NDArray[np.floating] | None = None
-) -> Parts:
-    """Cut capsules into parts of bounded length.
-
-    Args:
-        rows: Centre, half-axis and radius of n obstacles in B scenes, shape (B, n, 2 D + 1), [m].
-        present: Shape (B, n).
-        velocity: Shape (B, n, D), [m/s]; obstacles stand still if not given.
-    """
-    d = (rows.shape[-1] - 1) // 2
-    centre, half = rows[..., :d], rows[..., d : 2 * d]
-    length = np.sqrt((half * half).sum(axis=-1))
-    count = np.where(present, np.maximum(np.ceil(length / PART[d] - 1e-4), 1.0), 0.0).astype(np.int64)
-    scene, obstacle = (np.repeat(index, count.ravel()) for index in np.indices(count.shape).reshape(2, -1))
-    place = np.arange(len(scene)) - np.repeat(np.cumsum(count.ravel()) - count.ravel(), count.ravel())
-    number = count[scene, obstacle]
-    column = np.arange(len(scene)) - np.searchsorted(scene, scene)
-    most = max(int(count.sum(axis=1).max(initial=0)), 1)
-    offset = ((2.0 * place + 1.0) / number - 1.0)[:, None] * half[scene, obstacle]
-    values = {
-        "centre": centre[scene, obstacle] + offset,
-        "half_axis": half[scene, obstacle] / number[:, None],
-        "radius": rows[scene, obstacle, -1],
-        "velocity": np.zeros_like(offset) if velocity is None else velocity[scene, obstacle],
-        "present": np.ones(len(scene), dtype=bool),
-    }
-    parts = {}
-    for name, value in values.items():
-        whole = np.zeros((len(rows), most, *value.shape[1:]), dtype=bool if name == "present" else np.float32)
-        whole[scene, column] = value
-        parts[name] = torch.from_numpy(whole)
-    return Parts(**parts)
+    scene: SceneInputs
+    actions: Tensor
+    """Shape (B, H, m)."""
+    effort: Tensor
+    """Shape (B, H, EFFORT)."""
+    reach: Tensor
+    """Minimum reach margin of the planned hand, shape (B, H), [m]; negative if the plan leaves the reach of the arm."""
+    poses: Poses | None
+    """Planned poses of the arm; None for the form `action`."""
+    until: Tensor | None = None
+    """Time after which contact does not count, shape (B, H), [s]; None if plans are executed to their end."""
 
 
-def pair_features(
-    centre: list[Tensor], axis: list[Tensor] | None, half_axis: list[Tensor], radius: Tensor
-) -> list[Tensor]:
-    """Return the pose of an obstacle part relative to a body, as numbers that do not change with the frame.
+class _Saturated(torch.autograd.Function):
+    """Clamp whose gradient can move values back into the range, but not farther out of it."""
 
-    A capsule is symmetric under rotations about its axis and under reflections, a sphere under all rotations, so the
-    numbers are the components of centre and half-axis along the body's axis, in the direction of the part's centre,
-    and across both.
+    @staticmethod
+    def forward(context: Any, values: Tensor, low: float, high: float) -> Tensor:
+        context.save_for_backward(values)
+        context.bounds = low, high
+        return values.clamp(low, high)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (values,), (low, high) = context.saved_tensors, context.bounds
+        outwards = ((values > high) & (gradient < 0.0)) | ((values < low) & (gradient > 0.0))
+        return torch.where(outwards, 0.0, gradient), None, None
+
+
+class ViaQCritic(nn.Module):
+    """Network that predicts the value of plans from their margin, reach and effort.
+
+    The margin m(s, a) is learned (see :mod:`viapoint.training.algorithms.pair_networks`). The reach margin r(a) of the
+    planned hand does not depend on obstacles and is computed:
+
+        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(l r + d + c(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(m) + e(s, a)
 
     Args:
-        centre: D components of the vector from the body's centre to the part's, [m].
-        axis: D components of the body's unit axis; None for a sphere.
-        half_axis: D components of the part's half-axis, [m].
-        radius: Of the part, [m].
-    """
-    square, across, length = _dot(centre, centre), _dot(half_axis, centre), _dot(half_axis, half_axis)
-    if axis is None:
-        away = torch.sqrt(square + 1e-12)
-        radial = torch.abs(across) / away
-        return [away, radial, _root(length - radial * radial), radius.expand_as(away)]
-    along, turned = _dot(centre, axis), _dot(half_axis, axis)
-    away = _root(square - along * along)
-    radial = (across - along * turned) / away
-    sign = torch.where(radial < 0.0, -1.0, 1.0)
-    features = [along, away, turned * sign, radial * sign]
-    if len(centre) == 3:
-        features.append(_root(length - turned * turned - radial * radial))
-    return [*features, radius.expand_as(away)]
-
-
-class PairNetworks(nn.Module):
-    """One small network for each of the arm's bodies, evaluated side by side.
-
-    Args:
-        bodies: Number of bodies L.
-        inputs: Number of inputs F.
-        width: Of the two hidden layers.
+        task: Task of the environment.
+        replanning: True if an episode consists of several decisions.
+        form: Input of the pair networks: `places`, the planned poses of the arm, or `action`.
+        pooling: `minimum` over obstacles, or `sum` of their features (Deep Sets).
+        heads: Number of outputs for the form `action`, of which the minimum is taken.
+        width: Width of the hidden layers of the pair networks.
     """
 
-    def __init__(self, bodies: int, inputs: int, width: int) -> None:
+    def __init__(
+        self, task: Task, *, replanning: bool, form: Form, pooling: Pooling, heads: int, width: int
+    ) -> None:
         super().__init__()
-        sizes = (inputs, width, width, 1)
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
-        for fan_in, fan_out in itertools.pairwise(sizes):
-            scale = (2.0 / fan_in) ** 0.5 if fan_out > 1 else 0.3 / fan_in**0.5
-            self.weights.append(nn.Parameter(scale * torch.randn(bodies, fan_out, fan_in)))
-            self.biases.append(nn.Parameter(torch.zeros(bodies, fan_out, 1)))
-        self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]).repeat(bodies, 1))
-        """Slope and offset of a skip connection from the distance of the centres: at the beginning, the nearest pair
-        is taken to be responsible."""
-
-    def forward(self, features: Tensor, distance: Tensor) -> Tensor:
-        """Return values of shape (L, N) for features (L, F, N) and distances of the centres (L, N), [m]."""
-        layers = list(zip(self.weights, self.biases, strict=True))
-        columns = features.shape[2]
-        if not torch.is_grad_enabled():
-            columns = min(columns, HIDDEN // layers[0][0].shape[1])
-        pieces = []
-        for hidden in torch.split(features, max(columns, 1), dim=2):
-            for weight, bias in layers[:-1]:
-                hidden = torch.baddbmm(bias, weight, hidden)
-                hidden = hidden.relu_() if not hidden.requires_grad else hidden.relu()
-            pieces.append(torch.baddbmm(layers[-1][1], layers[-1][0], hidden))
-        values = torch.cat(pieces, dim=2)[:, 0] if len(pieces) > 1 else pieces[0][:, 0]
-        slope, offset = self.nearness[:, :1], self.nearness[:, 1:]
-        return values + slope * (distance / UNIT) + offset
-
-
-class PairMinimum(nn.Module):
-    """Minimum of the pair networks over obstacle parts, bodies and instants.
-
-    Args:
-        dimension: Spatial dimension D.
-        bodies: Number of bodies L; 0 stands for one sphere, the hand.
-        width: Of the hidden layers.
-    """
-
-    def __init__(self, dimension: int, bodies: int, width: int) -> None:
-        super().__init__()
-        inputs = 4 if not bodies else 2 * dimension + (1 if dimension == 2 else 0)
-        self.networks = PairNetworks(max(bodies, 1), inputs, width)
-
-    def forward(self, poses: Poses, parts: Parts, until: Tensor | None = None) -> Tensor:
-        """Return the minimum for each plan, shape (B, H), [m]; NOTHING where a scene has no obstacle.
-
-        The responsible pair is searched for without gradients; gradients flow through this pair alone.
-
-        Args:
-            poses: Of the plans.
-            parts: Of the obstacles.
-            until: Time after which instants do not count, shape (B, H), [s]; the first one always does.
-        """
-        late = None
-        if until is not None:
-            late = poses.time > until[..., None]
-            late[..., 0] = False
-        if not torch.is_grad_enabled():
-            least = self._least(poses, parts, late)
+        d, size = task.arm.dimension, task.action.size
+        ends = (4 * d + 3) if replanning else (2 * d + 1)
+        row = (3 * d + 1) if replanning else (2 * d + 1)
+        self.form, self.pooling, self.replanning = form, pooling, replanning
+        self.pairs: Any = None
+        if form == "places":
+            self.pairs = PairMinimum(d, bodies_of(task), width)
         else:
-            least, where = self._search(poses, parts, late)
-            scene, plan = (each.reshape(-1) for each in torch.meshgrid(
-                *(torch.arange(n) for n in least.shape), indexing="ij"))  # fmt: skip
-            body, part, instant = (each.reshape(-1) for each in where)
-            picked = self._picked(poses, parts, scene, plan, body, part, instant)
-            values = picked.reshape(least.shape)
-            least = torch.where(parts.present.any(dim=1)[:, None], values, least)
-        return torch.where(parts.present.any(dim=1)[:, None], least * UNIT, torch.full_like(least, NOTHING))
-
-    def _least(self, poses: Poses, parts: Parts, late: Tensor | None) -> Tensor:
-        """Return the least value of each plan, shape (B, H)."""
-        least = torch.full((*parts.present.shape, poses.centre.shape[3]), torch.inf)
-        for b, k, values in self._blocks(poses, parts, late):
-            least[b, k] = values.amin(dim=(2, 3))
-        return least.amin(dim=1)
-
-    @torch.no_grad()
-    def _search(
-        self, poses: Poses, parts: Parts, late: Tensor | None
-    ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """Find the least value of each plan, shape (B, H), and its body, part and instant."""
-        plans, instants = poses.centre.shape[3:]
-        least = torch.full((*parts.present.shape, plans), torch.inf)
-        at = torch.zeros(least.shape, dtype=torch.long)
-        for b, k, values in self._blocks(poses, parts, late):
-            least[b, k], at[b, k] = values.reshape(len(b), plans, -1).min(dim=-1)
-        lowest, nearest = least.min(dim=1)
-        found = at.gather(1, nearest[:, None])[:, 0]
-        return lowest, (found // instants, nearest, found % instants)
-
-    def _blocks(
-        self, poses: Poses, parts: Parts, late: Tensor | None
-    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yield scenes b and parts k, shape (P,), with the values of their pairs, shape (P, H, L, T)."""
-        bodies, _, _, plans, instants = poses.centre.shape
-        scene, part = torch.nonzero(parts.present, as_tuple=True)
-        several = max(ROWS // (bodies * plans * instants), 1)
-        for first in range(0, len(scene), several):
-            b, k = scene[first : first + several], part[first : first + several]
-            values = self._values(poses, parts, b, k)
-            yield b, k, values if late is None else values.masked_fill(late[b][:, :, None], torch.inf)
-
-    def _values(self, poses: Poses, parts: Parts, b: Tensor, k: Tensor) -> Tensor:
-        """Values of pairs of scene b and part k for every plan, body and instant, shape (P, H, L, T)."""
-        bodies, dimension, _, plans, instants = poses.centre.shape
-        here = poses.centre[:, :, b]
-        part, half = parts.centre[b, k], parts.half_axis[b, k]
-        drift = parts.velocity[b, k]
-        moves = bool(drift.any())
-        time = poses.time[b] if moves else None
-        centre = []
-        for i in range(dimension):
-            place = part[:, i, None, None]
-            if time is not None:
-                place = place + drift[:, i, None, None] * time
-            centre.append(place - here[:, i])
-        axis = None
-        if poses.axis is not None:
-            pointing = poses.axis[:, :, b]
-            axis = [pointing[:, i] for i in range(dimension)]
-        halves = [half[:, i, None, None] for i in range(dimension)]
-        features = pair_features(centre, axis, halves, parts.radius[b, k][:, None, None])
-        values = self._evaluate(features)
-        return values.reshape(bodies, len(b), plans, instants).permute(1, 2, 0, 3)
-
-    def _picked(
-        self,
-        poses: Poses,
-        parts: Parts,
-        scene: Tensor,
-        plan: Tensor,
-        body: Tensor,
-        part: Tensor,
-        instant: Tensor,
-    ) -> Tensor:
-        """Values of single pairs, with gradients, shape (N,)."""
-        dimension = poses.centre.shape[1]
-        here = poses.centre[body, :, scene, plan, instant]
-        drift = parts.velocity[scene, part] * poses.time[scene, plan, instant][:, None]
-        apart = parts.centre[scene, part] + drift - here
-        axis = None
-        if poses.axis is not None:
-            pointing = poses.axis[body, :, scene, plan, instant]
-            axis = [pointing[:, i] for i in range(dimension)]
-        half = parts.half_axis[scene, part]
-        features = pair_features(
-            [apart[:, i] for i in range(dimension)],
-            axis,
-            [half[:, i] for i in range(dimension)],
-            parts.radius[scene, part],
+            outputs = heads if pooling == "minimum" else width
+            self.pairs = dense(ends + row + size, width, width, outputs)
+            self.pooled = dense(width + ends + size, width, 1) if pooling == "sum" else None
+        self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
+        """Logarithm of l [1/m], and d."""
+        self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
+        for parameter in self.rest[-1].parameters():
+            nn.init.zeros_(parameter)
+        self.linear = nn.Parameter(torch.tensor([-task.weights.smoothness, -task.weights.duration, 0.0, 0.0]))
+        """Weights of the effort features, initialised from the reward weights."""
+        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
+        """Logarithm of k [1/m], and b."""
+        weights = task.weights
+        self.scales = nn.Parameter(
+            torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
         )
-        every = self._evaluate([each.expand(len(self.networks.nearness), -1) for each in features])
-        return every.gather(0, body[None])[0]
+        """w_s, w_c, w_g and w_m, initialised from the reward weights and adapted to the rewards."""
 
-    def _evaluate(self, features: list[Tensor]) -> Tensor:
-        """Values of shape (L, N) of features, each of shape (L, ...)."""
-        bodies = features[0].shape[0]
-        stacked = torch.stack([each.reshape(bodies, -1) for each in features], dim=1)
-        distance = stacked[:, 0] if len(features) == 4 else torch.hypot(stacked[:, 0], stacked[:, 1])
-        values: Tensor = self.networks(stacked * SCALE, distance)
-        return values
+    def forward(self, inputs: PlanInputs) -> Values:
+        """Return the predictions for each plan."""
+        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        plan = torch.cat((ends, inputs.actions), dim=-1)
+        if self.form == "places":
+            margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
+        else:
+            margin = self._of_actions(plan, inputs.scene)
+        reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
+        # Keeping a plan and planning the same movement again have the same value, so the action itself is not an input.
+        rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
+        low, high = CLEARANCE_RANGE
+        clip: Any = _Saturated.apply
+        clearance = clip(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        return Values(
+            margin,
+            margin * torch.exp(self.slope[0]) + self.slope[1],
+            reach + rest[..., 1] + IN_TIME * inputs.effort[..., 3],
+            clearance,
+            rest[..., 0] + inputs.effort @ self.linear,
+        )
 
+    def value(self, values: Values) -> Tensor:
+        """Return Q, shape (B, H)."""
+        clear = torch.sigmoid(values.clear)
+        success = clear * torch.sigmoid(values.arrives)
+        won, lost, missed, _ = self.scales
+        total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
+        return total + values.clearance + values.rest
 
-def dense(*sizes: int) -> nn.Sequential:
-    """Return linear layers with rectifiers between them."""
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in itertools.pairwise(sizes):
-        layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    def merit(self, values: Values) -> Tensor:
+        """Return the ranking criterion, shape (B, H): Q if success is more likely than not, otherwise a lower number.
 
+        If no plan is likely to succeed, Q prefers plans out of reach, which are not executed and so touch nothing. The
+        probability of success ranks such plans instead.
+        """
+        success = torch.sigmoid(values.clear) * torch.sigmoid(values.arrives)
+        merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+        return merit
 
-def _dot(first: list[Tensor], second: list[Tensor]) -> Tensor:
-    total = first[0] * second[0]
-    for u, v in zip(first[1:], second[1:], strict=True):
-        total = total + u * v
-    return total
-
-
-def _root(square: Tensor) -> Tensor:
-    return torch.sqrt(square.clamp_min(1e-10))
-
-
-def bodies_of(task: Task) -> int:
-    """Return how many capsules of the arm count; 0 where the hand alone does."""
-    return len(task.arm.link_radii) if task.whole_arm else 0
+    def _of_actions(self, plan: Tensor, scene: SceneInputs) -> Tensor:
+        """Return the margin for the form `action`, shape (B, H), [m]."""
+        plans, rows = plan.shape[1], scene.rows.shape[1]
+        pairs = torch.cat(
+            (
+                plan[:, :, None].expand(-1, -1, rows, -1),
+                scene.rows[:, None].expand(-1, plans, -1, -1),
+            ),
+            dim=-1,
+        )
+        values = self.pairs(pairs)
+        present = scene.present[:, None, :, None]
+        if self.pooled is not None:
+            summed = (values.relu() * present).sum(dim=2)
+            pooled: Tensor = 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
+            return pooled
+        far = torch.where(present, values, torch.full_like(values, 20.0))
+        margin: Tensor = 0.05 * far.amin(dim=(2, 3)) if rows else torch.ones_like(plan[..., 0])
+        return margin

@@ -1,4 +1,4 @@
-"""Observations as vectors for the standard algorithms: a set of obstacles, seen along the line to the goal."""
+"""Feature extractor for the standard algorithms: a Deep Sets encoder of the obstacles."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from torch import Tensor, nn
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, frame
 from viapoint.training.search.planned_movements import is_replanning
 
-PLACES = 5.0
-"""Metres times this are of size one: obstacles lie within a few decimetres of the line."""
+POSITION_SCALE = 5.0
+"""Scale of positions, [1/m]: obstacles lie within a few decimetres of the line from start to goal."""
 
 
 class SceneExtractor(BaseFeaturesExtractor):
-    """Features of a scene that depend neither on the order of its obstacles nor on how many there might be.
+    """Features of a scene that do not depend on the order or the maximum number of its obstacles.
 
-    Obstacles are seen in the frame of the straight line, from its middle; each passes through the same network, of
-    which sum and maximum over those present remain (Zaheer et al. 2017, Deep Sets, arXiv 1703.06114). The line runs
-    from `start` where the observation has one, otherwise from `hand`. What else is observed follows, made of size one;
-    vectors of the plane or of space other than the ends are turned into the frame.
+    Obstacle rows are transformed to the frame of the straight line to the goal, with its middle as origin. One network
+    encodes each row; the features are the sum and the maximum over the obstacles that are present (Zaheer et al. 2017,
+    Deep Sets, arXiv 1703.06114). The line begins at `start` if the observation has it, otherwise at `hand`. The other
+    parts of the observation are scaled to order one; velocities and accelerations are rotated to the frame.
 
     Args:
-        observation_space: Of an environment of this package.
-        width: Of the network that sees one obstacle.
+        observation_space: Observation space of an environment of this package.
+        width: Width of the layers of the obstacle network.
     """
 
     def __init__(self, observation_space: spaces.Dict, width: int = 64) -> None:
@@ -51,12 +51,12 @@ class SceneExtractor(BaseFeaturesExtractor):
         return torch.cat(parts, dim=-1)
 
     def rows(self, observation: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what is no obstacle, shape (B, E), obstacles (B, n, F), and their presence (B, n, 1)."""
+        """Return other features, shape (B, E), obstacle rows, shape (B, n, F), and presence, shape (B, n, 1)."""
         _, axes, middle, parts = self._ends(observation)
         return torch.cat(parts, dim=-1), *self._obstacles(observation["obstacles"], axes, middle)
 
     def _ends(self, observation: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
-        """Return ends, axes and middle of the line, and all features that are no obstacles."""
+        """Return ends, axes and middle of the line, and all features that do not describe obstacles."""
         hand, goal = observation["hand"], observation["goal"]
         start = observation.get("start", hand)
         axes = torch.stack(
@@ -66,7 +66,7 @@ class SceneExtractor(BaseFeaturesExtractor):
         distance = (goal - start).norm(dim=-1, keepdim=True)
         own = [2.0 * middle, 2.0 * (goal - middle), 2.0 * distance]
         if "start" in observation:
-            own.append(PLACES * _turned(axes, hand - middle))
+            own.append(POSITION_SCALE * _turned(axes, hand - middle))
         ends = torch.cat(own, dim=-1)
         parts = [ends]
         parts += [_turned(axes, observation[name]) * self._scale[name] for name in self.turned]
@@ -79,28 +79,28 @@ class SceneExtractor(BaseFeaturesExtractor):
         rows = flat.reshape(len(flat), -1, 2 * d + 2)
         centre = _turned(axes.unsqueeze(1), rows[..., :d] - middle.unsqueeze(1))
         half = _turned(axes.unsqueeze(1), rows[..., d : 2 * d])
-        half = torch.where(half[..., 1:2] < 0.0, -half, half)  # a bar has no sense of direction
-        seen = PLACES * torch.cat((centre, half, rows[..., 2 * d : 2 * d + 1]), dim=-1)
+        half = torch.where(half[..., 1:2] < 0.0, -half, half)  # the sign of a half-axis has no meaning
+        seen = POSITION_SCALE * torch.cat((centre, half, rows[..., 2 * d : 2 * d + 1]), dim=-1)
         return seen, (rows[..., -1:] > 0.5).to(flat.dtype)
 
     def _encoded(self, seen: Tensor, present: Tensor, ends: Tensor) -> list[Tensor]:
-        """Return sum and maximum over the obstacles that are there, shape (B, width) each."""
+        """Return sum and maximum over the obstacles that are present, shape (B, width) each."""
         about = ends.unsqueeze(1).expand(-1, seen.shape[1], -1)
         encoded = self.each(torch.cat((seen, about), dim=-1)) * present
         return [0.5 * encoded.sum(dim=1), encoded.amax(dim=1)]
 
 
 EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExtractor}
-"""By the name that a model's file knows them by."""
+"""Feature extractors by the name that model files use."""
 
 
 def _direction(line: Tensor, shortest: float) -> Tensor:
-    """Replace lines that are shorter, or of no length, by the first axis; see ``planned_movements.direction``."""
+    """Replace lines that are shorter than `shortest` by the first axis; see ``planned_movements.direction``."""
     square = (line * line).sum(dim=-1, keepdim=True)
     ahead = torch.eye(line.shape[-1], dtype=line.dtype, device=line.device)[0]
     return torch.where((square > 0.0) & (square >= shortest**2), line, ahead)
 
 
 def _turned(axes: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors, shape (..., D), in a frame of shape (..., D, D)."""
+    """Return vectors of shape (..., D) in a frame of shape (..., D, D)."""
     return (axes * vectors.unsqueeze(-2)).sum(dim=-1)

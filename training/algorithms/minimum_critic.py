@@ -1,9 +1,9 @@
-"""The minimum critic for Stable-Baselines3's own SAC and TD3.
+"""Policies that give SAC and TD3 of Stable-Baselines3 a critic with a minimum over obstacles.
 
     Q(s, a) = q0(ends, a) + min over obstacles i and heads h of q_h(obstacle i, ends, a)
 
-A collision is a minimum over obstacles, which a critic on one pooled vector of the scene has to learn. Only the critic
-differs: actor, replay buffer and updates are those of SAC and TD3.
+The clearance of a plan is a minimum over obstacles. A critic on one pooled vector of the scene has to learn this
+structure; this critic has it. Actor, replay buffer and updates are those of SAC and TD3.
 
 Example:
     >>> import gymnasium as gym, viapoint.envs
@@ -27,27 +27,27 @@ from stable_baselines3.sac.policies import MultiInputPolicy as SACPolicy
 from stable_baselines3.td3.policies import MultiInputPolicy as TD3Policy
 from torch import Tensor, nn
 
-from viapoint.training.algorithms.critic import dense
 from viapoint.training.algorithms.extractors import SceneExtractor
+from viapoint.training.algorithms.pair_networks import dense
 
 ABSENT = 1e3
-"""Value of an obstacle that is not there."""
+"""Value of a row without an obstacle."""
 
 
 class ObstacleRows(BaseFeaturesExtractor):
-    """Scene as rows: ends, then every obstacle in the frame of start and goal, then which of them are present.
+    """Features that keep each obstacle apart: ends, obstacle rows in the frame of start and goal, presence.
 
     Args:
-        observation_space: Of an environment with obstacles.
+        observation_space: Observation space of an environment with obstacles.
 
     Raises:
-        ValueError: There are no obstacles in the observation.
+        ValueError: The observation has no part `obstacles`.
     """
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         if "obstacles" not in observation_space.spaces:
             raise ValueError(
-                "a minimum critic needs an observation with the part obstacles, got one with "
+                "a minimum critic needs an observation with the part obstacles; got the parts "
                 f"{', '.join(observation_space.spaces)}"
             )
         scene = SceneExtractor(observation_space, width=1)
@@ -68,10 +68,10 @@ class MinimumQ(nn.Module):
     """Q network on :class:`ObstacleRows` and an action.
 
     Args:
-        extractor: Layout of the features.
-        size: Components of an action m.
-        width: Of the hidden layers.
-        heads: Networks of each obstacle, of which the minimum is taken.
+        extractor: Extractor that defines the layout of the features.
+        size: Number of components of an action.
+        width: Width of the hidden layers.
+        heads: Number of outputs for each obstacle, of which the minimum is taken.
     """
 
     def __init__(self, extractor: ObstacleRows, size: int, width: int, heads: int) -> None:
@@ -81,7 +81,7 @@ class MinimumQ(nn.Module):
         self.rest = dense(extractor.ends + size, width, width, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return Q, shape (B, 1), of features and actions in one vector."""
+        """Return Q, shape (B, 1), for concatenated features and actions."""
         ends, rows, row = self.layout
         about, seen = features[:, :ends], features[:, ends : ends + rows * row].reshape(-1, rows, row)
         present = features[:, ends + rows * row : ends + rows * (row + 1)]
@@ -94,21 +94,24 @@ class MinimumQ(nn.Module):
 
 
 class _MinimumCritic(BasePolicy):
-    """Part of both policies: makes critics with a minimum over obstacles.
+    """Mixin that makes critics with a minimum over obstacles.
 
     Args:
         *args: Arguments of the policy of SAC or TD3.
-        heads: Networks of each obstacle, of which the minimum is taken.
-        critic_width: Of the hidden layers of the critics.
-        **kwargs: As `args`; the actor sees the scene through :class:`SceneExtractor` if not told otherwise.
+        heads: Number of outputs for each obstacle, of which the minimum is taken.
+        critic_width: Width of the hidden layers of the critics.
+        **kwargs: Keyword arguments of the policy; `features_extractor_class` of the actor defaults to
+            :class:`SceneExtractor`.
     """
 
     def __init__(self, *args: Any, heads: int = 1, critic_width: int = 128, **kwargs: Any) -> None:
         for name, value in (("heads", heads), ("critic_width", critic_width)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number, 1 or more, got {value!r}")
+                raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
         if kwargs.get("share_features_extractor"):
-            raise ValueError("share_features_extractor must be False: a minimum critic sees rows of its own")
+            raise ValueError(
+                "share_features_extractor must be False: a minimum critic has its own features extractor"
+            )
         self.heads, self.critic_width = heads, critic_width
         super().__init__(*args, **{"features_extractor_class": SceneExtractor, **kwargs})
 
@@ -130,12 +133,12 @@ class _MinimumCritic(BasePolicy):
 
 
 class MinimumCriticSACPolicy(_MinimumCritic, SACPolicy):
-    """Policy of SAC with a minimum critic; see :class:`_MinimumCritic` for its arguments."""
+    """Policy of SAC with a minimum critic; further arguments are `heads` and `critic_width`."""
 
 
 class MinimumCriticTD3Policy(_MinimumCritic, TD3Policy):
-    """Policy of TD3 with a minimum critic; see :class:`_MinimumCritic` for its arguments."""
+    """Policy of TD3 with a minimum critic; further arguments are `heads` and `critic_width`."""
 
 
 POLICIES: dict[str, type[BasePolicy]] = {"sac": MinimumCriticSACPolicy, "td3": MinimumCriticTD3Policy}
-"""Policies by the name of their algorithm on the command line."""
+"""Policy class by the command-line name of the algorithm."""

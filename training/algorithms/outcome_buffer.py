@@ -1,4 +1,4 @@
-"""Replay buffer that keeps the terms of the reward besides their sum."""
+"""Replay buffer that stores the terms of the reward in addition to their sum."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from viapoint.training.rollouts.vec_env import TERMS
 """A NumPy array or a torch tensor."""
 
 LOWER = 1e-6
-"""Least change of the clearance term that counts as one."""
+"""Smallest decrease of the clearance term that counts as a decrease."""
 REWARD_TOLERANCE = 1e-4
-"""Greatest difference between the reward and the sum of its terms."""
+"""Largest difference between the reward and the sum of its terms that counts as rounding."""
 
 
 class Outcomes(NamedTuple):
-    """Outcomes of N decisions, shape (N,) each; NaN where the environment tells the sum of the terms only."""
+    """Outcomes of N decisions, shape (N,) each; NaN if the environment reports only the sum of the terms."""
 
     success: Array
-    """1 for success, 0 for none."""
+    """1 for success, otherwise 0."""
     contact: Array
-    """1 where something was touched."""
+    """1 if the arm touched an obstacle, otherwise 0."""
     clearance: Array
-    """Term of the reward, summed over the episode so far."""
+    """Clearance term of the reward, summed over the episode so far."""
     lower: Array
-    """1 where that sum is lower than before, so that this decision and none before it is responsible."""
+    """1 if this decision lowered that sum, so that no earlier decision accounts for it."""
     goal_error: Array
-    """Term of the reward."""
+    """Goal-error term of the reward."""
     rest: Array
     """Sum of the terms for smoothness and duration."""
 
 
 class OutcomeSamples(NamedTuple):
-    """Decisions drawn from a buffer: B observations by name, actions (B, m), and (B,) of everything else."""
+    """Sampled decisions: B observations by name, actions of shape (B, m), all other fields of shape (B,)."""
 
     observations: dict[str, Single]
     actions: Single
@@ -48,21 +48,21 @@ class OutcomeSamples(NamedTuple):
     ended: Single
     reward: Single
     discount: Single
-    """Discount of what follows, by the algorithm's gamma or by the time that the decision took."""
+    """Discount of the value of the next observation: gamma, or the discount of the elapsed time."""
     elapsed: Single
-    """Time that the decision took, [s]; infinite where it is not told, as the whole plan is carried out then."""
+    """Duration of the executed part of the plan, [s]; infinite if the plan was executed to its end."""
     outcomes: Outcomes
 
 
 class OutcomeReplayBuffer(TimedDictReplayBuffer):
-    """Replay buffer of dictionaries that keeps the outcome of each decision as `info` tells it.
+    """Replay buffer for dictionary observations that stores the outcome of each decision from `info`.
 
     Args:
         *args: Arguments of :class:`stable_baselines3.common.buffers.DictReplayBuffer`.
         gamma: Discount of one unit of time.
-        unit: [s]; None discounts every decision by gamma, no matter how long it takes.
-        key: Of the infos, where they tell the elapsed time [s].
-        **kwargs: As `args`.
+        unit: Length of the unit of time, [s]; None discounts each decision by gamma, whatever its duration.
+        key: Key of `info` that holds the elapsed time, [s].
+        **kwargs: Keyword arguments of the same class.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
     ) -> None:
         DictReplayBuffer.__init__(self, *args, **kwargs)
         if self.optimize_memory_usage:
-            raise ValueError("optimize_memory_usage must be False where the terms of the reward are kept")
+            raise ValueError("optimize_memory_usage must be False: the buffer stores the terms of the reward")
         self.gamma = gamma
         self.time_discount = None if unit is None else TimeDiscount(gamma=gamma, unit=unit, key=key)  # type: ignore[assignment]
         self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
@@ -83,7 +83,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
     def add(
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
     ) -> None:
-        """Keep a transition of every environment."""
+        """Add one transition of each environment."""
         if self.time_discount is not None:
             self.discounts[self.pos] = self.time_discount.of(infos)
         before = self._clearance_before()
@@ -93,11 +93,11 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         DictReplayBuffer.add(self, obs, next_obs, action, reward, done, infos)
 
     def begin(self) -> None:
-        """Note that all environments begin new episodes, whether or not the last ones had come to an end."""
+        """Mark the beginning of new episodes in all environments, after a reset."""
         self._begins = True
 
     def _clearance_before(self) -> Single:
-        """Return the sums of the clearance terms of the running episodes, shape (N,); NaN where one begins."""
+        """Return the clearance terms summed over each running episode, shape (N,); NaN at its first decision."""
         begins, self._begins = self._begins, False
         if begins or (not self.pos and not self.full):
             return np.full(self.n_envs, np.nan, dtype=np.float32)
@@ -106,7 +106,7 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         return np.where(over, np.nan, self.outcomes[last, :, Outcomes._fields.index("clearance")])
 
     def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
-        """Return `batch_size` decisions drawn with replacement."""
+        """Return `batch_size` decisions, sampled with replacement."""
         rows = np.random.randint(0, self.size(), size=batch_size)  # noqa: NPY002 - as SB3
         at = rows, np.random.randint(0, self.n_envs, size=batch_size)  # noqa: NPY002
         return OutcomeSamples(
@@ -122,12 +122,12 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
 
 
 def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
-    """Return the outcome that `info` tells, or NaN where its terms do not sum to the reward.
+    """Return the outcome that `info` reports, or NaN if its terms do not sum to the reward.
 
     Args:
-        info: Of the decision.
-        reward: Of the decision.
-        before: Sum of the clearance terms of the episode's earlier decisions; NaN where there are none.
+        info: Info of the decision.
+        reward: Reward of the decision.
+        before: Sum of the clearance terms of earlier decisions in the episode; NaN for the first decision.
     """
     unknown = (np.nan,) * len(Outcomes._fields)
     if not all(name in info for name in TERMS):

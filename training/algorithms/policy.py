@@ -1,238 +1,61 @@
-"""Policy of viaq: candidates, a critic that orders them, and exact checks of the most promising ones."""
+"""Policy of viaq: candidate plans, a critic that ranks them, and exact geometric checks of the best ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from torch import Tensor, nn
+from torch import Tensor
 
 from viapoint.envs.actions.via_points import frame
 from viapoint.envs.arms import ARMS
-from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
-from viapoint.training.algorithms.critic import PairMinimum, Parts, Poses, bodies_of, cut_obstacles, dense
+from viapoint.training.algorithms.critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
+from viapoint.training.algorithms.pair_networks import Poses, cut_obstacles
 from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import worth_of_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 from viapoint.training.search.planned_movements import Observation, direction, is_replanning, part, planned
 
-Form = Literal["places", "action"]
-Pooling = Literal["minimum", "sum"]
 Numbers = NDArray[np.floating[Any]]
 
-EFFORT = 4
-"""Numbers that tell the effort of a plan: log jerk, duration, log duration, and time to spare where that is limited."""
-IN_TIME = 20.0
-"""Logits of success for each second to spare, where time is limited, at the beginning."""
-UNLIKELY = 10.0
-"""Merit that is taken off where success is unlikely: more than the range of Q."""
 KEEP = 0.1
-"""Difference of Q for which a plan under way is revised."""
-BEST = 8
-"""Number of the best candidates that are refined in each round."""
+"""Minimum gain of Q for which a running plan is revised."""
+N_ELITES = 8
+"""Number of candidates around which each round of refinement samples."""
 SPREAD = 0.15
-"""Standard deviation of the first round of refinement; each further round halves it."""
+"""Standard deviation of the first round of refinement, in the action space; each round halves it."""
 CHECKED_INSTANTS = 16
-"""Instants of a plan that are enough to rank it where the best plans are checked exactly."""
-PLACES = 1 << 16
-"""Places of plans that are computed together, so that temporary arrays stay in the cache."""
-
-
-class Values(NamedTuple):
-    """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
-
-    margin: Tensor
-    """Predicted clearance, [m]."""
-    clear: Tensor
-    """Logit of the probability that nothing is touched."""
-    arrives: Tensor
-    """Logit of the probability of success where nothing is touched."""
-    clearance: Tensor
-    """Predicted clearance term of the reward."""
-    rest: Tensor
-    """Predicted sum of the terms for smoothness and duration."""
-
-
-class SceneInputs(NamedTuple):
-    """Inputs of the critic that belong to B scenes."""
-
-    ends: Tensor
-    """Start, goal and, on the way, the present motion, shape (B, E)."""
-    rows: Tensor
-    """Obstacles in the frame of start and goal, shape (B, n, F)."""
-    present: Tensor
-    """Shape (B, n), bool."""
-    parts: Parts | None
-    """Parts of the obstacles; None where the critic takes the action itself."""
-
-
-class PlanInputs(NamedTuple):
-    """Inputs of the critic: H plans in each of B scenes."""
-
-    scene: SceneInputs
-    actions: Tensor
-    """Shape (B, H, m)."""
-    effort: Tensor
-    """Shape (B, H, EFFORT)."""
-    reach: Tensor
-    """Least distance of the hand inside the arm's reach, shape (B, H), [m]; negative where the plan leaves it."""
-    poses: Poses | None
-    """Planned poses of the arm's bodies; None where the critic takes the action itself."""
-    until: Tensor | None = None
-    """Time after which contact does not count, shape (B, H), [s]: a plan may have been carried out in part."""
-
-
-class _Saturated(torch.autograd.Function):
-    """Clamp whose gradient pulls values back into the range, but never pushes them farther out."""
-
-    @staticmethod
-    def forward(context: Any, values: Tensor, low: float, high: float) -> Tensor:
-        context.save_for_backward(values)
-        context.bounds = low, high
-        return values.clamp(low, high)
-
-    @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (values,), (low, high) = context.saved_tensors, context.bounds
-        outwards = ((values > high) & (gradient < 0.0)) | ((values < low) & (gradient > 0.0))
-        return torch.where(outwards, 0.0, gradient), None, None
-
-
-class ViaQCritic(nn.Module):
-    """Value of plans: effort, and success as it follows from the least margin of all pairs.
-
-    The margin m(s, a) is learned (see :mod:`viapoint.training.algorithms.critic`); the reach r(a), the least distance
-    of the planned hand inside the arm's reach, belongs to the plan and is computed:
-
-        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(l r + d + c(s, a)),
-        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(m) + e(s, a)
-
-    Args:
-        task: Of the environment.
-        replanning: Whether episodes are several decisions.
-        form: Input of the pair networks: the arm's planned `places`, or the `action` itself.
-        pooling: `minimum` over obstacles, or `sum` of their features (Deep Sets).
-        heads: Networks for the action form, of which the minimum is taken.
-        width: Of the hidden layers of the pair networks.
-    """
-
-    def __init__(
-        self, task: Task, *, replanning: bool, form: Form, pooling: Pooling, heads: int, width: int
-    ) -> None:
-        super().__init__()
-        d, size = task.arm.dimension, task.action.size
-        ends = (4 * d + 3) if replanning else (2 * d + 1)
-        row = (3 * d + 1) if replanning else (2 * d + 1)
-        self.form, self.pooling, self.replanning = form, pooling, replanning
-        self.pairs: Any = None
-        if form == "places":
-            self.pairs = PairMinimum(d, bodies_of(task), width)
-        else:
-            outputs = heads if pooling == "minimum" else width
-            self.pairs = dense(ends + row + size, width, width, outputs)
-            self.pooled = dense(width + ends + size, width, 1) if pooling == "sum" else None
-        self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
-        """Logarithm of l in 1/m, and d."""
-        self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
-        for parameter in self.rest[-1].parameters():
-            nn.init.zeros_(parameter)
-        self.linear = nn.Parameter(torch.tensor([-task.weights.smoothness, -task.weights.duration, 0.0, 0.0]))
-        """Weights of the numbers of effort: at the beginning those of the task."""
-        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
-        """Logarithm of k in 1/m, and b."""
-        weights = task.weights
-        self.scales = nn.Parameter(
-            torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
-        )
-        """w_s, w_c, w_g and w_m: at the beginning the environment's, then adapted to the rewards."""
-
-    def forward(self, inputs: PlanInputs) -> Values:
-        """Return the predictions for each plan."""
-        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
-        plan = torch.cat((ends, inputs.actions), dim=-1)
-        if self.form == "places":
-            margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
-        else:
-            margin = self._of_actions(plan, inputs.scene)
-        reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
-        # On the way, keeping a plan and making the same plan anew are worth the same: the action itself is not seen.
-        rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
-        low, high = CLEARANCE_RANGE
-        clip: Any = _Saturated.apply
-        clearance = clip(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
-        return Values(
-            margin,
-            margin * torch.exp(self.slope[0]) + self.slope[1],
-            reach + rest[..., 1] + IN_TIME * inputs.effort[..., 3],
-            clearance,
-            rest[..., 0] + inputs.effort @ self.linear,
-        )
-
-    def value(self, values: Values) -> Tensor:
-        """Return Q, shape (B, H)."""
-        clear = torch.sigmoid(values.clear)
-        success = clear * torch.sigmoid(values.arrives)
-        won, lost, missed, _ = self.scales
-        total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
-        return total + values.clearance + values.rest
-
-    def merit(self, values: Values) -> Tensor:
-        """Return Q where success is more likely than not, elsewhere less than any such Q, shape (B, H).
-
-        Where nothing is likely to succeed, Q prefers plans out of reach, which touch nothing as they are not carried
-        out. The probability of success counts there instead.
-        """
-        success = torch.sigmoid(values.clear) * torch.sigmoid(values.arrives)
-        merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
-        return merit
-
-    def _of_actions(self, plan: Tensor, scene: SceneInputs) -> Tensor:
-        """Return the margin from actions and obstacles, shape (B, H), [m]."""
-        plans, rows = plan.shape[1], scene.rows.shape[1]
-        pairs = torch.cat(
-            (
-                plan[:, :, None].expand(-1, -1, rows, -1),
-                scene.rows[:, None].expand(-1, plans, -1, -1),
-            ),
-            dim=-1,
-        )
-        values = self.pairs(pairs)
-        present = scene.present[:, None, :, None]
-        if self.pooled is not None:
-            summed = (values.relu() * present).sum(dim=2)
-            pooled: Tensor = 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
-            return pooled
-        far = torch.where(present, values, torch.full_like(values, 20.0))
-        margin: Tensor = 0.05 * far.amin(dim=(2, 3)) if rows else torch.ones_like(plan[..., 0])
-        return margin
+"""Number of instants at which plans are evaluated if the best of them are checked exactly."""
+POSITIONS = 1 << 16
+"""Planned positions that are computed together, so that temporary arrays stay in the cache."""
 
 
 class ViaQPolicy(BasePolicy):
-    """Choose the best of many candidates by a critic and, if wanted, by exact checks of the most promising ones.
+    """Policy that ranks candidates with a critic and can check the best ones with exact geometry.
 
     Args:
-        observation_space: Of the environment.
-        action_space: Of the environment.
-        lr_schedule: Learning rate against the progress that remains.
-        task: The environment's task as plain values, see :meth:`viapoint.envs.mdp.task.Task.as_dict`.
-        form: Input of the critic's pair networks: `places` or `action`.
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        lr_schedule: Learning rate as a function of the remaining progress.
+        task: Task of the environment as plain values, see :meth:`viapoint.envs.mdp.task.Task.as_dict`.
+        form: Input of the pair networks: `places`, the planned poses of the arm, or `action`.
         pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
-        heads: Networks for the action form, of which the minimum is taken.
-        width: Of the hidden layers of the pair networks; if not given, 32 for planned places where every link must
-            clear, 16 where the hand alone must, and 160 for the action itself.
-        instants: Instants of a plan at which the arm's planned places are taken; if not given, 16 where every link
-            must clear, and 32 where the hand alone must.
-        candidates: Actions that are spread evenly over the action space (Sobol points).
+        heads: Number of outputs for the form `action`, of which the minimum is taken.
+        width: Width of the hidden layers of the pair networks. The default is 32 if every link must clear obstacles,
+            16 if only the hand must, and 160 for the form `action`.
+        instants: Instants of a plan at which the pair networks are evaluated. The default is 16 if every link must
+            clear obstacles, and 32 if only the hand must.
+        candidates: Number of Sobol points in the action space.
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
-        checks: How many of the most promising candidates are checked by exact geometry; 0 for none.
+        checks: Number of highest-ranked candidates that exact geometry checks; 0 for none.
     """
 
     def __init__(
@@ -299,7 +122,7 @@ class ViaQPolicy(BasePolicy):
         }
 
     def scene(self, observation: Observation) -> SceneInputs:
-        """Return what the critic sees of B scenes, whatever the plan."""
+        """Return the inputs of the critic that depend on B scenes only."""
         ends, rows, present = seen_from_line(observation, self.task)
         parts = None
         if self.settings["form"] == "places" and "obstacles" in observation:
@@ -328,7 +151,7 @@ class ViaQPolicy(BasePolicy):
             observation: Parts of B observations, shape (B, .) each.
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
-            shares: Shares of the duration at which the arm's planned places are taken; those of training if not given.
+            shares: Fractions of the duration at which the pair networks are evaluated; those of training if not given.
         """
         shares = self.shares if shares is None else shares
         moves = planned(observation, actions, self.task, shares)
@@ -352,18 +175,20 @@ class ViaQPolicy(BasePolicy):
         scene: SceneInputs | None = None,
         shares: Numbers | None = None,
     ) -> Numbers:
-        """Return the critic's merit of H actions in each of B scenes, shape (B, H): Q, but where success is unlikely.
+        """Return the ranking criterion of H actions in each of B scenes, shape (B, H); see :meth:`ViaQCritic.merit`.
 
-        On the way the first action, which keeps the plan, is worth KEEP more: a plan is not revised for less.
+        In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
         """
-        values: Numbers = self.critic.merit(self.critic(self.inputs(observation, actions, scene, shares))).numpy()
+        values: Numbers = self.critic.merit(
+            self.critic(self.inputs(observation, actions, scene, shares))
+        ).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
 
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
-        """Return candidates, shape (B, N, m), the first of them the zero action, and their merits, shape (B, N)."""
-        block = max(PLACES // (self.candidates * self.instants), 1)
+        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero."""
+        block = max(POSITIONS // (self.candidates * self.instants), 1)
         number = len(observation["hand"])
         if number > block:
             pieces = [self.propose(part(observation, slice(i, i + block))) for i in range(0, number, block)]
@@ -381,7 +206,7 @@ class ViaQPolicy(BasePolicy):
 
     def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
         """Return candidates around the best ones, shape (B, per_refinement, m)."""
-        best = min(BEST, actions.shape[1])
+        best = min(N_ELITES, actions.shape[1])
         top = np.argpartition(-values, best - 1, axis=1)[:, :best]
         chosen = np.take_along_axis(actions, top[..., None], axis=1)
         steps = normal_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
@@ -399,11 +224,11 @@ class ViaQPolicy(BasePolicy):
         return np.asarray(checked[rows, worth.argmax(axis=1)])
 
     def _promising(self, values: Numbers) -> NDArray[np.intp]:
-        """Return indices of the candidates to check, shape (B, checks), from their Q, shape (B, N).
+        """Return indices of the candidates to check, shape (B, checks), for ranking criteria of shape (B, N).
 
-        Refined candidates resemble each other, so at least half are the best of those that are spread evenly.
+        Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
         """
-        if self.replanning:  # keeping the plan is always the first of them
+        if self.replanning:  # the action that keeps the plan is always checked
             values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
         count = min(self.checks, values.shape[1])
         refined = min(count // 2, values.shape[1] - self.candidates)
@@ -421,11 +246,11 @@ class ViaQPolicy(BasePolicy):
         return torch.from_numpy(np.ascontiguousarray(self.decide(arrays), dtype=np.float32))
 
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Return actions for one observation or a batch, as SB3's policies do.
+        """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
 
         Raises:
             ValueError: The observation is not a dict with the parts of the observation space, is not finite, or the
-                hand is in the goal already, to which there is no movement.
+                hand is at the goal already.
         """
         if not isinstance(observation, tuple):
             self._check_parts(observation)
@@ -445,11 +270,11 @@ class ViaQPolicy(BasePolicy):
                 raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
         apart = np.asarray(observation["goal"]) != np.asarray(observation["hand"])
         if not self.replanning and not apart.any(axis=-1).all():
-            raise ValueError("hand and goal must be apart: where they are the same there is no movement")
+            raise ValueError("hand and goal must differ: no movement leads from a point to itself")
 
 
 def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
-    """Return the planned poses of the arm's bodies for paths of the hand, shape (B, H, T, D), [m]."""
+    """Return the planned poses of the arm for paths of the hand, shape (B, H, T, D), [m]."""
     if not task.whole_arm:
         return Poses(_tensor(np.moveaxis(path, -1, 0)[None]), None, _tensor(time))
     links = np.asarray(task.arm.links(task.arm.inverse_kinematics(path)))
@@ -463,8 +288,9 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
     """Return ends, obstacle rows and their presence in the frame of the line from hand to goal.
 
     Returns:
-        Start, goal, distance and, on the way, the present motion, shape (B, E); rows of centre, half-axis, radius and,
-        on the way, velocity, shape (B, n, F); presence, shape (B, n). Numbers are of order one.
+        Start, goal, distance and, in replanning tasks, the present motion, shape (B, E); rows of centre, half-axis,
+        radius and, in replanning tasks, velocity, shape (B, n, F); presence, shape (B, n). Lengths are scaled to
+        order one.
     """
     start, goal, line = observation["hand"], observation["goal"], direction(observation)
     axes = np.stack(frame(line), axis=-1)
@@ -480,7 +306,7 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
     rows = task.observation.obstacles(observation["obstacles"])
     centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
     half = rows.half_axis @ axes
-    half = np.where(half[..., 1:2] < 0.0, -half, half)  # a capsule has no sense of direction
+    half = np.where(half[..., 1:2] < 0.0, -half, half)  # the sign of a half-axis has no meaning
     seen = [5.0 * centre, 5.0 * half, 5.0 * rows.radius[..., None]]
     if is_replanning(observation):
         seen.append(3.0 * observation["obstacle_velocities"].reshape(centre.shape) @ axes)
@@ -488,12 +314,12 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
 
 
 def instants_of(number: int) -> NDArray[np.float32]:
-    """Return shares of a movement's duration, shape (number,), closer together where the hand is fast."""
+    """Return fractions of the duration of a movement, shape (number,), denser where the hand is fast."""
     share = np.linspace(0.0, 1.0, 2001)
     gone = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     return np.interp((np.arange(number) + 0.5) / number, 0.7 * gone + 0.3 * share, share).astype(np.float32)
 
 
 def _tensor(values: Any) -> Tensor:
-    """Return a tensor of single precision; constants that many calls share are copied."""
+    """Return a single-precision tensor; read-only arrays are copied."""
     return torch.from_numpy(np.require(values, dtype=np.float32, requirements=["C", "W"]))

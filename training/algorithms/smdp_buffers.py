@@ -1,14 +1,14 @@
-r"""Discounting by time, for decisions of different length.
+r"""Replay and rollout buffers that discount by elapsed time (semi-Markov decision processes).
 
-What follows a decision that took tau seconds counts gamma^(tau / unit), so that a plan is worth the same however finely
-it is cut into decisions (semi-Markov decision processes: Bradtke & Duff 1995, *Reinforcement learning methods for
+The value after a decision that took tau seconds is discounted by gamma^(tau / unit), so the value of a plan does not
+depend on the number of decisions that execute it (Bradtke & Duff 1995, *Reinforcement learning methods for
 continuous-time Markov decision problems*; Sutton, Precup & Singh 1999, *Between MDPs and semi-MDPs*). The reward of a
-decision counts fully, as if it were paid where the decision begins:
+decision is not discounted, as if it were paid when the decision begins:
 
     V(s_k) = E[r_k + gamma^(tau_k / unit) V(s_k+1)]
 
-The algorithms of Stable-Baselines3 take these buffers as they are. SAC, TD3 and TQC find the discount of each sample in
-it. PPO and A2C hand no infos to their buffer, so :class:`ElapsedTimeCallback` must be among the callbacks of `learn`:
+The algorithms of Stable-Baselines3 accept these buffers unchanged. SAC, TD3 and TQC read the discount of each sample
+from the buffer. PPO and A2C pass no infos to their buffer, so `learn` needs :class:`ElapsedTimeCallback`:
 
     SAC("MlpPolicy", env, gamma=0.98, **timed(SAC, env.observation_space, gamma=0.98, unit=0.1)).learn(10_000)
     PPO("MlpPolicy", env, gamma=0.98, **timed(PPO, env.observation_space, gamma=0.98, unit=0.1)).learn(
@@ -40,14 +40,14 @@ from viapoint.training.config.discount import ELAPSED, TimeDiscount
 
 
 class TimedReplayBuffer(ReplayBuffer):
-    """A replay buffer whose samples carry the discount of the time that their decision took.
+    """Replay buffer whose samples contain the discount of the time that each decision took.
 
     Args:
-        *args: Of :class:`stable_baselines3.common.buffers.ReplayBuffer`.
-        gamma: The algorithm's, the discount of one unit of time.
-        unit: [s].
-        key: Of the infos, where they tell the elapsed time [s].
-        **kwargs: As `args`; `optimize_memory_usage` is not supported.
+        *args: Arguments of :class:`stable_baselines3.common.buffers.ReplayBuffer`.
+        gamma: Discount of one unit of time; the `gamma` of the algorithm.
+        unit: Length of the unit of time, [s].
+        key: Key of `info` that holds the elapsed time, [s].
+        **kwargs: Keyword arguments of the same class; `optimize_memory_usage` is not supported.
 
     Raises:
         ValueError: See :class:`TimeDiscount`.
@@ -63,12 +63,12 @@ class TimedReplayBuffer(ReplayBuffer):
     def add(
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
     ) -> None:
-        """Keep a transition of every environment; see :meth:`TimeDiscount.of` for errors."""
+        """Add one transition of each environment; see :meth:`TimeDiscount.of` for errors."""
         self.discounts[self.pos] = self.time_discount.of(infos)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _get_samples(self, batch_inds: NDArray[Any], env: Any = None) -> Any:
-        """As SB3's, with the same draws, and with discounts."""
+        """Return samples with discounts, drawn with the same random numbers as in SB3."""
         at = batch_inds, np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002 - as SB3
         ended = self.dones[at] * (1.0 - self.timeouts[at])
         columns = {"dones": ended, "rewards": self._normalize_reward(self.rewards[at], env)}
@@ -83,7 +83,7 @@ class TimedReplayBuffer(ReplayBuffer):
         )
 
     def _tensors(self, stored: Any, at: Any, env: Any) -> Any:
-        """Observations, or each part of them."""
+        """Return observations, or each part of a dictionary of them, as tensors."""
         several = isinstance(stored, dict)
         chosen: Any = {name: part[at] for name, part in stored.items()} if several else stored[at]
         chosen = self._normalize_obs(chosen, env)
@@ -93,25 +93,25 @@ class TimedReplayBuffer(ReplayBuffer):
 
 
 class TimedDictReplayBuffer(TimedReplayBuffer, DictReplayBuffer):
-    """The same for observations that are dictionaries."""
+    """Replay buffer that discounts by elapsed time, for observations that are dictionaries."""
 
 
 class TimedRolloutBuffer(RolloutBuffer):
-    """A rollout buffer whose returns and advantages discount by time; needs :class:`ElapsedTimeCallback`.
+    """Rollout buffer whose returns and advantages discount by elapsed time; needs :class:`ElapsedTimeCallback`.
 
     With d_k = gamma^(tau_k / unit),
 
         A_k = r_k + d_k V(s_k+1) - V(s_k) + lambda d_k A_k+1
 
-    Lambda counts decisions, not seconds: it says how much to trust the critic over sampled rewards, whose noise grows
-    with the number of decisions drawn. With 1 nothing of the critic but the last value remains, with 0 its judgement
-    after one decision, however long that took.
+    Lambda counts decisions, not seconds. It weighs the critic against sampled rewards, whose variance grows with the
+    number of decisions. With 1 only the value after the last decision comes from the critic; with 0 the advantage is
+    the one-decision temporal difference.
 
     Args:
-        *args: Of :class:`stable_baselines3.common.buffers.RolloutBuffer`.
-        unit: [s]; gamma, which the algorithm hands over, is the discount of one.
-        key: Of the infos, where they tell the elapsed time [s].
-        **kwargs: As `args`.
+        *args: Arguments of :class:`stable_baselines3.common.buffers.RolloutBuffer`.
+        unit: Length of the unit of time that `gamma` discounts, [s].
+        key: Key of `info` that holds the elapsed time, [s].
+        **kwargs: Keyword arguments of the same class.
 
     Raises:
         ValueError: See :class:`TimeDiscount`.
@@ -122,24 +122,25 @@ class TimedRolloutBuffer(RolloutBuffer):
         self.time_discount = TimeDiscount(gamma=self.gamma, unit=unit, key=key)
 
     def reset(self) -> None:
-        """Forget the last rollout."""
+        """Clear the buffer for the next rollout."""
         super().reset()
         self.discounts = np.ones((self.buffer_size, self.n_envs), dtype=np.float32)
         self._told: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
     def tell(self, infos: Sequence[Mapping[str, Any]], rewards: NDArray[np.float32]) -> None:
-        """Note what the next :meth:`add` is not told.
+        """Store infos and rewards that the next call of :meth:`add` needs and does not receive.
 
         Args:
-            infos: Of N environments.
-            rewards: As the environments paid them, shape (N,).
+            infos: Infos of N environments.
+            rewards: Rewards of the environments, shape (N,).
         """
         self._told = self.time_discount.of(infos), rewards.copy()
 
     def add(self, obs: Any, action: Any, reward: Any, *args: Any, **kwargs: Any) -> None:
-        """Keep a transition of every environment.
+        """Add one transition of each environment.
 
-        Where an episode was cut off, SB3 has added gamma times the value of what was left; that is discounted anew.
+        SB3 adds gamma times the value of the final observation to the reward of a truncated episode; this method
+        replaces gamma by the discount of the elapsed time.
 
         Raises:
             ValueError: :meth:`tell` was not called before.
@@ -153,11 +154,11 @@ class TimedRolloutBuffer(RolloutBuffer):
         super().add(obs, action, paid + (reward - paid) * (discounts / self.gamma), *args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: NDArray[np.bool_]) -> None:
-        """Fill in returns and advantages once the rollout is complete.
+        """Compute returns and advantages of a complete rollout.
 
         Args:
-            last_values: Of the observations after it, N of them.
-            dones: Whether its last decision ended an episode, shape (N,).
+            last_values: Values of the observations after the rollout, N of them.
+            dones: Mask of environments whose last decision ended an episode, shape (N,).
         """
         last = last_values.detach().cpu().numpy().reshape(1, -1)
         following = np.concatenate((self.values[1:], last))
@@ -172,11 +173,11 @@ class TimedRolloutBuffer(RolloutBuffer):
 
 
 class TimedDictRolloutBuffer(TimedRolloutBuffer, DictRolloutBuffer):
-    """The same for observations that are dictionaries."""
+    """Rollout buffer that discounts by elapsed time, for observations that are dictionaries."""
 
 
 class ElapsedTimeCallback(BaseCallback):
-    """Hands the infos of each step on to a :class:`TimedRolloutBuffer`; does nothing with other buffers."""
+    """Callback that passes the infos of each step to a :class:`TimedRolloutBuffer`; it ignores other buffers."""
 
     def _on_step(self) -> bool:
         buffer = self.locals.get("rollout_buffer")
@@ -193,14 +194,14 @@ def timed(
     unit: float,
     key: str = ELAPSED,
 ) -> dict[str, Any]:
-    """Arguments that make an algorithm of Stable-Baselines3 discount by time.
+    """Return the arguments that make an algorithm of Stable-Baselines3 discount by elapsed time.
 
     Args:
-        algorithm: Its class.
-        observation_space: Of the environment.
-        gamma: The algorithm's, the discount of one unit of time.
-        unit: [s].
-        key: Of the infos, where they tell the elapsed time [s].
+        algorithm: Class of the algorithm.
+        observation_space: Observation space of the environment.
+        gamma: Discount of one unit of time; the `gamma` of the algorithm.
+        unit: Length of the unit of time, [s].
+        key: Key of `info` that holds the elapsed time, [s].
 
     Raises:
         ValueError: See :class:`TimeDiscount`.
@@ -215,7 +216,7 @@ def timed(
 
 
 def unit_of(model: BaseAlgorithm) -> float | None:
-    """The unit [s] by which a model discounts; None where it discounts by decisions."""
+    """Return the unit of time by which a model discounts, [s]; None if it discounts by decisions."""
     buffer = getattr(model, "replay_buffer", None) or getattr(model, "rollout_buffer", None)
     discount = getattr(buffer, "time_discount", None)
     return None if discount is None else float(discount.unit)

@@ -1,9 +1,8 @@
 """Q-learning over candidate plans, with a critic that is a minimum over obstacles.
 
-An algorithm on Stable-Baselines3's :class:`OffPolicyAlgorithm`. There is no actor: the policy evaluates many candidate
-actions with the critic and takes the best (as QT-Opt does: Kalashnikov et al. 2018, arXiv 1806.10293). The critic is
-regressed on the terms of the environment's reward, each of which `info` tells; it never computes a distance to an
-obstacle.
+The algorithm extends :class:`OffPolicyAlgorithm` of Stable-Baselines3. There is no actor: the policy evaluates many
+candidate actions with the critic and takes the best one, as QT-Opt does (Kalashnikov et al. 2018, arXiv 1806.10293).
+The critic is regressed on the terms of the reward that `info` reports; training computes no distance to an obstacle.
 """
 
 from __future__ import annotations
@@ -24,44 +23,45 @@ from torch.nn import functional
 from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.mdp.task import Task
+from viapoint.training.algorithms.critic import Values
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
-from viapoint.training.algorithms.policy import KEEP, Values, ViaQPolicy
+from viapoint.training.algorithms.policy import KEEP, ViaQPolicy
 from viapoint.training.config.checks import PARTICULAR, check_hyperparameters, check_via_policy
 from viapoint.training.search.candidates import candidate_actions
 
 OWN = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
-"""Settings that other off-policy algorithms do not have."""
-BOUND = ("arm", "whole_arm", "action")
-"""Parts of a task that an agent cannot do without: it plans with them."""
+"""Hyperparameters that other off-policy algorithms do not have."""
+FIXED_PARTS = ("arm", "whole_arm", "action")
+"""Parts of the task that agent and environment must share, because the policy plans with them."""
 CLEARANCE_SCALE = 0.4
-"""Error of the clearance term that counts one, as a share of the term's weight: 2 cm."""
-KEPT = 0.5
-"""Share of random decisions on the way that keep the plan."""
+"""Unit of errors of the clearance term, as a share of the weight of the term: 2 cm."""
+KEEP_PROBABILITY = 0.5
+"""Probability that a random decision in a replanning task keeps the plan."""
 CONTACT_WEIGHT = 0.1
-"""Weight of the loss for contact beside that for clearance, which tells the same more finely."""
+"""Weight of the contact loss; the clearance loss carries finer information on the same event."""
 
 
 class ViaQ(OffPolicyAlgorithm):
-    """Off-policy learner of via-points that ranks candidate plans.
+    """Off-policy algorithm that chooses via-points by ranking candidate plans.
 
     Args:
         policy: `ViaQPolicy`.
-        env: An environment of this package whose actions are whole movements, or many of them.
-        learning_rate: A number, or a function of the progress that remains.
-        buffer_size: Decisions that are kept.
-        learning_starts: Decisions taken at random before anything is learned.
-        batch_size: Decisions of an update.
-        gamma: Discount of what follows a decision; without effect where an episode is one decision.
+        env: Environment or vector environment of this package whose actions are whole movements.
+        learning_rate: Learning rate, or a function of the remaining progress.
+        buffer_size: Capacity of the replay buffer, in decisions.
+        learning_starts: Number of random decisions before the first update.
+        batch_size: Decisions in each update.
+        gamma: Discount of the value after a decision; without effect if an episode is one decision.
         gradient_steps: Updates after each step of all environments.
-        explore_uniformly: Share of decisions that are random later on.
-        temperature: Difference of Q that makes one candidate e times as likely as another.
+        explore_uniformly: Probability of a random action after `learning_starts`.
+        temperature: Temperature of the softmax of Q over candidates.
         explore_candidates: Candidates of each decision during training.
         next_candidates: Candidates over which the value of the next observation is maximised.
-        policy_kwargs: Arguments of :class:`ViaQPolicy`; the task is asked of `env`.
+        policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
         **kwargs: Arguments of :class:`OffPolicyAlgorithm`.
 
     Raises:
-        ValueError: A setting is out of range, or the environment lacks what the algorithm needs.
+        ValueError: A hyperparameter is out of range, or the environment has no task of this package.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaQPolicy": ViaQPolicy}
@@ -122,10 +122,10 @@ class ViaQ(OffPolicyAlgorithm):
         self.actor = self.policy
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """Set the environment to learn on.
+        """Set the training environment.
 
         Raises:
-            ValueError: The environment does not fit the agent.
+            ValueError: Spaces, arm, action or kind of clearance differ from those of the agent.
         """
         wrapped = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
@@ -143,10 +143,10 @@ class ViaQ(OffPolicyAlgorithm):
         mine, theirs = (
             task.as_dict() for task in (Task.from_dict(self.policy_kwargs["task"], ARMS), task_of(env))
         )
-        others = [name for name in BOUND if mine[name] != theirs[name]]
+        others = [name for name in FIXED_PARTS if mine[name] != theirs[name]]
         if others:
             raise ValueError(
-                f"the environment must have the {', '.join(others)} that the agent was made for: "
+                f"the environment must have the same {', '.join(others)} as the agent: "
                 f"{ {name: mine[name] for name in others} }, got { {name: theirs[name] for name in others} }"
             )
         normalized = unwrap_vec_normalize(env)
@@ -177,7 +177,7 @@ class ViaQ(OffPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
-        """Return the losses of the critic's predictions, by name."""
+        """Return the losses of the predictions of the critic by name."""
         policy, critic = self.policy, self.policy.critic
         inputs = policy.inputs(batch.observations, batch.actions[:, None])
         if policy.replanning:
@@ -210,10 +210,10 @@ class ViaQ(OffPolicyAlgorithm):
         return losses
 
     def _clearance_loss(self, predicted: Tensor, outcomes: Outcomes, known: Tensor) -> Tensor:
-        """Return the loss of the clearance of what was carried out.
+        """Return the loss of the predicted clearance of the executed part of each plan.
 
-        Where an earlier decision of the episode came nearer to an obstacle, this one was no nearer: then only a
-        prediction below that counts.
+        The environment reports the lowest clearance of the episode so far. If an earlier decision set it, it is a lower
+        bound for this decision, and only predictions below it count as errors.
         """
         scale = CLEARANCE_SCALE * max(float(self.policy.task.weights.clearance), 1e-3)
         apart = (predicted - outcomes.clearance) / scale
@@ -224,7 +224,7 @@ class ViaQ(OffPolicyAlgorithm):
 
     @torch.no_grad()
     def _following(self, batch: OutcomeSamples) -> Values | None:
-        """Return the target critic's predictions for the best of a few candidates after each decision."""
+        """Return the predictions of the target critic for the best of a few candidates after each decision."""
         policy, critic = self.policy, self.policy.critic_target
         if critic is None or not self.gamma:
             return None
@@ -241,11 +241,11 @@ class ViaQ(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return random actions at first and for some environments always, for the others one of the candidates."""
+        """Sample actions: uniform ones at first and for some environments, otherwise candidates by their softmax."""
         size = self.policy.task.action.size
         uniform = np.random.uniform(-1.0, 1.0, (n_envs, size)).astype(np.float32)  # noqa: NPY002 - seeded by SB3
-        if self.policy.replanning:  # a plan that is revised at random in every decision hardly ever arrives
-            uniform[np.random.uniform(size=n_envs) < KEPT] = 0.0  # noqa: NPY002
+        if self.policy.replanning:  # random revisions at every decision hardly ever reach the goal
+            uniform[np.random.uniform(size=n_envs) < KEEP_PROBABILITY] = 0.0  # noqa: NPY002
         if self.num_timesteps < learning_starts:
             return uniform, uniform
         observation: Any = self._last_obs
@@ -253,7 +253,7 @@ class ViaQ(OffPolicyAlgorithm):
         candidates[:, 0] = 0.0
         candidates = candidates.astype(np.float32)
         values = self.policy.values(observation, candidates) / self.temperature
-        # The maximum of values plus Gumbel noise is distributed as their softmax.
+        # The argmax of values plus Gumbel noise is a sample of their softmax (Gumbel-max trick).
         noisy = values + np.random.gumbel(size=values.shape)  # noqa: NPY002
         chosen = candidates[np.arange(n_envs), noisy.argmax(axis=1)]
         explore = np.random.uniform(size=(n_envs, 1)) < self.explore_uniformly  # noqa: NPY002
@@ -271,7 +271,7 @@ def task_of(env: VecEnv) -> Task:
     """Return the task of an environment whose actions are whole movements.
 
     Raises:
-        ValueError: The environment is not one of this package, or an action is less than a movement.
+        ValueError: The environment is not of this package, or an action lasts one control step.
     """
     try:
         task = env.get_attr("task", indices=0)[0]
@@ -280,13 +280,13 @@ def task_of(env: VecEnv) -> Task:
     if not isinstance(task, Task) or isinstance(task.weights, StepRewardWeights):
         raise ValueError(
             "ViaQ needs an environment of this package in which an action is a whole movement, such as "
-            f"viapoint/PlanarObstacles-v0, got {env.observation_space} with {env.action_space}"
+            f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
         )
     return task
 
 
 def _mean(losses: Tensor, counted: Tensor) -> Tensor:
-    """Return the mean over all rows, with zero for those that do not count."""
+    """Return the mean over all rows, with zero for rows that are not counted."""
     return (losses * counted).mean()
 
 
@@ -295,5 +295,5 @@ def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with numbers of NumPy as those of Python."""
+    """Return settings with NumPy scalars converted to Python numbers."""
     return {name: each.item() if isinstance(each, np.generic) else each for name, each in settings.items()}
