@@ -102,7 +102,7 @@ def test_it_goes_on_in_other_scenes_of_its_task_only(made):
         ({"duration_range": (0.5, 2.0)}, "action"),
     ):
         env = model.get_env()
-        with pytest.raises(ValueError, match=f"must have the {part} that the agent was made for"):
+        with pytest.raises(ValueError, match=f"must have the same {part} as the agent"):
             model.set_env(made(**other))
         assert model.get_env() is env
     with pytest.raises(ValueError, match="Observation spaces do not match"):
@@ -202,7 +202,7 @@ def test_what_cannot_be_decided_on_is_named(learned):
         goal[1, 0] = value
         with pytest.raises(ValueError, match="observation must be finite; goal is"):
             policy.predict({**observation, "goal": goal})
-    with pytest.raises(ValueError, match="hand and goal must be apart"):
+    with pytest.raises(ValueError, match="hand and goal must differ"):
         policy.predict({**observation, "goal": observation["hand"]})
 
 
