@@ -109,7 +109,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         """What the components of an action mean on the way."""
         limit = (2 + self.changes.n_jumps[1]) * self.action_layout.duration_range[1] + SETTLING
         self._ends = DecisionEnds(
-            self.arm, whole_arm=self.task.whole_arm, timestep=self._simulator.timestep, triggers=decide_at,
+            self.task.collision_model, timestep=self._simulator.timestep, triggers=decide_at,
             horizon=horizon, margin=margin, time_limit=limit,
         )  # fmt: skip
         self.time_limit = float(self._ends.limit * self._simulator.timestep)
@@ -121,7 +121,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
 
     def _build(self) -> None:
         """Make what follows from the arguments: the observation, and what draws and carries out episodes."""
-        base, action, whole_arm = self.observation_layout, self.action_layout, self.task.whole_arm
+        base, action, collision_model = self.observation_layout, self.action_layout, self.task.collision_model
         self.observation_layout = OnlineObservationLayout(
             dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, n_via=action.n_via,
             time_limit=self.time_limit,
@@ -130,12 +130,12 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         shortest, longest = action.duration_range
         self._change_sampler = ChangeSampler(
-            self.arm, self.changes, whole_arm=whole_arm, durations=(shortest, action.centre_duration, longest)
+            collision_model, self.changes, durations=(shortest, action.centre_duration, longest)
         )
-        self._online = OnlineExecutor(self._simulator, self._beside, whole_arm=whole_arm)
+        self._online = OnlineExecutor(self._simulator, self._beside)
         self._episodes = OnlineEpisodes(
-            self.arm, self.num_envs, n_via=action.n_via, whole_arm=whole_arm,
-            timestep=self._simulator.timestep, most=self._ends.limit + 1,
+            collision_model, self.num_envs, n_via=action.n_via, timestep=self._simulator.timestep,
+            most=self._ends.limit + 1,
         )  # fmt: skip
 
     @property
@@ -270,7 +270,7 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
 
     def _check_changes(self, scenes: ChangingScenes) -> None:
         for wrong, reason in problems_of_changes(
-            scenes, self.arm, whole_arm=self.task.whole_arm, time_limit=self.time_limit
+            scenes, self.task.collision_model, time_limit=self.time_limit
         ):
             if wrong.any():
                 raise ValueError(f"scene {int(wrong.argmax())}: {reason(int(wrong.argmax()))}")

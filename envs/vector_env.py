@@ -125,14 +125,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._sampler = self.task.sampler()
         self._simulator = Simulator(
-            arm,
+            self.task.collision_model,
             n_obstacles=self.observation_layout.n_rows,
-            whole_arm=self.task.whole_arm,
             num_envs=self.num_envs,
             threads=threads,
         )
         self._beside = BackgroundWorker(threaded=threads != 1)
-        self._executor = Executor(self._simulator, self._beside, whole_arm=self.task.whole_arm)
+        self._executor = Executor(self._simulator, self._beside)
         self._generators: list[np.random.Generator] = []
         self.scenes: Scenes | None = None
         """The scenes of the running episodes; None before the first reset."""

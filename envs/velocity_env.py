@@ -132,9 +132,7 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         most = self.control_steps * self.steering.physics_steps
         self._weights = weights
-        self._episodes = StepEpisodes(
-            arm, self.num_envs, whole_arm=self.task.whole_arm, timestep=timestep, most=most
-        )
+        self._episodes = StepEpisodes(self.task.collision_model, self.num_envs, timestep=timestep, most=most)
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:

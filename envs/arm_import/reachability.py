@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.arm_import.mjcf_reader import BOUND, ParsedMjcf
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.ik_table import PostureMap, hand_pose, solve_map, solve_postures
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.serial_arm import RESERVE, SerialArm
@@ -312,7 +313,9 @@ def check_room(arm: SerialArm, box: Box) -> None:
     """
     wanted = SpaceDistribution(n_obstacles=(0, 0))
     try:
-        SpaceSampler(arm, wanted, whole_arm=True)([np.random.default_rng(seed) for seed in range(SCENES)])
+        SpaceSampler(CollisionModel(arm, whole_arm=True), wanted)(
+            [np.random.default_rng(seed) for seed in range(SCENES)]
+        )
     except RuntimeError:
         low, high = wanted.distance
         raise ValueError(

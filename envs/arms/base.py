@@ -1,11 +1,16 @@
-"""What the environment needs to know of an arm."""
+"""Interface of arms, and the collision model that environments, scenes and planners check."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import mujoco
+import numpy as np
 
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, clearance_profile, hand_clearance
+from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.primitives.array_api import Array
 
 
@@ -80,3 +85,71 @@ class Arm(Protocol):
 
         The references are those of T consecutive physics steps.
         """
+
+
+@dataclass(frozen=True)
+class CollisionModel:
+    """Bodies of an arm that must not touch obstacles: the hand alone, or every link as well.
+
+    Obstacles are rows (centre D, half-axis D, radius), [m]. Every clearance is in [m], negative for penetration and at
+    most :data:`~viapoint.envs.geometry.distance.MAX_CLEARANCE`.
+    """
+
+    arm: Arm
+    """Arm that moves."""
+    whole_arm: bool
+    """True if the links must clear the obstacles, too; False for the hand alone."""
+
+    def least_clearance(
+        self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
+    ) -> Float:
+        """Return the least clearance over time and obstacles, shape (N,).
+
+        Args:
+            hand: Hand positions, shape (N, T, D), [m].
+            obstacles: Obstacles at rest, shape (N, n, 2 D + 1), [m].
+            present: True for rows that are obstacles, shape (N, n).
+            joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
+        """
+        if not obstacles.shape[1]:
+            return np.full(len(hand), MAX_CLEARANCE)
+        arm = self.arm
+        links: Any = None
+        if self.whole_arm:
+            links = arm.links(arm.inverse_kinematics(hand) if joints is None else joints)
+            if arm.traced:
+                return nearest_approach(ends_of(np.asarray(links)), arm.link_radii, obstacles, present)
+        each = hand_clearance(hand, arm.hand_radius, obstacles, present)
+        if links is not None:
+            each = np.minimum(each, arm_clearance(links, arm.link_radii, obstacles, present))
+        return np.asarray(each.min(axis=-1))
+
+    def clearance_profile(
+        self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
+    ) -> Float:
+        """Return the clearance from each obstacle, which may move, at each time, shape (N, T, n).
+
+        Args:
+            hand: Hand positions, shape (N, T, D), [m].
+            obstacles: Obstacles at these times, shape (N, T, n, 2 D + 1), [m].
+            present: True for rows that are obstacles, shape (N, n).
+            joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
+        """
+        number, times, most = obstacles.shape[:3]
+        if not obstacles.size or not present.any():
+            return np.full((number, times, most), MAX_CLEARANCE)
+        arm = self.arm
+        links, radius = None, arm.hand_radius
+        if self.whole_arm:
+            radius = arm.link_radii[-1] if arm.traced else radius  # a traced arm's last link ends in the hand
+            links = np.asarray(arm.links(arm.inverse_kinematics(hand) if joints is None else joints))
+            links = links.reshape(-1, 1, *links.shape[2:])
+        profile = clearance_profile(
+            hand.reshape(-1, 1, hand.shape[-1]),
+            radius,
+            obstacles.reshape(-1, *obstacles.shape[2:]),
+            np.repeat(present, times, axis=0),
+            links,
+            arm.link_radii,
+        )
+        return np.asarray(profile[..., 0].reshape(number, times, most))

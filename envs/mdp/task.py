@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import OF_ONES_OWN
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import RewardWeights
 from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
@@ -31,6 +32,11 @@ class Task:
     weights: RewardWeights
     scenes: AnyDistribution
 
+    @functools.cached_property
+    def collision_model(self) -> CollisionModel:
+        """Bodies of the arm that must not touch obstacles."""
+        return CollisionModel(self.arm, self.whole_arm)
+
     @property
     def observation(self) -> ObservationLayout:
         """The layout of the observation."""
@@ -39,8 +45,8 @@ class Task:
     def sampler(self) -> Sampler:
         """Draws scenes of the task."""
         if isinstance(self.scenes, SpaceDistribution):
-            return SpaceSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
-        return SceneSampler(self.arm, self.scenes, whole_arm=self.whole_arm)
+            return SpaceSampler(self.collision_model, self.scenes)
+        return SceneSampler(self.collision_model, self.scenes)
 
     def as_dict(self) -> dict[str, Any]:
         """The task as plain values, fit for JSON."""
@@ -94,6 +100,6 @@ def family_sampler(task: Task, family: str) -> Sampler:
         )
     if not isinstance(scenes, SceneDistribution):
         return dataclasses.replace(task, scenes=dataclasses.replace(scenes, families=(family,))).sampler()
-    placer = FamilyObstacles(task.arm, scenes, FAMILIES[family], whole_arm=task.whole_arm)
+    placer = FamilyObstacles(task.collision_model, scenes, FAMILIES[family])
     distribution = dataclasses.replace(scenes, n_obstacles=(1, ROWS))
-    return SceneSampler(task.arm, distribution, whole_arm=task.whole_arm, placer=placer, attempts=ATTEMPTS)
+    return SceneSampler(task.collision_model, distribution, placer=placer, attempts=ATTEMPTS)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, point_distance_squared
 from viapoint.envs.scenes.scene import Scenes
@@ -46,8 +46,9 @@ class Movement(NamedTuple):
     """The first contact."""
 
     @classmethod
-    def of(cls, arm: Arm, scene: Scenes, plan: Plan, rollout: Rollout, *, whole_arm: bool) -> Movement:
+    def of(cls, collision_model: CollisionModel, scene: Scenes, plan: Plan, rollout: Rollout) -> Movement:
         """The movement of one plan in one scene; both have one row."""
+        arm = collision_model.arm
         start = np.asarray(arm.inverse_kinematics(scene.start))
         joints = np.concatenate((start, rollout.joints))
         return cls(
@@ -55,21 +56,21 @@ class Movement(NamedTuple):
             vias=np.asarray(plan.waypoints).reshape(-1, arm.dimension)[1:-1],
             joints=joints,
             hand=np.concatenate((scene.start, rollout.hand)),
-            touch=first_touch(arm, scene, joints, rollout.contact, whole_arm=whole_arm),
+            touch=first_touch(collision_model, scene, joints, rollout.contact),
         )
 
 
 def first_touch(
-    arm: Arm, scene: Scenes, joints: Float, contact: NDArray[np.bool_], *, whole_arm: bool
+    collision_model: CollisionModel, scene: Scenes, joints: Float, contact: NDArray[np.bool_]
 ) -> Touch | None:
     """What the arm touched first: the nearest part and obstacle where the physics first reports contact."""
     if not contact.any():
         return None
-    step = int(contact.argmax())
+    arm, step = collision_model.arm, int(contact.argmax())
     posture = joints[None, step : step + 1]
     rows, present = scene.obstacles, scene.present
     parts = [hand_clearance(np.asarray(arm.hand_position(posture)), arm.hand_radius, rows, present)]
-    if whole_arm:
+    if collision_model.whole_arm:
         links = np.asarray(arm.links(posture))
         for i, radius in enumerate(arm.link_radii):
             parts.append(arm_clearance(links[..., i : i + 1, :, :], (radius,), rows, present))

@@ -81,7 +81,7 @@ class MovementRenderer:
     def movement(self, sim: int, scene: Scenes, plan: Plan, rollout: Rollout) -> Any:
         """The movement."""
         stage = self._ready()
-        movement = Movement.of(stage.arm, scene, plan, rollout, whole_arm=stage.whole_arm)
+        movement = Movement.of(self._simulator.collision_model, scene, plan, rollout)
         steps = frame_steps(rollout.time, self._fps)
         if self.mode == "human":
             return self._play(stage, scene, movement, steps)

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.distance import MAX_CLEARANCE, clearance_profile
 from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
 
 MOST_JUMPS = 4
@@ -106,14 +105,13 @@ class ChangingScenes(NamedTuple):
 
 
 def problems_of_changes(
-    scenes: ChangingScenes, arm: Arm, *, whole_arm: bool, time_limit: float
+    scenes: ChangingScenes, collision_model: CollisionModel, *, time_limit: float
 ) -> Iterator[Problem]:
     """Everything that can be wrong with what will become of N scenes that are sound at the start.
 
     Args:
         scenes: To look at.
-        arm: Whose hand shall reach the targets.
-        whole_arm: Whether its links count.
+        collision_model: Arm that must reach the targets.
         time_limit: After which nothing happens, [s].
     """
     d = scenes.start.shape[-1]
@@ -134,7 +132,7 @@ def problems_of_changes(
         yield _first(scenes.present & (speed > FASTEST), speed, "course", f"m/s is faster than {FASTEST} m/s")
     for k in range(scenes.jumps.shape[1]):
         goal = np.where(given[:, k, None], scenes.jumps[:, k, 1:], scenes.goal)
-        margin = np.asarray(arm.reach_margin(goal))
+        margin = np.asarray(collision_model.arm.reach_margin(goal))
         yield (
             given[:, k] & (margin < 0.0),
             lambda i, k=k, m=margin: (  # type: ignore[misc]
@@ -142,7 +140,7 @@ def problems_of_changes(
             ),
         )
         then = scenes.at(np.where(given[:, k], scenes.jumps[:, k, 0], 0.0))
-        least = rest_clearance(then, goal, arm, whole_arm=whole_arm).min(axis=-1)
+        least = rest_clearance(then, goal, collision_model).min(axis=-1)
         yield (
             given[:, k] & (least <= 0.0),
             lambda i, k=k, c=least: (  # type: ignore[misc]
@@ -157,41 +155,3 @@ def _first(wrong: NDArray[np.bool_], values: Float, what: str, why: str) -> Prob
         np.asarray(wrong.any(axis=-1)),
         lambda i: f"{what} {wrong[i].argmax()} at {values[i, wrong[i].argmax()]:g} {why}",
     )
-
-
-def clearance_over_time(
-    arm: Arm,
-    hand: Float,
-    rows: Float,
-    present: NDArray[np.bool_],
-    *,
-    whole_arm: bool,
-    joints: Float | None = None,
-) -> Float:
-    """Clearance of the arm from each obstacle at each time, shape (N, T, n), [m]; at most MAX_CLEARANCE.
-
-    Args:
-        arm: That moves.
-        hand: Positions, shape (N, T, D), [m].
-        rows: Obstacles, shape (N, T, n, 2 D + 1), [m].
-        present: Whether a row is an obstacle, shape (N, n).
-        whole_arm: Whether the links count.
-        joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
-    """
-    number, times, most = rows.shape[:3]
-    if not rows.size or not present.any():
-        return np.full((number, times, most), MAX_CLEARANCE)
-    links, radius = None, arm.hand_radius
-    if whole_arm:
-        radius = arm.link_radii[-1] if arm.traced else radius  # there the last link ends in the hand
-        links = np.asarray(arm.links(arm.inverse_kinematics(hand) if joints is None else joints))
-        links = links.reshape(-1, 1, *links.shape[2:])
-    profile = clearance_profile(
-        hand.reshape(-1, 1, hand.shape[-1]),
-        radius,
-        rows.reshape(-1, *rows.shape[2:]),
-        np.repeat(present, times, axis=0),
-        links,
-        arm.link_radii,
-    )
-    return np.asarray(profile[..., 0].reshape(number, times, most))

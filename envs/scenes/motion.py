@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.planar_draws import Uniforms, between
@@ -64,21 +64,19 @@ class ChangeSampler:
     """Draws what will become of scenes, each from a generator of its own.
 
     Args:
-        arm: Whose hand moves.
+        collision_model: Arm that moves.
         distribution: What becomes of scenes.
-        whole_arm: Whether the links count.
         durations: Shortest, centre and longest duration of a movement, [s].
     """
 
     def __init__(
         self,
-        arm: Arm,
+        collision_model: CollisionModel,
         distribution: ChangeDistribution,
         *,
-        whole_arm: bool,
         durations: tuple[float, float, float],
     ) -> None:
-        self.arm, self.distribution, self.whole_arm = arm, distribution, whole_arm
+        self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
         self._shortest, self._centre, self._longest = durations
 
     def __call__(
@@ -198,9 +196,7 @@ class ChangeSampler:
         )
         then = scenes.at(time)
         many = Scenes(*(np.repeat(field, CANDIDATES, axis=0) for field in then))
-        clearance = rest_clearance(
-            many, targets.reshape(-1, targets.shape[-1]), self.arm, whole_arm=self.whole_arm
-        )
+        clearance = rest_clearance(many, targets.reshape(-1, targets.shape[-1]), self.collision_model)
         free: Bool = inside & (clearance.min(axis=-1).reshape(inside.shape) > self.distribution.end_margin)
         return free
 
@@ -253,7 +249,7 @@ class ChangeSampler:
         for point, times in ((many.start, at_first), (many.goal, at_last)):
             rows = many.places(np.repeat(times[None], len(point), axis=0))
             scenes = Scenes(many.start, many.goal, rows.reshape(len(rows), -1, rows.shape[-1]))
-            clearance = rest_clearance(scenes, point, self.arm, whole_arm=self.whole_arm)[:, :-1]
+            clearance = rest_clearance(scenes, point, self.collision_model)[:, :-1]
             good &= (clearance.reshape(rows.shape[:3]) > d.end_margin).all(axis=1)
         return np.asarray(good)
 

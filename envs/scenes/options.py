@@ -37,7 +37,7 @@ def draw_given(
     Raises:
         ValueError: A scene is impossible, with the reason.
     """
-    arm, whole_arm, number = sampler.arm, sampler.whole_arm, len(generators)
+    collision_model, arm, number = sampler.collision_model, sampler.collision_model.arm, len(generators)
     nothing = Scenes(
         np.full((number, arm.dimension), np.nan),
         np.full((number, arm.dimension), np.nan),
@@ -45,20 +45,20 @@ def draw_given(
     )
     given = given_scenes(options, nothing, arm)
     with np.errstate(invalid="ignore"):
-        check_scenes(given, arm, whole_arm=whole_arm)  # comparisons with what is not given are false
+        check_scenes(given, collision_model)  # comparisons with what is not given are false
     if set(options) >= set(GIVEN):
         return given
     scenes = _drawn(options, sampler, generators, given)
     for _ in range(ATTEMPTS):
         wrong = np.zeros(number, dtype=bool)
-        for these, _ in problems(scenes, arm, whole_arm=whole_arm):
+        for these, _ in problems(scenes, collision_model):
             wrong |= these
         if not wrong.any() or "obstacles" not in options:
             break
         again = np.flatnonzero(wrong)
         some = {name: _rows(options[name], again, number, 2 + (name == "obstacles")) for name in options}
         scenes.put(again, _drawn(some, sampler, [generators[int(i)] for i in again], given.take(again)))
-    check_scenes(scenes, arm, whole_arm=whole_arm)
+    check_scenes(scenes, collision_model)
     return scenes
 
 
@@ -72,7 +72,7 @@ def _drawn(
         sampled = sampler(generators, (given.start, given.goal))
     except RuntimeError as error:
         raise ValueError(f"{error}; give the obstacles too, or ends farther inside the arm's reach") from None
-    return given_scenes(options, sampled, sampler.arm)
+    return given_scenes(options, sampled, sampler.collision_model.arm)
 
 
 def _rows(value: Any, rows: NDArray[np.int64], number: int, batched: int) -> Any:

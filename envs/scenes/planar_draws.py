@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import ActionLayout
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.types import Float
 
 ENDS, WITNESSES, PHASES = 16, 6, 40
@@ -80,23 +80,22 @@ def draw_ends(
 
 
 def draw_witness(
-    uniforms: Uniforms, arm: Arm, ends: tuple[Float, Float], reach_margin: float, *, whole_arm: bool
+    uniforms: Uniforms, collision_model: CollisionModel, ends: tuple[Float, Float], reach_margin: float
 ) -> tuple[FeasiblePath, NDArray[np.bool_]]:
     """Movements through one via-point inside the reach, and which of them are.
 
     Args:
         uniforms: 2 WITNESSES numbers are taken, 3 where links count.
-        arm: Whose hand moves.
+        collision_model: Arm that moves.
         ends: Starts and goals, shape (N, D) each, [m].
         reach_margin: How far inside the reach the hand stays, [m].
-        whole_arm: Whether links count.
     """
-    start, goal = ends
+    (start, goal), arm = ends, collision_model.arm
     layout = ActionLayout(dimension=arm.dimension)
     along = 1.6 * uniforms.take(WITNESSES) - 0.8
     side = 2.0 * uniforms.take(WITNESSES) - 1.0
     across = np.copysign(0.15 + 0.8 * np.abs(side), side)
-    if whole_arm:
+    if collision_model.whole_arm:
         across = np.where(
             uniforms.take(WITNESSES) < INWARD, np.abs(across) * _side_of_base(start, goal), across
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 from viapoint.envs.scenes.config import SceneDistribution
@@ -197,9 +197,12 @@ class FamilyObstacles:
 
     rows, size = ROWS, NUMBERS + 10 * CANDIDATES + CHOICES + 1 + 2 * ROWS
 
-    def __init__(self, arm: Arm, distribution: SceneDistribution, build: Builder, *, whole_arm: bool) -> None:
-        self._arm, self._distribution, self._build, self._whole_arm = arm, distribution, build, whole_arm
-        self._close = WholeArmObstacles(arm, distribution)
+    def __init__(
+        self, collision_model: CollisionModel, distribution: SceneDistribution, build: Builder
+    ) -> None:
+        self._arm, self._whole_arm = collision_model.arm, collision_model.whole_arm
+        self._distribution, self._build = distribution, build
+        self._close = WholeArmObstacles(self._arm, distribution)
 
     def __call__(self, uniforms: Uniforms, witness: FeasiblePath) -> tuple[Float, NDArray[np.bool_]]:
         """See :class:`~viapoint.envs.scenes.planar_hand.ObstacleSampler`."""

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.planar_arm import WholeArmObstacles
@@ -20,8 +20,7 @@ from viapoint.envs.scenes.scene import Scenes
 class Sampler(Protocol):
     """Draws scenes for an arm, each from a generator of its own."""
 
-    arm: Arm
-    whole_arm: bool
+    collision_model: CollisionModel
 
     def __call__(
         self, generators: Sequence[np.random.Generator], ends: tuple[Float, Float] | None = None
@@ -44,26 +43,23 @@ class SceneSampler:
     """Draws scenes for an arm, each from a generator of its own.
 
     Args:
-        arm: Whose hand moves.
+        collision_model: Arm that moves, and which of its bodies must clear.
         distribution: What scenes are like.
-        whole_arm: Whether every link must clear.
         placer: Puts the obstacles; by default as the distribution says.
         attempts: After how many nothing is found.
     """
 
     def __init__(
         self,
-        arm: Arm,
+        collision_model: CollisionModel,
         distribution: SceneDistribution,
         *,
-        whole_arm: bool,
         placer: ObstacleSampler | None = None,
         attempts: int = ATTEMPTS,
     ) -> None:
-        self.arm = arm
-        self.distribution = distribution
-        self.whole_arm = whole_arm
-        self._placer = placer or (WholeArmObstacles if whole_arm else HandObstacles)(arm, distribution)
+        self.collision_model, self.distribution = collision_model, distribution
+        kind = WholeArmObstacles if collision_model.whole_arm else HandObstacles
+        self._placer = placer or kind(collision_model.arm, distribution)
         self._attempts = attempts
 
     def __call__(
@@ -78,7 +74,7 @@ class SceneSampler:
         Raises:
             RuntimeError: No scene was found in many attempts, as with given ends in a corner of the reach.
         """
-        number, dimension = len(generators), self.arm.dimension
+        number, dimension = len(generators), self.collision_model.arm.dimension
         scenes = Scenes(
             np.zeros((number, dimension)),
             np.zeros((number, dimension)),
@@ -109,10 +105,8 @@ class SceneSampler:
         self, uniforms: Uniforms, ends: tuple[Float, Float] | None
     ) -> tuple[NDArray[np.bool_], Scenes]:
         """Scenes, and which of them are good."""
-        d = self.distribution
-        start, goal, good = draw_ends(uniforms, self.arm, d.distance, d.reach_margin, ends)
-        witness, reached = draw_witness(
-            uniforms, self.arm, (start, goal), d.reach_margin, whole_arm=self.whole_arm
-        )
+        d, arm = self.distribution, self.collision_model.arm
+        start, goal, good = draw_ends(uniforms, arm, d.distance, d.reach_margin, ends)
+        witness, reached = draw_witness(uniforms, self.collision_model, (start, goal), d.reach_margin)
         obstacles, placed = self._placer(uniforms, witness)
         return good & reached & placed, Scenes(start, goal, obstacles)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 
@@ -89,24 +89,24 @@ Problem = tuple[NDArray[np.bool_], Callable[[int], str]]
 """Which scenes have a fault, shape (N,), and the words for it in one of them."""
 
 
-def check_scenes(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> None:
+def check_scenes(scenes: Scenes, collision_model: CollisionModel) -> None:
     """Refuse a scene that no movement can start or end in.
 
     Raises:
         ValueError: With the scene, the offender and what is allowed.
     """
-    for wrong, reason in problems(scenes, arm, whole_arm=whole_arm):
+    for wrong, reason in problems(scenes, collision_model):
         if wrong.any():
             first = int(wrong.argmax())
             raise ValueError(f"scene {first}: {reason(first)}")
 
 
-def problems(scenes: Scenes, arm: Arm, *, whole_arm: bool) -> Iterator[Problem]:
+def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Problem]:
     """Everything that can be wrong with N scenes."""
-    yield from _problems_of_ends(scenes, arm)
+    yield from _problems_of_ends(scenes, collision_model.arm)
     yield from _problems_of_sizes(scenes)
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
-        clearance = rest_clearance(scenes, point, arm, whole_arm=whole_arm)
+        clearance = rest_clearance(scenes, point, collision_model)
         touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
         yield (
             least <= 0.0,
@@ -155,10 +155,11 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
         )
 
 
-def rest_clearance(scenes: Scenes, point: Float, arm: Arm, *, whole_arm: bool) -> Float:
+def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:
     """Clearance of the arm, its hand at rest at `point` (N, D), from n obstacles and one far away: (N, n + 1), [m]."""
+    arm = collision_model.arm
     hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
-    if whole_arm:
+    if collision_model.whole_arm:
         links = arm.links(arm.inverse_kinematics(point))[:, None]
         hand = np.minimum(hand, arm_clearance(links, arm.link_radii, scenes.obstacles, scenes.present))
     return np.concatenate(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import squared_length
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.scenes.config import BOARDS, FAMILIES, SpaceDistribution
@@ -41,10 +41,8 @@ IN_THE_WAY = 0.004
 class SpaceSampler:
     """Draws scenes for an arm that moves in space, each from a generator of its own."""
 
-    def __init__(self, arm: Arm, distribution: SpaceDistribution, *, whole_arm: bool) -> None:
-        self.arm = arm
-        self.distribution = distribution
-        self.whole_arm = whole_arm
+    def __init__(self, collision_model: CollisionModel, distribution: SpaceDistribution) -> None:
+        self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
         self._rows = distribution.n_obstacles[1]
         self._families = np.array(distribution.possible)
 
@@ -145,7 +143,7 @@ class SpaceSampler:
         """Which scenes get something in the way, shape (N,), and their obstacles, shape (N, rows, 7)."""
         (least, most), number = self.distribution.n_obstacles, len(start)
         general, hardness = u[0], u[0][:, :1] ** self.distribution.ease
-        swept = Swept.of(self.arm, path, whole_arm=self.whole_arm)
+        swept = Swept.of(self.collision_model, path)
         built = self._built(general[:, 1], _each(u[1], STRUCTURES), hardness, (start, goal, path), swept)
         fits = self._free(swept.outer, built)
         self._keep_blocking(fits, start, goal, built)
@@ -178,7 +176,11 @@ class SpaceSampler:
         for name in np.unique(names):
             some = names == name
             rows[some], retreat[some] = structure(
-                name, self.distribution, here.take(some), u[some, :, :NUMBERS], self.arm.hand_radius
+                name,
+                self.distribution,
+                here.take(some),
+                u[some, :, :NUMBERS],
+                self.arm.hand_radius,
             )
         rows, retreat = rows[:, :, :most], retreat[:, :, :most]
         enough = self.distribution.link_margin + 0.002
@@ -272,7 +274,7 @@ class SpaceSampler:
         if not len(left):
             return
         line = start[left, None] + (goal - start)[left, None] * np.linspace(0.0, 1.0, PHASES // 2)[:, None]
-        bodies = Swept.of(self.arm, line, whole_arm=self.whole_arm).outer
+        bodies = Swept.of(self.collision_model, line).outer
         while len(left):
             first = fits[left].argmax(axis=-1)
             depth = bodies.clearance(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
@@ -118,9 +118,10 @@ class Swept(NamedTuple):
     inner: Bodies
 
     @classmethod
-    def of(cls, arm: Arm, hand: Float, *, whole_arm: bool) -> Swept:
+    def of(cls, collision_model: CollisionModel, hand: Float) -> Swept:
         """Of an arm, or its hand alone, whose hand takes paths of shape (N, T, 3), [m]."""
-        if whole_arm:
+        arm = collision_model.arm
+        if collision_model.whole_arm:
             links, radii = np.asarray(arm.links(arm.inverse_kinematics(hand))), arm.link_radii
         else:
             links = np.stack((hand, hand + np.array([0.0, 0.0, LENGTH])), axis=-2)[:, :, None]

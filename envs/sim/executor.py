@@ -13,7 +13,7 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.background_worker import BackgroundWorker
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Outcome, add_terminal_metrics, empty_outcome, least_clearance, measure
+from viapoint.envs.sim.outcome import Outcome, add_terminal_metrics, empty_outcome, measure
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
 from viapoint.envs.sim.time_scaling import LOOK_EVERY, pace_of
 
@@ -81,10 +81,10 @@ class PendingExecution(NamedTuple):
 class Executor:
     """Carries out plans in a simulator, in groups of similar length so that short movements cost less."""
 
-    def __init__(self, simulator: Simulator, beside: BackgroundWorker, *, whole_arm: bool) -> None:
+    def __init__(self, simulator: Simulator, beside: BackgroundWorker) -> None:
         self.simulator = simulator
         self.arm = simulator.arm
-        self.whole_arm = whole_arm
+        self.collision_model = simulator.collision_model
         self._beside = beside
         self._groups: list[TrackingReferences] = []
         self._records: list[SimulationLog | None] = []
@@ -123,9 +123,7 @@ class Executor:
             for mine, theirs in zip(together, outcome, strict=True):
                 mine[group.sims] = theirs
         self.final_joints = self._final_joints(scenes)
-        together = add_terminal_metrics(
-            together, self.final_joints, scenes, self.arm, whole_arm=self.whole_arm
-        )
+        together = add_terminal_metrics(together, self.final_joints, scenes, self.collision_model)
         straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
         jerk_ratio = np.maximum(together.jerk_cost / straight, 1.0)
         return together._replace(duration=duration, jerk_ratio=jerk_ratio, stretch=stretch)
@@ -143,8 +141,8 @@ class Executor:
             joints, contact = record.joints[ran, :steps].copy(), record.contact[ran, :steps].copy()
         hand = np.asarray(self.arm.hand_position(joints))
         each = Scenes(*(np.repeat(field, steps, axis=0) for field in scene))
-        clearance = least_clearance(
-            self.arm, hand[:, None], each, whole_arm=self.whole_arm, joints=joints[:, None]
+        clearance = self.collision_model.least_clearance(
+            hand[:, None], each.obstacles, each.present, joints[:, None]
         )
         time = np.arange(1, steps + 1) * float(self.simulator.timestep)
         return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
@@ -172,7 +170,9 @@ class Executor:
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
             reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & within[rows],
             jerk_cost=np.asarray(trajectory.cost()),
-            clearance=least_clearance(self.arm, seen, scenes.take(rows), whole_arm=self.whole_arm),
+            clearance=self.collision_model.least_clearance(
+                seen, scenes.obstacles[rows], scenes.present[rows]
+            ),
         )
 
     def _final_joints(self, scenes: Scenes) -> Float:
@@ -200,8 +200,7 @@ class Executor:
                 group.steps[run],
                 group.planned[run],
                 scenes.take(group.rows).take(run),
-                self.arm,
-                whole_arm=self.whole_arm,
+                self.collision_model,
                 timestep=self.simulator.timestep,
             )
             for mine, theirs in zip(outcome, done, strict=True):

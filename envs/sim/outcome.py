@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.arrays import norm, squared_length
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
-from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
+from viapoint.envs.geometry.distance import MAX_CLEARANCE
+from viapoint.envs.geometry.narrow_phase import nearest_approach
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import SimulationLog
 
@@ -63,9 +63,8 @@ def measure(
     steps: NDArray[np.int64],
     planned: Float,
     scenes: Scenes,
-    arm: Arm,
+    collision_model: CollisionModel,
     *,
-    whole_arm: bool,
     timestep: float,
 ) -> Outcome:
     """The outcome of n movements that were carried out, all but what the plan alone decides.
@@ -75,10 +74,10 @@ def measure(
         steps: How many of them belong to each movement, shape (n,).
         planned: Hand position of the plan after each step, shape (n, T, D), [m].
         scenes: Where they took place.
-        arm: That moved.
-        whole_arm: Whether its links count.
+        collision_model: Arm that moved.
         timestep: Of the physics, [s].
     """
+    arm = collision_model.arm
     after = np.arange(record.joints.shape[1]) >= steps[:, None]
     last = np.arange(len(steps)), steps - 1
     joints, contact = record.joints, record.contact
@@ -97,7 +96,7 @@ def measure(
         is_success=arrived & ~collision & ~record.unstable & within.all(axis=(1, 2)),
         collision=collision,
         first_contact_time=np.where(collision, contact.argmax(axis=-1) * timestep, -1.0),
-        min_clearance=_measured_clearance(record, hand, joints, last, scenes, arm, whole_arm=whole_arm),
+        min_clearance=_measured_clearance(record, hand, joints, last, scenes, collision_model),
         goal_error=goal_error,
         path_length=_sum_in_order(moved),
         peak_speed=moved.max(axis=-1) / timestep,
@@ -125,18 +124,17 @@ def _measured_clearance(
     joints: Float,
     last: tuple[Any, Any],
     scenes: Scenes,
-    arm: Arm,
-    *,
-    whole_arm: bool,
+    collision_model: CollisionModel,
 ) -> Float:
     """Least clearance over all steps; of what the physics has recorded, before each of them."""
-    if record.traced is None or not whole_arm:
-        return least_clearance(arm, hand, scenes, whole_arm=whole_arm, joints=joints)
-    return nearest_approach(record.traced, arm.link_radii, scenes.obstacles, scenes.present, last[1])
+    if record.traced is None or not collision_model.whole_arm:
+        return collision_model.least_clearance(hand, scenes.obstacles, scenes.present, joints)
+    radii = collision_model.arm.link_radii
+    return nearest_approach(record.traced, radii, scenes.obstacles, scenes.present, last[1])
 
 
 def add_terminal_metrics(
-    outcome: Outcome, joints: Float, scenes: Scenes, arm: Arm, *, whole_arm: bool
+    outcome: Outcome, joints: Float, scenes: Scenes, collision_model: CollisionModel
 ) -> Outcome:
     """The outcome of N movements with what belongs to where the arms ended, looked at for all of them together.
 
@@ -147,15 +145,18 @@ def add_terminal_metrics(
         outcome: Of which this is missing.
         joints: Where the arms ended, shape (N, J), [rad].
         scenes: Where they moved.
-        arm: That moved.
-        whole_arm: Whether its links count.
+        collision_model: Arm that moved.
     """
-    some = np.flatnonzero(~outcome.reachable | (whole_arm and len(arm.traced) > 0))
+    some = np.flatnonzero(
+        ~outcome.reachable | (collision_model.whole_arm and len(collision_model.arm.traced) > 0)
+    )
     least, scene = outcome.min_clearance.copy(), scenes.take(some)
     # Where links are traced, the hand is the end of one of them.
     least[some] = np.minimum(
         np.where(outcome.reachable, least, MAX_CLEARANCE)[some],
-        least_clearance(arm, scene.start[:, None], scene, whole_arm=whole_arm, joints=joints[some, None]),
+        collision_model.least_clearance(
+            scene.start[:, None], scene.obstacles, scene.present, joints[some, None]
+        ),
     )
     away = norm(scenes.goal - scenes.start)
     goal_error = np.where(outcome.reachable, outcome.goal_error, away)
@@ -168,30 +169,6 @@ def empty_outcome(number: int) -> Outcome:
     for name in ("is_success", "collision", "reachable", "unstable"):
         fields[name] = np.zeros(number, dtype=bool)
     return Outcome(**{**fields, "first_contact_time": np.full(number, -1.0), "stretch": np.ones(number)})
-
-
-def least_clearance(
-    arm: Arm, hand: Float, scenes: Scenes, *, whole_arm: bool, joints: Float | None = None
-) -> Float:
-    """Least clearance over time and obstacles, shape (N,), [m].
-
-    Args:
-        arm: That moves.
-        hand: Positions, shape (N, T, D), [m].
-        scenes: N of them.
-        whole_arm: Whether the links count.
-        joints: Angles, shape (N, T, J), [rad]; by default those of the posture for the hand.
-    """
-    if not scenes.obstacles.shape[1]:
-        return np.full(len(hand), MAX_CLEARANCE)
-    present = scenes.present
-    links = arm.links(arm.inverse_kinematics(hand) if joints is None else joints) if whole_arm else None
-    if links is not None and arm.traced:
-        return nearest_approach(ends_of(np.asarray(links)), arm.link_radii, scenes.obstacles, present)
-    each = hand_clearance(hand, arm.hand_radius, scenes.obstacles, present)
-    if links is not None:
-        each = np.minimum(each, arm_clearance(links, arm.link_radii, scenes.obstacles, present))
-    return np.asarray(each.min(axis=-1))
 
 
 def _sum_in_order(values: Float) -> Float:

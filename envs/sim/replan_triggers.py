@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Int
 from viapoint.envs.common.validation import number_of_at_least
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.sim.executor import SETTLING
 
 Trigger = Literal["horizon", "target", "course", "clearance"]
@@ -67,8 +67,7 @@ class DecisionEnds:
     """Finds out when decisions end.
 
     Args:
-        arm: That moves.
-        whole_arm: Whether its links count.
+        collision_model: Arm that moves.
         timestep: Of the physics, [s].
         triggers: What ends a decision on the way.
         horizon: [s].
@@ -81,16 +80,15 @@ class DecisionEnds:
 
     def __init__(
         self,
-        arm: Arm,
+        collision_model: CollisionModel,
         *,
-        whole_arm: bool,
         timestep: float,
         triggers: Sequence[Trigger],
         horizon: float,
         margin: float,
         time_limit: float,
     ) -> None:
-        self.arm, self.whole_arm, self.timestep = arm, whole_arm, timestep
+        self.collision_model, self.timestep = collision_model, timestep
         known = not isinstance(triggers, str) and isinstance(triggers, Iterable)
         if not known or any(each not in TRIGGERS for each in triggers):
             raise ValueError(f"decide_at must be some of {', '.join(TRIGGERS)}, got {triggers!r}")
@@ -144,7 +142,7 @@ class DecisionEnds:
         times = np.asarray(self.timestep * (now[:, None] + every * np.arange((looks - 1) * LOOK + ahead + 1)))
         hand = plan.trajectory()(times - self.timestep * began[:, None])
         unturned, turned = (
-            clearance_over_time(self.arm, hand, rows, scenes.present, whole_arm=self.whole_arm)
+            self.collision_model.clearance_profile(hand, rows, scenes.present)
             for rows in (scenes.places(times, unturned=times[:, 0]), scenes.places(times))
         )
         windows = [

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.sim.executor import Rollout
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, LIMIT_TOLERANCE, REST_SPEED, Outcome, empty_outcome
 from viapoint.envs.sim.simulator import SimulationLog
@@ -80,10 +80,11 @@ class OnlineEpisodes:
     """Bookkeeping of N episodes that began at different times."""
 
     def __init__(
-        self, arm: Arm, num_envs: int, *, n_via: int, whole_arm: bool, timestep: float, most: int
+        self, collision_model: CollisionModel, num_envs: int, *, n_via: int, timestep: float, most: int
     ) -> None:
         """Make room for `num_envs` episodes of at most `most` physics steps."""
-        self.arm, self.whole_arm, self.timestep = arm, whole_arm, timestep
+        self.collision_model, self.arm, self.timestep = collision_model, collision_model.arm, timestep
+        arm = self.arm
         n, j, d = num_envs, len(arm.joint_range), arm.dimension
         numbers: dict[str, Any] = {name: np.zeros(n) for name in EpisodeState._fields}
         numbers |= {name: np.zeros(n, dtype=np.int64) for name in ("steps", "began", "first_contact")}
@@ -128,9 +129,8 @@ class OnlineEpisodes:
         rest = np.repeat(scenes.start[:, None], self.plan.waypoints.shape[1], axis=1)
         zero = np.zeros_like(scenes.start)
         self.plan.put(rows, MovingPlan(rest, np.ones((len(rows), rest.shape[1] - 1)), zero, zero))
-        clearance = clearance_over_time(
-            self.arm, scenes.start[:, None], scenes.places(np.zeros((len(rows), 1))), scenes.present,
-            whole_arm=self.whole_arm,
+        clearance = self.collision_model.clearance_profile(
+            scenes.start[:, None], scenes.places(np.zeros((len(rows), 1))), scenes.present
         ).min(axis=(1, 2), initial=MAX_CLEARANCE)  # fmt: skip
         now.min_clearance[rows] = now.planned_clearance[rows] = clearance
         for row in rows:
@@ -183,8 +183,8 @@ class OnlineEpisodes:
         if not scenes.obstacles.shape[1]:
             return np.full(len(rows), MAX_CLEARANCE)
         time = np.asarray(self.timestep * (self.running.steps[rows, None] + np.arange(1, hand.shape[1] + 1)))
-        profile = clearance_over_time(
-            self.arm, hand, scenes.places(time), scenes.present, whole_arm=self.whole_arm, joints=joints
+        profile = self.collision_model.clearance_profile(
+            hand, scenes.places(time), scenes.present, joints
         ).min(axis=-1)
         return np.asarray(np.where(done, profile, MAX_CLEARANCE).min(axis=-1))
 
@@ -236,9 +236,8 @@ class OnlineEpisodes:
             np.asarray(self.arm.hand_position(joints)),
             np.asarray(self.timestep * np.arange(1, number + 1)),
         )
-        clearance = clearance_over_time(
-            self.arm, hand[None], scene.places(time[None]), scene.present, whole_arm=self.whole_arm,
-            joints=joints[None],
+        clearance = self.collision_model.clearance_profile(
+            hand[None], scene.places(time[None]), scene.present, joints[None]
         )[0].min(axis=-1, initial=MAX_CLEARANCE)  # fmt: skip
         return Rollout(time, planned, joints, hand, contact, clearance)
 

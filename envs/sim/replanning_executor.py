@@ -12,7 +12,7 @@ from viapoint.envs.arms.serial_arm import EVERY
 from viapoint.envs.common.background_worker import BackgroundWorker
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.sim.executor import GROUP
 from viapoint.envs.sim.replanning_episodes import DecisionRollout, jerk_cost_between
 from viapoint.envs.sim.simulator import Simulator
@@ -45,11 +45,10 @@ class OnlineExecutor:
     Args:
         simulator: Of the arm.
         beside: For the work that need not wait for the physics.
-        whole_arm: Whether the links count.
     """
 
-    def __init__(self, simulator: Simulator, beside: BackgroundWorker, *, whole_arm: bool) -> None:
-        self.simulator, self.arm, self.whole_arm = simulator, simulator.arm, whole_arm
+    def __init__(self, simulator: Simulator, beside: BackgroundWorker) -> None:
+        self.simulator, self.arm = simulator, simulator.arm
         self._beside = beside
 
     def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float, Bool]:
@@ -119,8 +118,8 @@ class OnlineExecutor:
         controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])[:, :number]
         rows = scenes.places(np.asarray(timestep * (now[:, None] + np.arange(number + 1))))
         looks = np.arange(0, number + 1, max(round(LOOK_EVERY / timestep), 1))
-        profile = clearance_over_time(
-            self.arm, position[:, looks], rows[:, looks], scenes.present, whole_arm=self.whole_arm
+        profile = self.simulator.collision_model.clearance_profile(
+            position[:, looks], rows[:, looks], scenes.present
         ).min(axis=-1, initial=MAX_CLEARANCE)
         clearance = np.where(looks <= steps[:, None], profile, MAX_CLEARANCE).min(axis=-1)
         cost = jerk_cost_between(plan, np.asarray(timestep * since), np.asarray(timestep * (since + steps)))

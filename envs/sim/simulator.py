@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import batch
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.narrow_phase import LinkPositions
 
@@ -36,18 +36,20 @@ class SimulationLog(NamedTuple):
 class Simulator:
     """MuJoCo's batch engine with the arm in its posture and capsules of any place and size around it."""
 
-    def __init__(self, arm: Arm, *, n_obstacles: int, whole_arm: bool, num_envs: int, threads: int) -> None:
+    def __init__(
+        self, collision_model: CollisionModel, *, n_obstacles: int, num_envs: int, threads: int
+    ) -> None:
         """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
-        self.arm = arm
-        self.model = arm.compile(n_obstacles, whole_arm)
+        self.collision_model, self.arm = collision_model, collision_model.arm
+        self.model = self.arm.compile(n_obstacles, collision_model.whole_arm)
         self.physics_steps = 0
         """Physics steps simulated so far, all simulations together."""
         self.batch = batch.Batch(self.model, num_envs, threads)
         """MuJoCo's engine, whose state rows are the simulations'."""
         self._rest_state = self.batch.state[0].copy()
-        self.recorded = ("qpos", "ncon", "site_xpos") if arm.traced else ("qpos", "ncon")
+        self.recorded = ("qpos", "ncon", "site_xpos") if self.arm.traced else ("qpos", "ncon")
         """What the engine records at every step."""
-        sites = [self.model.site(name).id for name in arm.traced]
+        sites = [self.model.site(name).id for name in self.arm.traced]
         self._traced = (sites[0], np.array(sites[1:]).reshape(-1, 2)) if sites else None
         self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
         if n_obstacles:

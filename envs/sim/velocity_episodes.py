@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.actions.velocity import Motion
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
@@ -21,7 +21,6 @@ from viapoint.envs.sim.outcome import (
     REST_SPEED,
     Outcome,
     empty_outcome,
-    least_clearance,
 )
 from viapoint.envs.sim.simulator import SimulationLog
 
@@ -62,9 +61,10 @@ class EpisodeState(NamedTuple):
 class StepEpisodes:
     """Bookkeeping of N episodes that began at different times."""
 
-    def __init__(self, arm: Arm, num_envs: int, *, whole_arm: bool, timestep: float, most: int) -> None:
+    def __init__(self, collision_model: CollisionModel, num_envs: int, *, timestep: float, most: int) -> None:
         """Make room for `num_envs` episodes of at most `most` physics steps."""
-        self.arm, self.whole_arm, self.timestep = arm, whole_arm, timestep
+        self.collision_model, self.arm, self.timestep = collision_model, collision_model.arm, timestep
+        arm = self.arm
         n, j, d = num_envs, len(arm.joint_range), arm.dimension
         self.motion = Motion.at_rest(np.zeros((n, d)))
         """Where the references are."""
@@ -93,7 +93,9 @@ class StepEpisodes:
         for name in ("within", "reachable"):
             getattr(self.running, name)[rows] = True
         self.running.first_contact[rows] = -1
-        clearance = least_clearance(self.arm, scenes.start[:, None], scenes, whole_arm=self.whole_arm)
+        clearance = self.collision_model.least_clearance(
+            scenes.start[:, None], scenes.obstacles, scenes.present
+        )
         self.running.min_clearance[rows] = self.running.planned_clearance[rows] = clearance
 
     def add(
@@ -123,7 +125,7 @@ class StepEpisodes:
             (now.min_clearance, hand, record.joints),
             (now.planned_clearance, planned, None),
         ):
-            least = least_clearance(self.arm, path, scenes, whole_arm=self.whole_arm, joints=joints)
+            least = self.collision_model.least_clearance(path, scenes.obstacles, scenes.present, joints)
             mine[rows] = np.minimum(mine[rows], least)
         now.path_length[rows] += _sum_in_order(moved)
         now.peak_speed[rows] = np.maximum(now.peak_speed[rows], moved.max(axis=-1) / timestep)
@@ -172,8 +174,8 @@ class StepEpisodes:
             joints[:], planned[:], contact[:] = self.running.joints[row], self.running.hand[row], False
         hand = np.asarray(self.arm.hand_position(joints))
         each = Scenes(*(np.repeat(field, number, axis=0) for field in scene))
-        clearance = least_clearance(
-            self.arm, hand[:, None], each, whole_arm=self.whole_arm, joints=joints[:, None]
+        clearance = self.collision_model.least_clearance(
+            hand[:, None], each.obstacles, each.present, joints[:, None]
         )
         time = np.asarray(self.timestep * np.arange(1, number + 1))
         return Rollout(time, planned, joints, hand, contact, clearance)

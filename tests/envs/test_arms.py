@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ADULT, ARMS
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.scenes.scene import TARGETS
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.primitives import point_to_point
@@ -144,7 +145,7 @@ def test_controls_are_the_inverse_dynamics_of_mujoco():
 
 def test_a_reach_of_40_cm_in_800_ms_is_tracked_within_2_mm_rms():
     targets = {name: np.array(place) for name, place in TARGETS.items()}
-    simulator = Simulator(ADULT, n_obstacles=0, whole_arm=False, num_envs=1, threads=1)
+    simulator = Simulator(CollisionModel(ADULT, False), n_obstacles=0, num_envs=1, threads=1)
     none = np.zeros((1, 0, 5)), np.zeros((1, 0), dtype=bool)
     for first, second in (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T3", "T6")):
         start, goal = targets[first], targets[second]

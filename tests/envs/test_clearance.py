@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ADULT
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import (
     MAX_CLEARANCE,
     arm_clearance,
@@ -55,7 +56,7 @@ def test_contact_exactly_where_clearance_is_negative(whole_arm):
     joints = np.stack((rng.uniform(-0.4, 2.4, number), rng.uniform(0.2, 2.4, number)), axis=-1)
     obstacles, present = rows(2, (number, 3)), rng.random((number, 3)) < 0.8
     obstacles[..., 1] += 0.25
-    simulator = Simulator(ADULT, n_obstacles=3, whole_arm=whole_arm, num_envs=number, threads=2)
+    simulator = Simulator(CollisionModel(ADULT, whole_arm), n_obstacles=3, num_envs=number, threads=2)
     simulator.place(np.arange(number), joints, obstacles, present)
     contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 2))).contact[:, 0]
     clearance = hand_clearance(ADULT.hand_position(joints)[:, None], ADULT.hand_radius, obstacles, present)

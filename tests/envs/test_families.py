@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import ADULT
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.mdp.task import family_sampler
 from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
@@ -54,7 +55,7 @@ def ends_of(centre, axis):
 def test_scenes_of_a_family_can_begin_and_end_and_something_is_in_the_way(name, env_id, tasks):
     sampler = family_sampler(tasks[env_id], name)
     scenes = sampler([np.random.default_rng(seed) for seed in range(NUMBER[env_id])])
-    check_scenes(scenes, ADULT, whole_arm=tasks[env_id].whole_arm)
+    check_scenes(scenes, tasks[env_id].collision_model)
     assert scenes.obstacles.shape[1] == ROWS
     squared = segment_distance_squared(scenes.start[:, None], scenes.goal[:, None], scenes.obstacles)[..., 0]
     clearance = np.sqrt(squared) - scenes.obstacles[..., -1] - ADULT.hand_radius
@@ -175,7 +176,7 @@ def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(monk
     names = {}
     exec(example, names)
     scenes, start = names["scenes"], names["observation"]["hand"]
-    check_scenes(scenes, ADULT, whole_arm=False)
+    check_scenes(scenes, CollisionModel(ADULT, False))
     np.testing.assert_allclose(start, scenes.start[0], atol=1e-6)
     assert (scenes.present.sum(axis=1) == 2).all()
     names["env"].close()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import PANDA
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
 from viapoint.envs.scenes import spatial, spatial_draws
@@ -41,7 +42,7 @@ def bodies(generator):
     low, high = (np.array(corner) for corner in PANDA.workspace)
     start, goal = (low + (high - low) * generator.random((N, 1, 3)) for _ in range(2))
     path = start + (goal - start) * np.linspace(0.0, 1.0, TIMES)[:, None]
-    return Swept.of(PANDA, path, whole_arm=True).outer
+    return Swept.of(CollisionModel(PANDA, True), path).outer
 
 
 def everything(bodies, rows):
@@ -92,7 +93,7 @@ def test_rows_that_belong_together_have_one_clearance(generator, bodies):
 
 
 def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
-    sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
+    sampler, found = SpaceSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
     for together in (1, 30, 10_000):
         monkeypatch.setattr(spatial, "TOGETHER", together)
         found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
@@ -102,7 +103,7 @@ def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkey
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(monkeypatch, shared):
-    sampler, found = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True), []
+    sampler, found = SpaceSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
     for ahead in (0, 30, 1_000):
         monkeypatch.setattr(spatial_draws, "AHEAD", ahead)
         generators = [np.random.default_rng(0 if shared else seed) for seed in range(8)]

@@ -7,6 +7,7 @@ import torch
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import PANDA
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.serial_arm import RESERVE
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
@@ -124,7 +125,7 @@ def test_movements_of_the_centre_duration_are_tracked_and_links_are_where_they_w
     trajectory = plan._replace(durations=plan.durations * factor[:, None]).trajectory()
     position, velocity, acceleration = trajectory.sample(steps)
     number = len(position)
-    simulator = Simulator(PANDA, n_obstacles=0, whole_arm=True, num_envs=number, threads=1)
+    simulator = Simulator(CollisionModel(PANDA, True), n_obstacles=0, num_envs=number, threads=1)
     none = np.zeros((number, 0, 7)), np.zeros((number, 0), dtype=bool)
     simulator.place(np.arange(number), PANDA.inverse_kinematics(position[:, 0]), *none)
     record = simulator.rollout(
@@ -184,7 +185,7 @@ def test_contact_exactly_where_a_link_reaches_into_an_obstacle():
     axis = rng.uniform(-0.12, 0.12, (number, 3, 3)) * (rng.random((number, 3, 1)) < 0.6)
     obstacles = np.concatenate((centre, axis, rng.uniform(0.01, 0.05, (number, 3, 1))), axis=-1)
     present = rng.random((number, 3)) < 0.6
-    simulator = Simulator(PANDA, n_obstacles=3, whole_arm=True, num_envs=number, threads=1)
+    simulator = Simulator(CollisionModel(PANDA, True), n_obstacles=3, num_envs=number, threads=1)
     joints = PANDA.inverse_kinematics(places)
     simulator.place(np.arange(number), joints, obstacles, present)
     contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 10))).contact[:, 0]

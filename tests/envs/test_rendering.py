@@ -110,7 +110,7 @@ def test_the_obstacle_that_was_touched_is_named(name):
     inner = env.unwrapped
     scene, plan, _ = inner.batch._last
     movement = Movement.of(
-        inner.task.arm, scene, plan, inner.last_rollout, whole_arm=inner.task.whole_arm
+        inner.task.collision_model, scene, plan, inner.last_rollout
     )  # fmt: skip
     assert movement.touch.obstacle == 1
     assert movement.touch.step == inner.last_rollout.contact.argmax()
@@ -197,5 +197,5 @@ def test_a_contact_that_is_with_no_obstacle_is_drawn_as_such():
     env.reset(seed=0)
     scene = env.batch.scenes
     joints = np.repeat(env.task.arm.inverse_kinematics(scene.start), 3, axis=0)
-    touch = first_touch(env.task.arm, scene, joints, np.array([False, True, True]), whole_arm=True)
+    touch = first_touch(env.task.collision_model, scene, joints, np.array([False, True, True]))
     assert (touch.step, touch.obstacle, touch.link) == (1, -1, None)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import ADULT
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.sampler import SceneSampler
@@ -15,13 +16,13 @@ NUMBER = 300
 
 @pytest.fixture(scope="module", params=[False, True], ids=["hand", "whole arm"])
 def sampled(request):
-    sampler = SceneSampler(ADULT, SceneDistribution(), whole_arm=request.param)
+    sampler = SceneSampler(CollisionModel(ADULT, request.param), SceneDistribution())
     return sampler([np.random.default_rng(seed) for seed in range(NUMBER)]), request.param
 
 
 def test_sampled_scenes_can_begin_and_end(sampled):
     scenes, whole_arm = sampled
-    check_scenes(scenes, ADULT, whole_arm=whole_arm)
+    check_scenes(scenes, CollisionModel(ADULT, whole_arm))
 
 
 def test_one_to_five_obstacles_all_numbers_posts_and_bars(sampled):
@@ -42,7 +43,7 @@ def test_the_straight_line_always_hits_something(sampled):
 
 
 def test_a_scene_depends_on_its_own_generator_alone():
-    sampler = SceneSampler(ADULT, SceneDistribution(), whole_arm=False)
+    sampler = SceneSampler(CollisionModel(ADULT, False), SceneDistribution())
     together = sampler([np.random.default_rng(seed) for seed in range(40)])
     for seed in (0, 7, 39):
         alone = sampler([np.random.default_rng(seed)])
@@ -165,7 +166,7 @@ def test_given_obstacles_get_ends_clear_of_them_and_an_empty_list_is_none():
 
 def test_rows_of_lights_stand_across_the_middle_between_targets():
     pairs, scenes = rows_of_lights()
-    check_scenes(scenes, ADULT, whole_arm=False)
+    check_scenes(scenes, CollisionModel(ADULT, False))
     assert ("T1", "T4") in pairs
     assert ("T6", "T3") in pairs
     line, axis = scenes.goal - scenes.start, scenes.obstacles[:, 0, 2:4]

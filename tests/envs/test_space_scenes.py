@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import PANDA
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.config import BEAMS, FAMILIES, SpaceDistribution
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.envs.scenes.spatial import SpaceSampler
-from viapoint.envs.sim.outcome import least_clearance
 from viapoint.envs.single_env import ReachVectorEnv
 
-NUMBER = 60
+NUMBER, WHOLE_PANDA = 60, CollisionModel(PANDA, whole_arm=True)
 
 
 def drawn(number=NUMBER, **distribution):
-    sampler = SpaceSampler(PANDA, SpaceDistribution(**distribution), whole_arm=True)
+    sampler = SpaceSampler(WHOLE_PANDA, SpaceDistribution(**distribution))
     return sampler([np.random.default_rng(seed) for seed in range(number)])
 
 
@@ -28,10 +28,10 @@ def scenes():
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_can_begin_and_end_and_stands_in_the_way_of_the_straight_movement(family):
     scenes = drawn(24, families=(family,))
-    check_scenes(scenes, PANDA, whole_arm=True)
+    check_scenes(scenes, WHOLE_PANDA)
     assert (scenes.present.sum(axis=-1) >= FAMILIES[family]).all()
     line = scenes.start[:, None] + (scenes.goal - scenes.start)[:, None] * np.linspace(0, 1, 60)[:, None]
-    assert (least_clearance(PANDA, line, scenes, whole_arm=True) < -0.003).all()
+    assert (WHOLE_PANDA.least_clearance(line, scenes.obstacles, scenes.present) < -0.003).all()
 
 
 def test_a_beam_is_above_the_hand_on_its_way_and_a_board_or_sill_below():
@@ -65,7 +65,7 @@ def test_start_and_goal_are_as_far_apart_and_as_level_as_stated(scenes):
 
 def test_a_scene_depends_on_its_own_generator_alone(scenes):
     for seed in (0, 7, 39):
-        alone = SpaceSampler(PANDA, SpaceDistribution(), whole_arm=True)([np.random.default_rng(seed)])
+        alone = SpaceSampler(WHOLE_PANDA, SpaceDistribution())([np.random.default_rng(seed)])
         for one, together in zip(alone, scenes, strict=True):
             np.testing.assert_array_equal(one[0], together[seed])
 

@@ -82,7 +82,7 @@ def test_no_scene_is_in_two_sets(env_id):
 def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, trials):
     """The first of each set, and those that the straight line may solve, which is only where nothing is in the way."""
     trial = trials(shipped.env_id)
-    check_scenes(shipped.scenes, trial.task.arm, whole_arm=trial.task.whole_arm)
+    check_scenes(shipped.scenes, trial.task.collision_model)
     some = shipped.take(slice(0, 120))
     assert trial(some.scenes, some.solution).success.all()
     straight = trial(some.scenes, np.zeros_like(some.solution)).success

@@ -6,8 +6,6 @@ import pytest
 
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.envs.scenes.dynamic_scene import clearance_over_time
-from viapoint.envs.sim.outcome import least_clearance
 from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS, make_method
 from viapoint.training.rollouts.rollout import new_trial
 from viapoint.training.scene_sets.scene_set import load
@@ -113,7 +111,9 @@ def test_clearance_is_that_of_many_instants(env_id):
     )
     hand = plan.trajectory()(time).reshape(number * tried, -1, env.arm.dimension)
     scenes = env.scenes.take(np.repeat(np.arange(number), tried))
-    exact = least_clearance(env.arm, hand, scenes, whole_arm=env.task.whole_arm).reshape(number, tried)
+    exact = env.task.collision_model.least_clearance(hand, scenes.obstacles, scenes.present).reshape(
+        number, tried
+    )
     checks = check_plans(observation, actions, env.task)
     margin = np.asarray(env.arm.reach_margin(hand)).min(axis=-1).reshape(number, tried)
     near = np.abs(margin) < 0.03
@@ -133,7 +133,7 @@ def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
     ahead, now = plan.duration[:, None] * np.linspace(0.0, 1.0, 800), env._episodes.time
     rows = env.scenes.places(now[:, None] + ahead, unturned=now)
     hand = plan.trajectory()(ahead)
-    exact = clearance_over_time(env.arm, hand, rows, env.scenes.present, whole_arm=False).min(axis=(1, 2))
+    exact = env.task.collision_model.clearance_profile(hand, rows, env.scenes.present).min(axis=(1, 2))
     found = check_plans(observation, actions[:, None], env.task).clearance[:, 0]
     some &= (exact > -0.05) & (exact < CLOSE)
     assert some.sum() > 8
@@ -154,7 +154,7 @@ def test_clearance_after_a_time_does_not_matter():
         time = last[:, None] * np.linspace(0.0, 1.0, 200)
         hand = plan.trajectory()(time[:, None])[:, 0]
         rows = env.scenes.places(time, unturned=np.zeros(number))
-        clearance = clearance_over_time(env.arm, hand, rows, env.scenes.present, whole_arm=False)
+        clearance = env.task.collision_model.clearance_profile(hand, rows, env.scenes.present)
         least.append(clearance.min(axis=(1, 2)))
     some = (found > -0.05) & (found < CLOSE)
     assert (found >= every - 1e-4).all()

@@ -153,9 +153,8 @@ def _engine(
     """A rollout of the engine alone: the same controls in the same scenes, with the records the environment needs."""
     number = len(actions)
     simulator = Simulator(
-        task.arm,
+        task.collision_model,
         n_obstacles=task.observation.n_rows,
-        whole_arm=task.whole_arm,
         num_envs=number,
         threads=threads,
     )

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.planar import ADULT, PlanarArm
 from viapoint.envs.common.types import Float
 from viapoint.envs.sim.executor import SETTLING
@@ -79,7 +80,7 @@ def follow(
 ) -> Performed:
     """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
     number, count = position.shape[:2]
-    simulator = Simulator(arm, n_obstacles=0, whole_arm=False, num_envs=number, threads=1)
+    simulator = Simulator(CollisionModel(arm, whole_arm=False), n_obstacles=0, num_envs=number, threads=1)
     sims, start = np.arange(number), np.asarray(arm.inverse_kinematics(position[:, 0]))
     simulator.place(sims, start, np.zeros((number, 0, 5)), np.zeros((number, 0), dtype=bool))
     controls = arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])

@@ -23,7 +23,6 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import least_clearance
 from viapoint.training.rollouts.rollout import Trial, Trials
 
 Clear = Callable[[Float, Float], bool]
@@ -119,11 +118,12 @@ class MotionPlanner:
         time = np.linspace(0.0, self._task.action.centre_duration, LOOKS)
         hand = np.asarray(plan.trajectory()(time))
         margin = float(np.asarray(self._task.arm.reach_margin(hand)).min())
-        clearance = least_clearance(self._task.arm, hand, scene, whole_arm=self._task.whole_arm)
+        clearance = self._task.collision_model.least_clearance(hand, scene.obstacles, scene.present)
         return min(margin, 0.0) + float(clearance[0])
 
     def _clear(self, scene: Scenes, margin: float) -> Clear:
-        arm, whole_arm = self._task.arm, self._task.whole_arm
+        model = self._task.collision_model
+        arm, whole_arm = model.arm, model.whole_arm
         rows = scene.obstacles[0][scene.present[0]]
         capsules = [(*_split(row), float(row[-1]) + arm.hand_radius + margin) for row in rows]
 
@@ -137,7 +137,7 @@ class MotionPlanner:
                 return False
             if not whole_arm:
                 return True
-            return bool(least_clearance(arm, points[None], scene, whole_arm=True)[0] > margin)
+            return bool(model.least_clearance(points[None], scene.obstacles, scene.present)[0] > margin)
 
         return clear
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.scenes.dynamic_scene import clearance_over_time
 from viapoint.training.rollouts.rollout import OnlineTrial, Trials
 from viapoint.training.search.candidates import sobol_actions
 from viapoint.training.search.planned_movements import planned
@@ -101,8 +100,6 @@ class OnlinePlanner:
         now = np.repeat(self._limit - observation["time_left"][:, 0], tried)
         times = now[:, None] + moves.duration.reshape(-1, 1) * INSTANTS
         path = moves.path.reshape(number * tried, *moves.path.shape[2:])
-        clearance = clearance_over_time(
-            task.arm, path, many.places(times), many.present, whole_arm=task.whole_arm
-        )
+        clearance = task.collision_model.clearance_profile(path, many.places(times), many.present)
         least = clearance.min(axis=(1, 2)).reshape(number, tried)
         return np.asarray(merit + 200.0 * np.minimum(least - ENOUGH, 0.0))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.arms.base import Arm
+from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 from viapoint.envs.rendering.overlay import Movement, Touch
@@ -55,7 +55,7 @@ def draw_movement(
         _draw_plan(axes, plan, scale)
     joints, hand, touch = np.asarray(arm.inverse_kinematics(scene.start))[0], scene.start[0], None
     if plan is not None and rollout is not None:
-        movement = Movement.of(arm, scene, plan, rollout, whole_arm=whole_arm)
+        movement = Movement.of(CollisionModel(arm, whole_arm), scene, plan, rollout)
         last = len(movement.hand) - 1 if step is None else step
         _draw_done(axes, movement, last, scale)
         touch = movement.touch if movement.touch is not None and last >= movement.touch.step else None

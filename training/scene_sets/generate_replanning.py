@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes, clearance_over_time
+from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.training.planners.replanning_baselines import INSTANTS, OnlinePlanner
 from viapoint.training.rollouts.rollout import OnlineTrial
 from viapoint.training.scene_sets.scene_set import FrozenScenes
@@ -73,9 +73,9 @@ def shares(trial: OnlineTrial, scenes: ChangingScenes) -> NDArray[np.float64]:
         moves = planned(trial.observe(scene), actions, task, INSTANTS)
         every = scene.take(np.zeros(PLANS, dtype=np.int64))
         rows = every.places(moves.duration[0, :, None] * INSTANTS)
-        least: Any = clearance_over_time(
-            task.arm, moves.path[0], rows, every.present, whole_arm=task.whole_arm
-        ).min(axis=(1, 2))
+        least: Any = task.collision_model.clearance_profile(moves.path[0], rows, every.present).min(
+            axis=(1, 2)
+        )
         reach = np.asarray(task.arm.reach_margin(moves.path[0])).min(axis=-1)
         share[row] = ((least > 0.0) & (reach > 0.0)).mean()
     return share

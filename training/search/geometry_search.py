@@ -157,7 +157,7 @@ class GeometrySearch:
         first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
         given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
         scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
-        for wrong, reason in problems(scene, self.task.arm, whole_arm=self.task.whole_arm):
+        for wrong, reason in problems(scene, self.task.collision_model):
             if wrong.any():
                 raise ValueError(reason(0))
         rows: Float = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1)

@@ -67,7 +67,7 @@ def decide(agent: Path | None) -> Decided:
     """Let the agent of a run folder, the shipped one, or else the planner, move around the rows of lights."""
     scenes = light_scenes()
     method, trial = _method(agent)
-    check_scenes(scenes, trial.task.arm, whole_arm=trial.task.whole_arm)
+    check_scenes(scenes, trial.task.collision_model)
     action = method.decide(trial.observe(_padded(scenes, trial)), _padded(scenes, trial))
     success = trial(scenes, action).success
     trial.close()
