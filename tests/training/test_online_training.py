@@ -76,10 +76,10 @@ def test_files_of_changing_scenes_come_back_whole(tmp_path):
 
 
 def settings(folder, n_timesteps, **changes):
-    hyperparameters = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
+    hyperparameters = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "gamma": 0.99}
     return TrainConfig(
         env=MOVING, n_timesteps=n_timesteps, n_envs=16, out=folder, eval_every=0, checkpoint_every=48,
-        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, progress=False, **changes,
+        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, discount_unit=0.1, progress=False, **changes,
     )  # fmt: skip
 
 

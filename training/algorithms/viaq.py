@@ -77,7 +77,7 @@ class ViaQ(OffPolicyAlgorithm):
         buffer_size: int = 50_000,
         learning_starts: int = 4_096,
         batch_size: int = 256,
-        gamma: float = 0.99,
+        gamma: float = 1.0,
         gradient_steps: int = 16,
         explore_uniformly: float = 0.25,
         temperature: float = 0.1,

@@ -133,7 +133,6 @@ ONLINE_PRESETS: dict[str, Preset] = {
 } | {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
-        discount_unit=0.1,
         hyperparameters=(
             *PRESETS["viaq"].hyperparameters,
             ("gradient_steps", 6),
@@ -141,7 +140,7 @@ ONLINE_PRESETS: dict[str, Preset] = {
         ),
     ),
 }
-"""Where plans are revised on the way: episodes are several decisions, and discounts follow time."""
+"""Presets of replanning tasks, in which discounts follow time; viaq does not discount, as episodes end in seconds."""
 
 
 def preset_of(env_id: str, algo: Algorithm) -> Preset:
