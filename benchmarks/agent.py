@@ -30,12 +30,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.algorithms.model_io import load_model, untrained
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import SEARCHES, agent_method, make_method
 from viapoint.training.rollouts.rollout import new_trial
-from viapoint.training.runs.model_io import untrained
-from viapoint.training.runs.run_dir import load_model
 from viapoint.training.runs.trainer import one_thread
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 from viapoint.training.search.candidates import candidate_actions
@@ -167,7 +166,7 @@ def once(words: argparse.Namespace, env: str, scenes: str, name: str, make: Call
     frozen = frozen.take(slice(0, MOVING_SCENES)) if env in ONLINE_TASKS else frozen
     if path.is_file() and read_json(path)["sha256"] == frozen.sha256:
         return
-    result = evaluate([make()], frozen, env).results[0]
+    result = evaluate_methods([make()], frozen, env).results[0]
     summary = result.summary()
     names = ("success", "jerk_ratio", "duration", "decision_time", "success_by_band")
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -33,10 +33,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.algorithms.model_io import build
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.model_io import build
 from viapoint.training.runs.trainer import one_thread
 from viapoint.training.scene_sets.scene_set import load
 
@@ -113,7 +113,11 @@ def attempt(setting: Setting, seed: int = 0) -> dict[str, Any]:
     model.learn(setting.n_timesteps)
     seconds, used = time.perf_counter() - began, time.process_time() - used
     agent = agent_method("agent", model)
-    summary = evaluate([agent], load("validation", ENV_ID), ENV_ID, time_decisions=False).results[0].summary()
+    summary = (
+        evaluate_methods([agent], load("validation", ENV_ID), ENV_ID, time_decisions=False)
+        .results[0]
+        .summary()
+    )
     bands = {name: round(100.0 * band["rate"], 1) for name, band in summary["success_by_band"].items()}
     env.close()
     return {

@@ -1,11 +1,62 @@
-"""Gymnasium environments whose actions are via-points and durations; importing registers them.
+"""Gymnasium environments whose actions are via-points and durations; importing this package registers them.
 
-See :data:`viapoint.envs.registration.TASKS` for the ids.
+:data:`ENV_IDS` lists the ids. Other names are imported when they are first used.
 """
 
+import importlib
+from typing import TYPE_CHECKING
+
 from viapoint.envs.common import mujoco_check as mujoco_check
-from viapoint.envs.registration import TASKS, register_all
+from viapoint.envs.registration import ENV_IDS, TASKS, register_all
+
+if TYPE_CHECKING:
+    from viapoint.envs.actions.via_points import Plan
+    from viapoint.envs.arm_import.loader import load_arm
+    from viapoint.envs.arms import register_arm
+    from viapoint.envs.arms.base import Arm
+    from viapoint.envs.record_video import RecordMovements
+    from viapoint.envs.replanning_env import OnlineReachEnv, OnlineReachVectorEnv
+    from viapoint.envs.single_env import ReachEnv
+    from viapoint.envs.vector_env import ReachVectorEnv
+    from viapoint.envs.velocity_env import StepReachEnv, StepReachVectorEnv
+else:
+    _MODULES = {
+        "Arm": "viapoint.envs.arms.base",
+        "OnlineReachEnv": "viapoint.envs.replanning_env",
+        "OnlineReachVectorEnv": "viapoint.envs.replanning_env",
+        "Plan": "viapoint.envs.actions.via_points",
+        "ReachEnv": "viapoint.envs.single_env",
+        "ReachVectorEnv": "viapoint.envs.vector_env",
+        "RecordMovements": "viapoint.envs.record_video",
+        "StepReachEnv": "viapoint.envs.velocity_env",
+        "StepReachVectorEnv": "viapoint.envs.velocity_env",
+        "load_arm": "viapoint.envs.arm_import.loader",
+        "register_arm": "viapoint.envs.arms",
+    }
+
+    def __getattr__(name):
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_MODULES[name]), name)
+
+    def __dir__():
+        return sorted({*globals(), *_MODULES})
+
 
 register_all()
 
-__all__ = ["TASKS"]
+__all__ = [
+    "ENV_IDS",
+    "TASKS",
+    "Arm",
+    "OnlineReachEnv",
+    "OnlineReachVectorEnv",
+    "Plan",
+    "ReachEnv",
+    "ReachVectorEnv",
+    "RecordMovements",
+    "StepReachEnv",
+    "StepReachVectorEnv",
+    "load_arm",
+    "register_arm",
+]

@@ -73,10 +73,11 @@ def modules():
     return found
 
 
-def import_graph(*, strings=True):
+def import_graph(*, strings=True, typing=True):
     """Modules of ours that each module imports, deferred imports and those for types included.
 
-    With `strings`, a string that names a module counts, too: registries load these modules later.
+    With `strings`, a string that names a module counts, too: registries load these modules later. Without `typing`,
+    imports for type checkers alone do not count.
     """
     known = modules()
     graph = {}
@@ -84,7 +85,10 @@ def import_graph(*, strings=True):
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         tree = ast.parse(path.read_text())
         seen = set()
+        skipped = set() if typing else typing_only(tree)
         for node in ast.walk(tree):
+            if node in skipped:
+                continue
             if isinstance(node, ast.Import):
                 seen |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -97,6 +101,17 @@ def import_graph(*, strings=True):
                 seen |= {named} if named in known and known[named].name != "__init__.py" else set()
         graph[name] = (seen & known.keys()) - {name}
     return graph
+
+
+def typing_only(tree):
+    """Imports under `if TYPE_CHECKING`."""
+    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
+    return {
+        each
+        for block in blocks
+        if isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING"
+        for each in block.body
+    }
 
 
 def package_of(module, known):
@@ -136,7 +151,7 @@ def test_sub_packages_import_one_another_without_cycles():
 
 
 def test_no_chain_of_imports_is_long():
-    graph = import_graph(strings=False)
+    graph = import_graph(strings=False, typing=False)
     lengths = {}
 
     def chain(module):

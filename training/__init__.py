@@ -1,1 +1,52 @@
-"""Learning to place via-points, and measuring how well it was learnt."""
+"""Agents that learn to place via-points: training, evaluation, and planning.
+
+Names are imported when they are first used, so that importing this package alone is fast.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from viapoint.training.algorithms.agent import Agent, load_agent
+    from viapoint.training.algorithms.viaq import ViaQ
+    from viapoint.training.config.configs import TrainConfig
+    from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
+    from viapoint.training.rollouts.vec_env import ViaVecEnv
+    from viapoint.training.runs.run_dir import Run
+    from viapoint.training.runs.trainer import train
+    from viapoint.training.search.geometry_search import GeometrySearch
+else:
+    _MODULES = {
+        "Agent": "viapoint.training.algorithms.agent",
+        "EvaluationResult": "viapoint.training.evaluation.evaluator",
+        "GeometrySearch": "viapoint.training.search.geometry_search",
+        "Run": "viapoint.training.runs.run_dir",
+        "TrainConfig": "viapoint.training.config.configs",
+        "ViaQ": "viapoint.training.algorithms.viaq",
+        "ViaVecEnv": "viapoint.training.rollouts.vec_env",
+        "evaluate": "viapoint.training.evaluation.evaluator",
+        "load_agent": "viapoint.training.algorithms.agent",
+        "train": "viapoint.training.runs.trainer",
+    }
+
+    def __getattr__(name):
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_MODULES[name]), name)
+
+    def __dir__():
+        return sorted({*globals(), *_MODULES})
+
+
+__all__ = [
+    "Agent",
+    "EvaluationResult",
+    "GeometrySearch",
+    "Run",
+    "TrainConfig",
+    "ViaQ",
+    "ViaVecEnv",
+    "evaluate",
+    "load_agent",
+    "train",
+]

@@ -131,7 +131,7 @@ def _records(cells: Sequence[Cell], name: str, study: Study) -> list[Numbers]:
     found = []
     for cell in cells:
         run, frozen = Run(cell.folder(study)), work.scenes(name, cell.env, study)
-        identity = work.identity_of(frozen, run.model_folder, study)
+        identity = work.identity_of(frozen, run.best, study)
         record = work.kept(work.evaluation_path(cell, name, study), identity)
         if record is not None:
             found.append(record)

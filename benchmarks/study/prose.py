@@ -40,7 +40,7 @@ so the difference between the two is what was learned.
 FAILURES = """## Failures, drawn
 
 Failures of the shipped agent in the `hard` scenes of PlanarWholeArm-v0, policy alone, from the deepest of a kind to its
-mildest (`viapoint evaluate --pretrained viapoint/PlanarWholeArm-v0 --methods agent --scenes hard --failures
+mildest (`viapoint evaluate viapoint/PlanarWholeArm-v0 --baselines --scenes hard --failures
 docs/images/failures`).
 
 ![The plan enters an obstacle by 5 mm or less](images/failures/graze.png)

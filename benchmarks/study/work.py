@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from study.plan import FREEDOM, Cell, Study, Variant, sets_of, short
+from viapoint.training.algorithms.model_io import load_model, untrained
 from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import MethodResult, evaluate
+from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
 from viapoint.training.io.config_json import as_json
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import SEARCHES, Method, agent_method, make_method
 from viapoint.training.plotting.failure_report import sort_out
-from viapoint.training.runs.model_io import untrained
-from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread, resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
@@ -84,7 +84,7 @@ def completed(cell: Cell, study: Study) -> bool:
     there = state(cell, study)
     if there != "trained":
         return there not in ("absent", "unfinished")
-    model = Run(cell.folder(study)).model_folder
+    model = Run(cell.folder(study)).best
     return "evaluate" not in study.only or all(
         kept(evaluation_path(cell, name, study), identity_of(scenes(name, cell.env, study), model, study))
         for name in sets_of(cell.env)
@@ -141,12 +141,12 @@ def state(cell: Cell, study: Study) -> str:
 def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     """The evaluation of a trained agent on a set, from its file where it is of this agent and these scenes."""
     run, frozen = Run(cell.folder(study)), scenes(name, cell.env, study)
-    identity = identity_of(frozen, run.model_folder, study)
+    identity = identity_of(frozen, run.best, study)
     path = evaluation_path(cell, name, study)
     found = kept(path, identity)
     if found is not None:
         return found
-    model: Any = load_model(run.model_folder)
+    model: Any = load_model(run.best)
     methods = [agent_method(way, agent, checks) for way, (agent, checks) in agents(model, study).items()]
     kwargs = dict(cell.variant.env_kwargs)
     results = _results(methods, frozen, cell.env, kwargs)
@@ -220,7 +220,7 @@ def _results(
 ) -> tuple[MethodResult, ...]:
     """What came of each method in all scenes; where it was interrupted, nothing is kept."""
     with one_thread():
-        results = evaluate(methods, frozen, env, env_kwargs=kwargs, time_decisions=timed).results
+        results = evaluate_methods(methods, frozen, env, env_kwargs=kwargs, time_decisions=timed).results
     if any(each.interrupted for each in results):
         raise KeyboardInterrupt
     return results
@@ -254,7 +254,7 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
         first = next((cell for cell in cells if state(cell, study) == "trained"), None)
         if first is None:
             continue
-        folder = Run(first.folder(study)).model_folder
+        folder = Run(first.folder(study)).best
         model: Any = load_model(folder)
         source = identity_of(scenes("test", env, study), folder, study)["weights"]
         for way, (agent, checks) in agents(model, study).items():

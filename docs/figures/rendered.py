@@ -14,7 +14,8 @@ from PIL import Image
 
 from viapoint.envs.common.types import Float, Frame
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.runs.agents import load_agent
+from viapoint.training import load_agent
+from viapoint.training.planners.baselines import agent_method
 from viapoint.training.scene_sets.scene_set import load
 
 SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
@@ -118,11 +119,13 @@ def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = F
     Raises:
         RuntimeError: The agent's does not succeed, or the straight one does.
     """
-    scene, agent = load("test", env_id).scenes.take([row]), load_agent(None, env_id)
+    scene, agent = load("test", env_id).scenes.take([row]), load_agent(env_id)
     observation, _ = env.reset(options=scene.as_options())
     task: Any = env.unwrapped.task  # type: ignore[attr-defined]
     batch = {name: part[None] for name, part in observation.items()}
-    action = np.zeros(task.action.size) if straight else agent.method(16).decide(batch, scene)[0]
+    action = (
+        np.zeros(task.action.size) if straight else agent_method("agent", agent, 16).decide(batch, scene)[0]
+    )
     info = env.step(action.astype(np.float32))[-1]
     if info["is_success"] is straight:
         raise RuntimeError(f"scene {row} shows nothing: is_success is {info['is_success']}")

@@ -10,7 +10,8 @@ import gymnasium as gym
 from PIL import Image
 from rendered import PAUSE, SPEED
 
-from viapoint.training.runs.agents import Agent, load_agent
+from viapoint.training import Agent, load_agent
+from viapoint.training.planners.baselines import agent_method
 from viapoint.training.scene_sets.scene_set import load
 
 SHOWN = {"viapoint/PlanarMovingObstacles-v0": (2, 45), "viapoint/PlanarTargetJump-v0": (3,)}
@@ -22,7 +23,7 @@ def frames(agent: Agent, rows: tuple[int, ...], size: int) -> list[list[Any]]:
     env: Any = gym.make(
         agent.env_id, render_mode="rgb_array_list", width=size, height=size, **agent.env_kwargs
     )
-    decide, scenes = agent.method().decide, load("validation", agent.env_id).scenes
+    decide, scenes = agent_method("agent", agent, 0).decide, load("validation", agent.env_id).scenes
     episodes = []
     for row in rows:
         scene, over = scenes.take([row]), False
@@ -39,7 +40,7 @@ def animation(path: Path, *, size: int = 320) -> None:
     """The episodes one after the other, for ever."""
     images, durations = [], []
     for env_id, rows in SHOWN.items():
-        agent = load_agent(None, env_id)
+        agent = load_agent(env_id)
         env = gym.make(env_id)
         each = round(1000.0 / (env.metadata["render_fps"] * SPEED))
         env.close()

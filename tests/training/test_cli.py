@@ -8,9 +8,9 @@ import shlex
 import pytest
 
 from viapoint.envs.registration import ENV_IDS
+from viapoint.training.algorithms.agent import find_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import EvaluateConfig, TrainConfig
-from viapoint.training.runs.agents import pretrained_folder
 from viapoint.training.scene_sets.scene_set import load
 
 ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
@@ -41,9 +41,9 @@ def test_words_become_a_configuration():
     config = cli.parse(["train", "--env-kwargs", "n_via=2", "timing=learned", "--hyperparameters", "tau=0.1"])
     assert config.env_kwargs == {"n_via": 2, "timing": "learned"}
     assert config.hyperparameters == {"tau": 0.1}
-    config = cli.parse(shlex.split("evaluate runs/x --methods agent planner --json a.json"))
+    config = cli.parse(shlex.split("evaluate runs/x --baselines planner --json a.json"))
     assert isinstance(config, EvaluateConfig)
-    assert (str(config.run), config.methods, str(config.json)) == ("runs/x", ("agent", "planner"), "a.json")
+    assert (config.agent, config.baselines, str(config.json)) == ("runs/x", ("planner",), "a.json")
 
 
 @pytest.mark.parametrize("words", [[], *([name] for name in cli.COMMANDS)])
@@ -79,30 +79,31 @@ def test_help_lists_the_environments(capsys):
         ("train --env-kwargs whole_arm=True", "whole_arm=True is no JSON"),
         ("train --env-kwargs num_envs=4", "--n-envs"),
         ("train --hyperparameters gamma=7", "gamma of viaq must be a number from 0 to 1, got 7"),
-        ("evaluate", "name a run folder"),
+        ("evaluate", "name an agent"),
         ("evaluate nowhere", "no run folder"),
         ("evaluate /etc/passwd", "it is a file"),
-        ("evaluate --methods magic", "search4096, got 'magic'"),
-        (f"evaluate --pretrained {REACH} --env {ENV}", f"env must be {REACH}"),
-        (f"evaluate --pretrained {REACH} --methods agent unrevised", "got 'unrevised'"),
-        (f"evaluate --env {ENV} --methods straight --failures there", "failures concerns the agent"),
-        (f"evaluate --env {ENV} --methods straight --json /", "json must be a file"),
-        (f"play --pretrained {REACH} --video film.gif", "video must end in .mp4, got film.gif"),
+        ("evaluate --baselines magic", "search4096, got 'magic'"),
+        (f"evaluate {REACH} --env {ENV}", f"env must be {REACH}"),
+        (f"evaluate {REACH} --baselines unrevised", "got 'unrevised'"),
+        ("play viapoint/Reach-v0", "no agent is shipped for 'viapoint/Reach-v0'"),
+        (f"evaluate --env {ENV} --baselines straight --failures there", "failures concerns an agent"),
+        (f"evaluate --env {ENV} --baselines straight --json /", "json must be a file"),
+        (f"play {REACH} --video film.gif", "video must end in .mp4, got film.gif"),
         ("paper --out /etc/passwd", "out /etc/passwd cannot be written"),
         ("paper --agent nowhere", "nowhere: is no run folder"),
         *(
-            (f"paper --agent {pretrained_folder(f'viapoint/{name}-v0')}", f"is of viapoint/{name}-v0")
+            (f"paper --agent {find_model(f'viapoint/{name}-v0')}", f"is of viapoint/{name}-v0")
             for name in ("PlanarReach", "PandaReach", "PlanarMovingObstacles")
         ),
         (
             'train --hyperparameters policy_kwargs={"heads":0}',
             "heads in policy_kwargs of viaq must be a whole",
         ),
-        (f"evaluate --env {ENV} --methods straight random straight", "straight is there twice"),
-        ("evaluate --pretrained viapoint/Nothing-v0", "no pretrained agent for 'viapoint/Nothing-v0'"),
-        (f"evaluate --methods magic --env {ENV} --scenes test", "magic"),
-        (f"evaluate --methods straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
-        ("evaluate --methods straight", "--env"),
+        (f"evaluate --env {ENV} --baselines straight random straight", "straight is there twice"),
+        ("evaluate viapoint/Nothing-v0", "agents are shipped for viapoint/PandaMovingObstacles-v0"),
+        (f"evaluate --baselines magic --env {ENV} --scenes test", "magic"),
+        (f"evaluate --baselines straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
+        ("evaluate --baselines straight", "--env"),
         ("play nowhere", "no run folder"),
         ("train --out . --n-timesteps 1", "is not empty"),
     ],
@@ -150,7 +151,7 @@ def trained(tmp_path_factory):
 
 def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     results = tmp_path / "new" / "results.json"
-    words = ["evaluate", trained, "--methods", "agent", "straight", "--scenes", "test", "--json", results]
+    words = ["evaluate", trained, "--baselines", "straight", "--scenes", "test", "--json", results]
     run(*words, "--n-scenes", 12)
     printed = capsys.readouterr().out
     assert "straight" in printed
@@ -158,7 +159,7 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
     record = json.loads(results.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == ENV
-    run(*words[:3], "agent", "--checks", 0, 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
+    run(*words[:3], "--checks", 0, 8, "--n-scenes", 4, "--failures", tmp_path / "failures")
     counts = json.loads((tmp_path / "failures" / "failures.json").read_text())
     assert counts["method"] == "agent, 8 checks"
     kept = json.loads((trained / "evaluations" / "test.first-4.json").read_text())
@@ -168,9 +169,9 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path):
     few = load("test", ENV).take(slice(3, 6))
     few.save(tmp_path / "test.npz")
-    run("evaluate", trained, "--methods", "straight", "--scenes", "test")
+    run("evaluate", trained, "--baselines", "straight", "--scenes", "test")
     for words in (("--n-scenes", 4), ("--scenes", tmp_path / "test.npz"), ("--n-scenes", 1000)):
-        run("evaluate", trained, "--methods", "straight", *words)
+        run("evaluate", trained, "--baselines", "straight", *words)
     kept = {
         path.name: json.loads(path.read_text())["methods"]["straight line"]["scenes"]
         for path in (trained / "evaluations").glob("test*.json")
@@ -181,12 +182,12 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path)
 
 
 def test_the_environment_is_that_of_the_run_or_of_the_pretrained_agent(trained, shipped, capsys):
-    run("evaluate", trained, "--methods", "straight", "--n-scenes", 2)
+    run("evaluate", trained, "--baselines", "straight", "--n-scenes", 2)
     assert ENV in capsys.readouterr().out
-    run("evaluate", "--pretrained", ENV, "--env", ENV, "--methods", "straight", "--n-scenes", 2)
+    run("evaluate", ENV, "--env", ENV, "--baselines", "straight", "--n-scenes", 2)
     assert ENV in capsys.readouterr().out
     assert f"env must be {ENV}" in failed(
-        capsys, "evaluate", trained, "--env", REACH, "--methods", "straight"
+        capsys, "evaluate", trained, "--env", REACH, "--baselines", "straight"
     )
 
 
@@ -197,7 +198,7 @@ def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
         "--env-kwargs", "n_obstacles=3", "threads=1",
     )  # fmt: skip
     capsys.readouterr()
-    run("evaluate", folder, "--methods", "agent", "straight", "--n-scenes", 3)
+    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 3)
     assert "with n_obstacles=3: they are drawn" in capsys.readouterr().err
     record = json.loads((folder / "evaluations" / "test.first-3.json").read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [3, 3]

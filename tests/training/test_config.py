@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from viapoint.training.algorithms.model_io import ALGORITHMS
 from viapoint.training.config import configs
-from viapoint.training.config.checks import ELSEWHERE
-from viapoint.training.config.checks import METHODS as MEASURABLE
+from viapoint.training.config.checks import BASELINES, ELSEWHERE
 from viapoint.training.config.configs import (
     BenchConfig,
     DemoConfig,
@@ -21,7 +21,6 @@ from viapoint.training.config.configs import (
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.config_json import as_json, from_json
 from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS
-from viapoint.training.runs.model_io import ALGORITHMS
 
 EXAMPLES = [
     TrainConfig(),
@@ -33,8 +32,8 @@ EXAMPLES = [
         env_kwargs={"n_via": 2, "timing": "learned"},
         hyperparameters={"batch_size": 3},
     ),
-    EvaluateConfig(run=Path("runs/x"), methods=("agent", "random80"), json=Path("a.json")),
-    PlayConfig(pretrained="viapoint/PlanarReach-v0"),
+    EvaluateConfig(agent="runs/x", baselines=("untrained", "random80"), json=Path("a.json")),
+    PlayConfig(agent="viapoint/PlanarReach-v0"),
     BenchConfig(num_envs=3),
     DemoConfig(out=Path("d"), n_scenes=4),
 ]
@@ -76,7 +75,7 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"n_timesteps": 0}, "n_timesteps"),
         (TrainConfig, {"env_kwargs": ("n_via",)}, "env_kwargs must be values by name"),
         (TrainConfig, {"hyperparameters": 5}, "hyperparameters must be values by name, got 5"),
-        (EvaluateConfig, {"methods": ("agent", "agent"), "pretrained": "x"}, "agent is there twice"),
+        (EvaluateConfig, {"baselines": ("ompl", "ompl"), "agent": "x"}, "ompl is there twice"),
         (TrainConfig, {"n_envs": True}, "n_envs"),
         (TrainConfig, {"n_envs": 10**9}, "n_envs must be a whole number, from 1 to 65536"),
         (TrainConfig, {"seed": 2**32}, "seed must be a whole number, from 0 to 4294967295"),
@@ -89,22 +88,18 @@ def test_nothing_is_shared_between_two_configurations():
         ),
         (TrainConfig, {"hyperparameters": {"batch_size": -3}}, "batch_size of viaq must be a whole number"),
         *[(TrainConfig, {"env_kwargs": {name: 1}}, f"{name} cannot be among") for name in ELSEWHERE],
-        (EvaluateConfig, {}, "name a run folder"),
-        (EvaluateConfig, {"methods": ("magic",)}, "agent, untrained, straight, .* got 'magic'"),
-        (EvaluateConfig, {"methods": ("straight",)}, "--env must say"),
+        (EvaluateConfig, {}, "name an agent .*--env"),
+        (EvaluateConfig, {"baselines": ("magic",)}, "untrained, straight, .* got 'magic'"),
         *[
             (
                 EvaluateConfig,
-                {"run": Path("a"), "methods": ("straight",), name: value},
-                f"{name} concerns the agent",
+                {"env": "viapoint/PlanarReach-v0", name: value},
+                f"{name} concerns an agent",
             )
             for name, value in (("checks", (8,)), ("failures", Path("b")))
         ],
-        (EvaluateConfig, {"run": Path("a"), "pretrained": "b"}, "not both"),
-        (EvaluateConfig, {"run": Path("a"), "methods": ()}, "methods"),
-        (EvaluateConfig, {"methods": ("planner",), "env": "nothing"}, "env"),
-        (PlayConfig, {}, "name a run folder"),
-        (PlayConfig, {"run": Path("a"), "n_scenes": 0}, "n_scenes"),
+        (EvaluateConfig, {"baselines": ("planner",), "env": "nothing"}, "env"),
+        (PlayConfig, {"agent": "a", "n_scenes": 0}, "n_scenes"),
         (BenchConfig, {"num_envs": 0}, "num_envs"),
         (BenchConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "an action is a whole movement"),
         (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}, "viapoint/PlanarWholeArm-v0 for one"),
@@ -120,8 +115,8 @@ def test_what_cannot_be_meant_is_refused(kind, values, named):
 @pytest.mark.parametrize(
     ("kind", "name", "needed"),
     [
-        (EvaluateConfig, "json", {"run": Path("a")}),
-        (PlayConfig, "video", {"run": Path("a")}),
+        (EvaluateConfig, "json", {"agent": "a"}),
+        (PlayConfig, "video", {"agent": "a"}),
         (BenchConfig, "json", {}),
     ],
 )
@@ -144,7 +139,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_there_is_anything_to_wr
 @pytest.mark.parametrize(
     ("kind", "name", "needed"),
     [
-        (EvaluateConfig, "failures", {"run": Path("a")}),
+        (EvaluateConfig, "failures", {"agent": "a"}),
         (PaperConfig, "out", {}),
         (PaperConfig, "guide", {}),
         (DemoConfig, "out", {}),
@@ -161,7 +156,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(kind, name, needed, tmp_p
 
 
 def test_every_method_can_be_named():
-    assert set(MEASURABLE) == {"agent", "untrained", *METHODS, *ONLINE_METHODS}
+    assert set(BASELINES) == {"untrained", *METHODS, *ONLINE_METHODS}
 
 
 def test_unknown_names_in_a_file_are_refused():

@@ -15,11 +15,11 @@ from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.actions.via_points import MOST_VIAS
 from viapoint.envs.scenes.config import MOST_OBSTACLES
+from viapoint.training.algorithms.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.checkpoints import _digest, read_checkpoint, write_checkpoint
-from viapoint.training.runs.model_io import build, load_model, save_model
 
 ENV = "viapoint/PlanarObstacles-v0"
 MEGABYTE = 1 << 20

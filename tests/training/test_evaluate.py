@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from viapoint.training.cli.demo import StoredSolutions
-from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate
+from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planners.baselines import make_method
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.scene_sets.scene_set import BANDS
@@ -29,7 +29,9 @@ class Given:
 
 
 def run(methods, scenes, **kwargs):
-    return evaluate(methods, scenes, ENV, env_kwargs={"threads": 1}, **{"time_decisions": False, **kwargs})
+    return evaluate_methods(
+        methods, scenes, ENV, env_kwargs={"threads": 1}, **{"time_decisions": False, **kwargs}
+    )
 
 
 def test_every_method_meets_the_same_scenes(small_scenes):
@@ -142,7 +144,7 @@ def test_an_interrupted_evaluation_keeps_what_is_done(small_scenes):
         ("first", 40, False),
         ("second", 20, True),
     ]
-    record = json.loads(json.dumps(evaluation.as_json(), allow_nan=False))
+    record = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))
     assert record["methods"]["second"]["scenes"] == 20
     at_once = run([Interrupted("x", zeros)], small_scenes.take(slice(0, 0 + 30)), batch=10)
     assert at_once.results[0].partial
@@ -155,7 +157,7 @@ def test_an_evaluation_interrupted_before_its_first_scene_can_be_written(small_s
         def decide(self, observation, scenes):
             raise KeyboardInterrupt
 
-    record = json.loads(json.dumps(run([AtOnce()], small_scenes).as_json(), allow_nan=False))
+    record = json.loads(json.dumps(run([AtOnce()], small_scenes).to_dict(), allow_nan=False))
     assert record["partial"] is True
     assert record["methods"]["at once"]["success"]["rate"] is None
 
@@ -184,7 +186,7 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
 
 def test_comparisons_are_with_the_first(small_scenes):
     zeros = np.zeros(small_scenes.solution.shape)
-    record = run([Given("straight", zeros), StoredSolutions(small_scenes)], small_scenes).as_json()
+    record = run([Given("straight", zeros), StoredSolutions(small_scenes)], small_scenes).to_dict()
     comparison = record["compared_with_first"]["planner (stored)"]
     solved = int((small_scenes.share > 0).sum())
     assert (comparison["only_first"], comparison["only_second"]) == (solved, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.plotting import failure_report as module
 from viapoint.training.plotting.failure_report import KINDS, kinds, markdown, proposals, sort_out, write
 from viapoint.training.rollouts.rollout import Trial
@@ -62,7 +62,7 @@ def sorted_out(small_scenes):
     env = ViaVecEnv(ENV, 1, threads=1)
     model = new_model(resolved(TrainConfig(env=ENV)), env)  # untrained
     trial = Trial(ENV, 64, threads=1)
-    result = evaluate(
+    result = evaluate_methods(
         [Chosen(model, trial)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
     ).results[0]
     return result, sort_out(result, small_scenes, model, ENV, threads=1)

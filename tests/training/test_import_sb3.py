@@ -12,10 +12,10 @@ import pytest
 from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC, TD3
 
+from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.cli import import_sb3
 from viapoint.training.cli import main as cli
 from viapoint.training.io.files import BadFileError
-from viapoint.training.runs import model_io
-from viapoint.training.runs.model_io import load_model
 
 ENV = "viapoint/PlanarObstacles-v0"
 KINDS = {"ppo": PPO, "sac": SAC, "td3": TD3, "tqc": TQC}
@@ -53,7 +53,7 @@ def test_it_decides_as_it_did(algo, tmp_path, capsys):
 def test_it_can_be_measured(shipped, tmp_path, capsys):
     archive(PPO, tmp_path / "model.zip")
     cli.main(words(tmp_path / "model.zip", tmp_path / "out", "--trust"))
-    cli.main(["evaluate", str(tmp_path / "out"), "--methods", "agent", "straight", "--n-scenes", "6"])
+    cli.main(["evaluate", str(tmp_path / "out"), "--baselines", "straight", "--n-scenes", "6"])
     assert "agent" in capsys.readouterr().out
 
 
@@ -85,7 +85,7 @@ def test_nothing_is_opened_unasked(evil, tmp_path, capsys, monkeypatch):
     assert end.value.code == 2
     assert "--trust" in capsys.readouterr().err
     for answer, opened in (("", False), ("y", False), ("no", False), ("yes", True)):
-        monkeypatch.setattr(model_io.sys, "stdin", Terminal())
+        monkeypatch.setattr(import_sb3.sys, "stdin", Terminal())
         monkeypatch.setattr("builtins.input", lambda question, answer=answer: answer)
         if opened:
             cli.main(words(evil, tmp_path / "out"))
@@ -115,7 +115,7 @@ def test_what_is_no_such_archive_is_refused_unopened(tmp_path, capsys):
         if bytes_ is not None:
             (tmp_path / name).write_bytes(bytes_)
         with pytest.raises(BadFileError, match=reason):
-            model_io.algorithm_of(tmp_path / name)
+            import_sb3.algorithm_of(tmp_path / name)
         with pytest.raises(SystemExit):
             cli.main(words(tmp_path / name, tmp_path / "out", "--trust"))
     assert not (tmp_path / "out").exists()
@@ -124,11 +124,11 @@ def test_what_is_no_such_archive_is_refused_unopened(tmp_path, capsys):
 def test_what_does_not_fit_is_refused(tmp_path):
     archive(PPO, tmp_path / "other.zip", "viapoint/PlanarReach-v0")
     with pytest.raises(BadFileError, match="holds no plain ppo model for viapoint/PlanarObstacles-v0"):
-        model_io.convert(tmp_path / "other.zip", "ppo", ENV, tmp_path / "out")
+        import_sb3.convert(tmp_path / "other.zip", "ppo", ENV, tmp_path / "out")
     with pytest.raises(BadFileError, match="cannot be opened as sac"):
-        model_io.convert(tmp_path / "other.zip", "sac", ENV, tmp_path / "out")
+        import_sb3.convert(tmp_path / "other.zip", "sac", ENV, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
     with pytest.raises(BadFileError, match="is not empty"):
-        model_io.run(cli.parse(words(tmp_path / "other.zip", tmp_path / "full", "--trust")))
+        import_sb3.run(cli.parse(words(tmp_path / "other.zip", tmp_path / "full", "--trust")))

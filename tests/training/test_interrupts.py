@@ -12,11 +12,12 @@ import time
 import numpy as np
 import pytest
 
+from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.runs import run_dir
-from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -91,7 +92,7 @@ def test_ctrl_c_in_an_evaluation_leaves_what_is_finished_and_says_that_it_is_par
     small_scenes.save(tmp_path / "scenes.npz")
     out = tmp_path / "out.json"
     words = ["evaluate", "--env", ENV, "--scenes", tmp_path / "scenes.npz", "--json", out]
-    process = start(*words, "--methods", "straight", "random80", "planner")
+    process = start(*words, "--baselines", "straight", "random80", "planner")
     seen = ""
     while "straight line" not in seen:  # it is done, and the next method is at work
         read = process.stderr.read(1)
@@ -110,7 +111,17 @@ def test_ctrl_c_in_an_evaluation_leaves_what_is_finished_and_says_that_it_is_par
 
 def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipped):
     run = train(config(tmp_path / "run", n_timesteps=32))
-    words = ["evaluate", str(run.folder), "--env", ENV, "--methods", "straight", "random", "--n-scenes", "4"]
+    words = [
+        "evaluate",
+        str(run.folder),
+        "--env",
+        ENV,
+        "--baselines",
+        "straight",
+        "random",
+        "--n-scenes",
+        "4",
+    ]
     cli.main(words)
     whole = (run.folder / "evaluations" / "test.first-4.json").read_text()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners import ompl_planner
 from viapoint.training.planners.baselines import make_method
 from viapoint.training.planners.ompl_planner import points_on
@@ -26,7 +26,9 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     pytest.importorskip("ompl")
     frozen = load("validation", WHOLE)
     frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:5] for band in range(4)]))
-    result = evaluate([make_method("ompl", WHOLE)], frozen, WHOLE, batch=20, time_decisions=False).results[0]
+    result = evaluate_methods(
+        [make_method("ompl", WHOLE)], frozen, WHOLE, batch=20, time_decisions=False
+    ).results[0]
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
     assert summary["jerk_ratio"] < 50.0

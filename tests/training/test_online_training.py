@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json
 from viapoint.training.planners.baselines import make_method
 from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
-from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.generate_replanning import SIZES, shares
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
@@ -19,7 +20,7 @@ MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-
 def results(env_id, *names, number=12):
     frozen = load("validation", env_id).take(slice(0, number))
     methods = [make_method(name, env_id) for name in names]
-    found = evaluate(methods, frozen, env_id, time_decisions=False).results
+    found = evaluate_methods(methods, frozen, env_id, time_decisions=False).results
     return {name: each.summary()["success"]["rate"] for name, each in zip(names, found, strict=True)}
 
 

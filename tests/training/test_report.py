@@ -10,7 +10,7 @@ from rich.console import Console
 
 from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.plotting import plots
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -27,8 +27,10 @@ class Still:
 
 @pytest.fixture(scope="module")
 def record(small_scenes):
-    evaluation = evaluate([Still(), StoredSolutions(small_scenes)], small_scenes, ENV, time_decisions=False)
-    return evaluation.as_json()
+    evaluation = evaluate_methods(
+        [Still(), StoredSolutions(small_scenes)], small_scenes, ENV, time_decisions=False
+    )
+    return evaluation.to_dict()
 
 
 def test_the_document_holds_every_method_and_metric(record, tmp_path):

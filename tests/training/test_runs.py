@@ -11,14 +11,15 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from viapoint.envs.arms import ARMS, PANDA
+from viapoint.training.algorithms.agent import find_model
+from viapoint.training.algorithms.model_io import build, describe, load_model, save_model, weights
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io import files
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
-from viapoint.training.runs.model_io import build, describe, load_model, save_model, weights
-from viapoint.training.runs.run_dir import Run, find_model
+from viapoint.training.runs.run_dir import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
 

@@ -6,16 +6,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.training.algorithms.model_io import build, load_model
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import STEP_PRESETS
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners.baselines import Straight, agent_method
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import validation_scenes
-from viapoint.training.runs.model_io import build
-from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import load
 
@@ -80,7 +80,7 @@ def test_it_stands_in_one_table_with_the_others(model):
     assert isinstance(agent_method("agent", model), StepAgentMethod)
     frozen = load("validation", WHOLE).take(slice(0, 12))
     methods = [agent_method("agent", model), Straight(Trial(WHOLE, 4))]
-    result = evaluate(methods, frozen, WHOLE, batch=5, time_decisions=False)
+    result = evaluate_methods(methods, frozen, WHOLE, batch=5, time_decisions=False)
     for each in result.results:
         assert each.summary()["scenes"] == 12
     assert set(result.results[1].outcomes) <= set(result.results[0].outcomes)

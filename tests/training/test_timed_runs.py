@@ -6,11 +6,11 @@ import pytest
 from decision_chain import SECONDS, Chain
 
 from viapoint.envs.velocity_env import StepReachVectorEnv
+from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.algorithms.smdp_buffers import unit_of
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import BadFileError, read_arrays, read_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.model_io import load_model
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 

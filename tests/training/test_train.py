@@ -8,13 +8,14 @@ import signal
 import numpy as np
 import pytest
 
+from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import callback
-from viapoint.training.runs.run_dir import Run, load_model
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingStoppedError, train
 
 TINY = {
@@ -99,7 +100,7 @@ def test_a_run_is_the_same_watched_or_not(tmp_path):
             read_arrays(alone.folder / "final" / "weights.safetensors")[part], array
         )
     assert alone.curve == []
-    assert alone.model_folder.name == "final"
+    assert alone.best.name == "final"
 
 
 def test_another_seed_is_another_run(tmp_path):
@@ -118,11 +119,13 @@ def test_what_a_run_leaves(tmp_path):
         assert record["success"]["low"] <= record["success"]["rate"] <= record["success"]["high"]
     assert list((run.folder / "tensorboard").glob("events.*"))
     best = max(record["success"]["rate"] for record in run.curve)
-    model = load_model(run.model_folder)
-    assert run.model_folder.name == "best"
+    model = load_model(run.best)
+    assert run.best.name == "best"
     scenes = callback.validation_scenes(run)
     method = callback.agent_method("agent", model)
-    again = evaluate([method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False)
+    again = evaluate_methods(
+        [method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False
+    )
     assert again.results[0].success.mean() == best
 
 

@@ -262,7 +262,7 @@ def test_an_unknown_id_is_answered_with_those_that_there_are(make):
         "from viapoint.training.rollouts.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
         "from viapoint.training.search.geometry_search import GeometrySearch; GeometrySearch(ID)",
         "from viapoint.training.rollouts.rollout import Trial; Trial(ID, 2)",
-        "from viapoint.training.cli.commands import load_agent; load_agent(None, ID)",
+        "from viapoint.training import load_agent; load_agent(ID)",
     ],
 )
 def test_whoever_is_given_an_id_registers_it(line):

@@ -23,7 +23,9 @@ from torch.nn import functional
 from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.mdp.task import Task
+from viapoint.training.algorithms.agent import Agent
 from viapoint.training.algorithms.critic import Values
+from viapoint.training.algorithms.model_io import ALGORITHMS
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
 from viapoint.training.algorithms.policy import KEEP, ViaQPolicy
 from viapoint.training.config.checks import PARTICULAR, check_hyperparameters, check_via_policy
@@ -41,7 +43,7 @@ CONTACT_WEIGHT = 0.1
 """Weight of the contact loss; the clearance loss carries finer information on the same event."""
 
 
-class ViaQ(OffPolicyAlgorithm):
+class ViaQ(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that chooses via-points by ranking candidate plans.
 
     Args:
@@ -62,6 +64,13 @@ class ViaQ(OffPolicyAlgorithm):
 
     Raises:
         ValueError: A hyperparameter is out of range, or the environment has no task of this package.
+
+    Example:
+        >>> from viapoint.training import ViaQ, ViaVecEnv
+        >>> agent = ViaQ("ViaQPolicy", ViaVecEnv("viapoint/PlanarObstacles-v0", 64, seed=0), learning_starts=64)
+        >>> agent = agent.learn(128)
+        >>> agent.num_timesteps
+        128
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaQPolicy": ViaQPolicy}
@@ -297,3 +306,6 @@ def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with NumPy scalars converted to Python numbers."""
     return {name: each.item() if isinstance(each, np.generic) else each for name, each in settings.items()}
+
+
+ALGORITHMS["viaq"] = ViaQ

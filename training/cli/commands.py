@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,17 @@ import gymnasium as gym
 import numpy as np
 from tqdm.auto import tqdm
 
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
+from viapoint.training.algorithms.agent import Agent, load_agent
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
+from viapoint.training.evaluation.evaluator import check_baselines, task_of
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import write_json
-from viapoint.training.planners.baselines import Method, check_method, make_method
-from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
+from viapoint.training.planners.baselines import agent_method
 from viapoint.training.plotting.failure_report import sort_out, write
-from viapoint.training.rollouts.rollout import OnlineTrial
-from viapoint.training.rollouts.step_rollout import is_step_wise, whole_task
+from viapoint.training.rollouts.step_rollout import whole_task
 from viapoint.training.runs import trainer as training
-from viapoint.training.runs.agents import Agent, load_agent
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import SETS, FrozenScenes, scenes_for
 
@@ -48,29 +47,37 @@ def train(config: TrainConfig) -> None:
 
 
 def evaluate(config: EvaluateConfig) -> None:
-    """Measure, print the table, and write the results."""
-    agent = load_agent(config.run, config.pretrained) if config.run or config.pretrained else None
-    env_id, env_kwargs = _task_of(config, agent)
+    """Evaluate, print the table, and write the results."""
+    agent = None if config.agent is None else load_agent(config.agent)
+    if config.failures is not None:
+        _check_failures(agent)
+    env_id, env_kwargs = task_of(agent, config.env, None)
+    check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
-    frozen = whole.take(slice(0, config.n_scenes))
-    methods = _methods(config, agent, env_id, env_kwargs)
-    with progress_bar(methods, len(frozen.share)) as progress, training.one_thread():
-        result = measure(methods, frozen, env_id, env_kwargs=env_kwargs, progress=progress)
-    record = result.as_json()
+    scenes = whole.take(slice(0, config.n_scenes))
+    with progress_bar() as progress, training.one_thread():
+        result = measure(
+            agent,
+            env=config.env,
+            scenes=scenes,
+            checks=config.checks,
+            baselines=config.baselines,
+            progress=progress,
+        )
+    record = result.to_dict()
     report.show(record)
-    if config.run is not None and (config.run / "config.json").is_file():
-        name = _kept_as(config.scenes, whole, len(frozen.share), partial=result.partial)
-        print(f"kept as {Run(config.run).write_evaluation(name, record)}")
+    if config.agent is not None and (Path(config.agent) / "config.json").is_file():
+        name = _kept_as(config.scenes, whole, len(scenes.share), partial=result.partial)
+        print(f"kept as {Run(config.agent).write_evaluation(name, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
     if result.partial:
         raise EvaluationStoppedError("stopped: the results are partial")
-    if config.failures is not None and agent is not None:
+    if config.failures is not None:
         last = [each for each in result.results if each.name.startswith("agent")][-1]
-        done = frozen.take(slice(0, len(last.success)))
-        failures = sort_out(last, done, agent.model, env_id, **env_kwargs)
+        failures = sort_out(last, scenes.take(slice(0, len(last.success))), agent, env_id, **env_kwargs)
         write(failures, config.failures, env_id, **env_kwargs)
         print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
@@ -82,50 +89,28 @@ def _kept_as(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) ->
     return name + (".partial" if partial else "")
 
 
-def _task_of(config: EvaluateConfig, agent: Agent | None) -> tuple[str, dict[str, Any]]:
-    """Id and arguments of the environment to measure in.
+def _check_failures(agent: Agent | None) -> None:
+    """Check that an agent's actions are whole movements.
 
     Raises:
-        ValueError: The agent is for another one than was named, or what was asked for cannot be had there.
+        ValueError: They are not.
     """
-    mine = agent.env_id if agent else str(config.env)
-    env_id, env_kwargs = whole_task(mine, agent.env_kwargs if agent else {})
-    if config.env not in (None, mine, env_id):
-        raise ValueError(
-            f"env must be {mine}, on which the agent of {config.run or config.pretrained} was trained, or be left "
-            f"out, got {config.env!r}"
-        )
-    if config.failures is not None and (is_step_wise(mine) or env_id in ONLINE_TASKS):
-        raise ValueError(f"failures are sorted where one action is a whole movement; in {mine} it is not")
-    for name in config.methods:
-        check_method(name, env_id)
-    return env_id, env_kwargs
-
-
-def _methods(
-    config: EvaluateConfig, agent: Agent | None, env_id: str, env_kwargs: Mapping[str, Any]
-) -> list[Method]:
-    """What is measured, in the order in which it was named."""
-    methods: list[Method] = []
-    for name in config.methods:
-        if name == "unrevised" and agent:
-            methods.append(OpenLoopBaseline(agent.method(), OnlineTrial(env_id, **env_kwargs)))
-        elif name not in ("agent", "untrained"):
-            methods.append(make_method(name, env_id, **env_kwargs))
-        elif agent:
-            methods += [getattr(agent, "method" if name == "agent" else name)(n) for n in config.checks]
-    return methods
+    env_id = "" if agent is None else agent.env_id
+    if env_id in STEP_TASKS or env_id in ONLINE_TASKS:
+        raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
 
 
 def play(config: PlayConfig) -> None:
     """Film an agent's movements."""
     from viapoint.training.plotting.video import film
 
-    agent = load_agent(config.run, config.pretrained)
+    agent = load_agent(config.agent)
     scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
     rows = spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    method = agent.method(config.checks)
+    method = agent_method(
+        f"agent, {config.checks} checks" if config.checks else "agent", agent, config.checks
+    )
     config.video.parent.mkdir(parents=True, exist_ok=True)
     film(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()
@@ -138,12 +123,14 @@ def spread(number: int, count: int) -> Any:
 
 
 @contextmanager
-def progress_bar(methods: Sequence[Method], scenes: int) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar over methods and scenes."""
-    with tqdm(total=scenes * len(methods), unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar over the scenes of each method."""
+    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
 
         def progress(name: str, done: int, total: int) -> None:
-            bar.set_description(name)
-            bar.update(done - (bar.n % total))
+            if bar.desc != f"{name}: ":
+                bar.reset(total)
+                bar.set_description(name)
+            bar.update(done - bar.n)
 
         yield progress

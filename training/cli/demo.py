@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.algorithms.agent import Agent, find_model, load_agent
+from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.cli.commands import progress_bar, spread
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_json
-from viapoint.training.planners.baselines import Method, make_method
+from viapoint.training.planners.baselines import Method, agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.plotting.video import film
-from viapoint.training.runs.agents import Agent, load_agent
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread, train
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
@@ -61,7 +62,8 @@ def run(config: DemoConfig) -> None:
     began = time.monotonic()
     folder = config.out
     trained = _trained(config)
-    agent = load_agent(folder, None)
+    model_folder = find_model(folder)
+    agent = load_agent(model_folder)
     frozen = load("test", config.env).take(slice(0, config.n_scenes))
     record = _measured(config, agent, frozen)
     pictures: dict[str, Callable[[Path], Any]] = {
@@ -75,7 +77,7 @@ def run(config: DemoConfig) -> None:
         "movements.mp4": lambda path: _film(path, agent, frozen),
     }
     for name, draw in pictures.items():
-        _once(folder / name, agent.folder / "weights.safetensors", draw)
+        _once(folder / name, model_folder / "weights.safetensors", draw)
     report.show(record)
     for name, what in (
         ("table.md", "the table"),
@@ -84,7 +86,7 @@ def run(config: DemoConfig) -> None:
         ("success_by_band.png", "success by difficulty"),
         ("gallery.png", "test scenes, planned and executed"),
         ("movements.mp4", "movements"),
-        (agent.folder.name, "the trained agent"),
+        (model_folder.name, "the trained agent"),
     ):
         print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
@@ -99,7 +101,7 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
     for row in by_difficulty[spread(len(by_difficulty), count)]:
         scene = frozen.scenes.take([row])
         observation, _ = env.reset(options=scene.as_options())
-        action, _ = agent.model.predict(observation, deterministic=True)
+        action, _ = agent.predict(observation, deterministic=True)
         info = env.step(action)[-1]
         result.append(
             Entry(
@@ -143,7 +145,9 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     path = config.out / "table.json"
     identity = {
         "sha256": frozen.sha256,
-        "weights_sha256": hashlib.sha256((agent.folder / "weights.safetensors").read_bytes()).hexdigest(),
+        "weights_sha256": hashlib.sha256(
+            (find_model(config.out) / "weights.safetensors").read_bytes()
+        ).hexdigest(),
         "checks": config.checks,
     }
     if path.exists():
@@ -151,11 +155,15 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
             print(f"{path} holds its evaluation: starting from it")
             return record
-    methods: list[Method] = [agent.method(), agent.method(config.checks), agent.untrained()]
+    methods: list[Method] = [
+        agent_method("agent", agent, 0),
+        agent_method(f"agent, {config.checks} checks", agent, config.checks),
+        agent_method("untrained", untrained(agent), 0),
+    ]
     methods += [*(make_method(name, config.env) for name in BASELINES), StoredSolutions(frozen)]
-    with progress_bar(methods, len(frozen.share)) as progress, one_thread():
-        result = evaluate(methods, frozen, config.env, progress=progress)
-    record = {**result.as_json(), **identity}
+    with progress_bar() as progress, one_thread():
+        result = evaluate_methods(methods, frozen, config.env, progress=progress)
+    record = {**result.to_dict(), **identity}
     report.write(record, config.out)
     if result.partial:
         raise KeyboardInterrupt
@@ -164,7 +172,12 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    film(path, env, frozen.scenes.take(spread(len(frozen.share), MOVEMENTS)), agent.method().decide)
+    film(
+        path,
+        env,
+        frozen.scenes.take(spread(len(frozen.share), MOVEMENTS)),
+        agent_method("agent", agent, 0).decide,
+    )
     env.close()
 
 

@@ -62,8 +62,8 @@ print("an optimizer was made after a frame was rendered")
 """
 UPDATE_TRITON = "import torch (and triton) before the first picture is rendered, or pip uninstall triton"
 AGENT = """
-from viapoint.training.cli.commands import load_agent
-agent = load_agent(None, "viapoint/PlanarObstacles-v0")
+from viapoint.training import load_agent
+agent = load_agent("viapoint/PlanarObstacles-v0")
 print("the shipped agent of", agent.env_id, "loads")
 """
 

@@ -51,7 +51,7 @@ COMMANDS: dict[str, Command] = {
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
-    "import-sb3": Command(ImportConfig, "viapoint.training.runs.model_io", "run"),
+    "import-sb3": Command(ImportConfig, "viapoint.training.cli.import_sb3", "run"),
 }
 """Every subcommand by its name; one line adds one."""
 

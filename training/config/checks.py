@@ -13,11 +13,11 @@ from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, OWN_ARM_TASKS, STE
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 
-METHODS = (
-    "agent", "untrained", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
+BASELINES = (
+    "untrained", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",
     "search16", "search64", "search512", "search4096",
 )  # fmt: skip
-"""Everything that can be measured; not every environment has each of them."""
+"""Names of baselines; not every environment has each of them."""
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
@@ -72,23 +72,13 @@ def check_whole(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
 
 
-def check_one_source(run: Path | None, pretrained: str | None, *, needed: bool) -> None:
-    """Refuse two agents, or none where one is needed."""
-    if run is not None and pretrained is not None:
-        raise ValueError("give a run folder or --pretrained, not both")
-    if needed and run is None and pretrained is None:
-        raise ValueError("name a run folder, or an environment with --pretrained")
-
-
-def check_methods(methods: tuple[str, ...]) -> None:
-    """Refuse none, names that there are not, and one that is there twice, as a table has one row for each."""
-    if not methods:
-        raise ValueError("methods must name at least one method")
-    for name in methods:
-        if name not in METHODS:
-            raise ValueError(f"methods must be some of {', '.join(METHODS)}, got {name!r}")
-        if methods.count(name) > 1:
-            raise ValueError(f"methods must differ, {name} is there twice")
+def check_baselines(names: tuple[str, ...]) -> None:
+    """Check that baselines exist and differ, as a table has one row for each."""
+    for name in names:
+        if name not in BASELINES:
+            raise ValueError(f"baselines must be some of {', '.join(BASELINES)}, got {name!r}")
+        if names.count(name) > 1:
+            raise ValueError(f"baselines must differ, {name} is there twice")
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:

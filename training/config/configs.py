@@ -11,14 +11,13 @@ import tyro
 from viapoint.envs.registration import STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
+    check_baselines,
     check_env,
     check_env_kwargs,
     check_file,
     check_folder,
     check_has_scenes,
     check_hyperparameters,
-    check_methods,
-    check_one_source,
     check_whole,
     check_whole_movements,
 )
@@ -123,21 +122,19 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """Measure agents and baselines on the same frozen scenes.
+    """Evaluate an agent and baselines on the same scenes.
 
-    Example: viapoint evaluate runs/first --methods agent straight planner --scenes test
+    Example: viapoint evaluate runs/first --baselines straight planner --scenes test
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """Run folder, or folder of a model."""
-    pretrained: str | None = None
-    """Id of an environment whose shipped agent is taken instead."""
-    methods: tuple[str, ...] = ("agent", "straight", "random", "planner")
-    """Some of agent, untrained (the same network before training), straight, constant, random, random16, random80,
-    planner, ompl, search16, search64, search512 and search4096 (the best of that many computed plans) and, where plans
-    are revised on the way, unrevised: the first plan alone."""
+    agent: tyro.conf.Positional[str | None] = None
+    """Run folder, model folder, or id of an environment with a shipped agent; baselines alone if not given."""
+    baselines: tuple[str, ...] = ("straight", "random", "planner")
+    """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
+    search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
+    with replanning, unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
-    """One row of the agent for each number: how many of its proposals are checked by exact geometry, 0 for none."""
+    """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
     """validation, test, hard, or a file of scenes."""
     n_scenes: int | None = None
@@ -147,16 +144,15 @@ class EvaluateConfig:
     failures: Path | None = None
     """Folder for counts and pictures of the agent's failures by kind; those of its last row in the table."""
     env: str | None = None
-    """Id of the environment where neither a run nor a pretrained agent says it."""
+    """Id of the environment; that of the agent if not given."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        check_methods(self.methods)
+        check_baselines(self.baselines)
         if self.env is not None:
             check_env(self.env)
-        check_one_source(self.run, self.pretrained, needed=bool({"agent", "untrained"} & set(self.methods)))
-        if self.run is None and self.pretrained is None and self.env is None:
-            raise ValueError("without an agent, --env must say which environment is meant")
+        if self.agent is None and self.env is None:
+            raise ValueError("name an agent (run folder, model folder or id), or an environment with --env")
         for number in self.checks:
             check_whole("checks", number, 0)
         if not self.checks:
@@ -166,21 +162,19 @@ class EvaluateConfig:
         check_file("json", self.json)
         check_folder("failures", self.failures)
         for name, asked in (("checks", any(self.checks)), ("failures", self.failures is not None)):
-            if asked and not {"agent", "untrained"} & set(self.methods):
-                raise ValueError(f"{name} concerns the agent, which is not among the methods")
+            if asked and self.agent is None:
+                raise ValueError(f"{name} concerns an agent, and none is given")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig:
-    """Film an agent's movements.
+    """Record a video of an agent's movements.
 
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """Run folder, or folder of a model."""
-    pretrained: str | None = None
-    """Id of an environment whose shipped agent is taken instead."""
+    agent: tyro.conf.Positional[str]
+    """Run folder, model folder, or id of an environment with a shipped agent."""
     video: Path = Path("movements.mp4")
     """File to write, an MP4."""
     scenes: str = "test"
@@ -192,7 +186,6 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
-        check_one_source(self.run, self.pretrained, needed=True)
         check_file("video", self.video, ".mp4")
         check_whole("n_scenes", self.n_scenes, 1)
         check_whole("checks", self.checks, 0)

@@ -29,7 +29,7 @@ class Preset:
     discount_unit: float | None = None
     """Seconds that count gamma; None where each decision does, whatever it takes."""
     hyperparameters: tuple[tuple[str, Any], ...]
-    """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.runs.model_io` writes them."""
+    """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.algorithms.model_io` writes them."""
 
     def arguments(self) -> dict[str, Any]:
         """The hyperparameters as a fresh dictionary."""

@@ -1,4 +1,4 @@
-"""Measuring methods on frozen scenes: the same scenes for each, every outcome kept."""
+"""Evaluation of agents and baselines on the same scenes, with every outcome."""
 
 from __future__ import annotations
 
@@ -6,18 +6,27 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.registration import ONLINE_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.algorithms.agent import load_agent
+from viapoint.training.algorithms.model_io import untrained
+from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
-from viapoint.training.planners.baselines import Method
-from viapoint.training.rollouts.rollout import Trial, new_trial
-from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes
+from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
+from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
+from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
+from viapoint.training.rollouts.step_rollout import whole_task
+from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
 Progress = Callable[[str, int, int], None]
 """Is told the method's name, the scenes that are done and the scenes that there are."""
@@ -91,25 +100,60 @@ class MethodResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """What several methods did in the same scenes."""
+class EvaluationResult:
+    """Outcomes of several methods in the same scenes.
+
+    Example:
+        >>> from viapoint.training import evaluate
+        >>> result = evaluate(env="viapoint/PlanarReach-v0", baselines=["straight", "random"], n_scenes=20)
+        >>> result.success_rate, [row["method"] for row in result.rows]
+        (1.0, ['straight line', 'random via-point'])
+        >>> print(result.to_markdown().splitlines()[0])  # doctest: +ELLIPSIS
+        # viapoint/PlanarReach-v0, scenes test (20, sha256 ...)
+    """
 
     env_id: str
+    """Id of the environment."""
     scenes: str
-    """Name of the set."""
+    """Name of the scene set."""
     sha256: str
-    """Of the set."""
+    """Hash of the scene set."""
     results: tuple[MethodResult, ...]
+    """Outcomes of each method, the agent first."""
     missing: bool = False
-    """Whether it was interrupted before the last method."""
+    """Mark of an evaluation that was interrupted before the last method."""
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the scenes in which the first method succeeded."""
+        return float(self.results[0].success.mean())
+
+    @property
+    def success_interval(self) -> tuple[float, float]:
+        """Wilson interval of that share at 95 %."""
+        interval = wilson(int(self.results[0].success.sum()), len(self.results[0].success))
+        return interval.low, interval.high
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """Metrics of each method by name, the name of the method as `method`.
+
+        Rates are dictionaries of `rate`, `low`, `high` (95 % Wilson interval), `count` and `of`; lengths are in [m] and
+        times in [s].
+        """
+        return [{"method": result.name, **result.summary()} for result in self.results]
+
+    def to_markdown(self) -> str:
+        """Return the table of all methods as a Markdown document."""
+        return report.markdown(self.to_dict())
 
     @property
     def partial(self) -> bool:
         """Whether it was interrupted before the end."""
         return self.missing or any(result.partial for result in self.results)
 
-    def as_json(self) -> dict[str, Any]:
-        """Metrics, comparisons with the first method, and every outcome, as JSON can hold them."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
         return {
             "env": self.env_id,
             "scenes": self.scenes,
@@ -128,6 +172,132 @@ class Evaluation:
 
 
 def evaluate(
+    agent: str | Path | BaseAlgorithm | Method | None = None,
+    *,
+    env: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    scenes: str | Path | FrozenScenes = "test",
+    n_scenes: int | None = None,
+    checks: int | Sequence[int] | None = None,
+    baselines: Sequence[str | Method] = (),
+    time_decisions: bool = True,
+    progress: Progress | None = None,
+) -> EvaluationResult:
+    """Evaluate an agent and baselines on the same scenes.
+
+    Ctrl-C ends the evaluation; the result then holds the finished scenes and is marked as partial.
+
+    Args:
+        agent: Id of an environment, for its shipped agent; run folder or model folder; an agent; any object with
+            `name` and `decide`, such as a :class:`GeometrySearch`; None to evaluate baselines alone.
+        env: Id of the environment; that of the agent if not given.
+        env_kwargs: Keyword arguments of the environment; those of the agent if not given.
+        scenes: `validation`, `test`, `hard`, the path of a scene file, or a scene set.
+        n_scenes: Number of scenes, from the first on; all if not given.
+        checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
+            agent's own setting if not given.
+        baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
+            training), `straight`, `constant`, `random`, `random16`, `random80`, `planner`, `ompl`, `search16`,
+            `search64`, `search512`, `search4096` and, in tasks with replanning, `unrevised` (the first plan alone).
+        time_decisions: Measure the wall time of single decisions.
+        progress: Function of the method's name, the number of finished scenes and the number of all scenes.
+
+    Raises:
+        ValueError: There is no such agent, baseline, scene set or environment, or they do not fit together.
+
+    Example:
+        >>> from viapoint.training import evaluate
+        >>> result = evaluate("viapoint/PlanarObstacles-v0", baselines=["straight"], n_scenes=50)
+        >>> result.success_rate > 0.5
+        True
+        >>> low, high = result.success_interval
+        >>> [row["method"] for row in result.rows]
+        ['agent', 'straight line']
+    """
+    if isinstance(agent, str | Path):
+        agent = load_agent(agent)
+    env_id, kwargs = task_of(agent, env, env_kwargs)
+    check_baselines(baselines, agent, env_id)
+    chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), env_id, kwargs)
+    methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
+    return evaluate_methods(
+        methods,
+        chosen.take(slice(0, n_scenes)),
+        env_id,
+        env_kwargs=kwargs,
+        time_decisions=time_decisions,
+        progress=progress,
+    )
+
+
+def task_of(
+    agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
+) -> tuple[str, dict[str, Any]]:
+    """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
+
+    Raises:
+        ValueError: The agent is for another environment, or none is given.
+    """
+    if not isinstance(agent, BaseAlgorithm):
+        if env is None:
+            raise ValueError("env must be the id of an environment where no trained agent is given")
+        check_registered(env)
+        return whole_task(env, env_kwargs or {})
+    mine, kwargs = env_arguments(agent.get_env())
+    env_id, kwargs = whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
+    if env not in (None, mine, env_id):
+        raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
+    return env_id, kwargs
+
+
+def check_baselines(
+    baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, env_id: str
+) -> None:
+    """Check that the named baselines exist for an environment.
+
+    Raises:
+        ValueError: One does not.
+    """
+    for each in baselines:
+        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
+            check_method(each, env_id)
+
+
+def _rows_of(
+    agent: BaseAlgorithm | Method | None, checks: int | Sequence[int] | None, name: str = "agent"
+) -> list[Method]:
+    """Return one method for each number of checks."""
+    if agent is None:
+        return []
+    if not isinstance(agent, BaseAlgorithm):
+        return [agent]
+    numbers = [checks] if checks is None or isinstance(checks, int) else checks
+    return [agent_method(f"{name}, {each} checks" if each else name, agent, each) for each in numbers]
+
+
+def _baselines(
+    baselines: Sequence[str | Method],
+    agent: BaseAlgorithm | Method | None,
+    checks: int | Sequence[int] | None,
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+) -> list[Method]:
+    """Return the methods that the agent is compared with, in the order given."""
+    methods: list[Method] = []
+    for each in baselines:
+        if not isinstance(each, str):
+            methods.append(each)
+        elif each == "untrained" and isinstance(agent, BaseAlgorithm):
+            methods += _rows_of(untrained(agent), checks, each)
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and env_id in ONLINE_TASKS:
+            first = agent_method("agent", agent, None if checks is None else 0)
+            methods.append(OpenLoopBaseline(first, OnlineTrial(env_id, **env_kwargs)))
+        else:
+            methods.append(make_method(each, env_id, **env_kwargs))
+    return methods
+
+
+def evaluate_methods(
     methods: Sequence[Method],
     frozen: FrozenScenes,
     env_id: str,
@@ -136,22 +306,20 @@ def evaluate(
     batch: int = 250,
     time_decisions: bool = True,
     progress: Progress | None = None,
-) -> Evaluation:
+) -> EvaluationResult:
     """Let each method decide in each scene, and simulate its decisions, or let it do so itself where it can.
 
-    Ctrl-C ends it: what is done is returned, and marked as partial.
-
     Args:
-        methods: To measure.
-        frozen: The scenes.
-        env_id: Of the environment.
-        env_kwargs: Of the environment.
-        batch: Scenes at a time.
-        time_decisions: Whether to time single decisions, too.
-        progress: Is told how far it is.
+        methods: Methods to evaluate, one or more.
+        frozen: Scenes.
+        env_id: Id of the environment.
+        env_kwargs: Keyword arguments of the environment.
+        batch: Number of scenes that are simulated at a time.
+        time_decisions: Measure the wall time of single decisions.
+        progress: Function of the method's name, the number of finished scenes and the number of all scenes.
     """
     if not methods:
-        raise ValueError("methods must name at least one method")
+        raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
     with _trial(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as trial:
         for method in methods:
@@ -160,7 +328,7 @@ def evaluate(
             if result.interrupted:
                 break
     missing = len(results) < len(methods)
-    return Evaluation(
+    return EvaluationResult(
         env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), missing=missing
     )
 

@@ -17,6 +17,7 @@ from viapoint.training.planners.ompl_planner import MotionPlannerMethod
 from viapoint.training.planners.replanning_baselines import OnlinePlanner, OpenLoopBaseline
 from viapoint.training.rollouts.rollout import Trial, Trials, new_trial
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
+from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.search.geometry_search import GeometrySearch
 
 
@@ -129,10 +130,16 @@ class AgentMethod:
 
 
 def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
-    """Return a trained agent as a method, whether an action of it is a whole movement or lasts a control step."""
-    env = model.get_env()
-    if is_step_wise(env.env_id):
-        return StepAgentMethod(name, model, env.env_id, env.env_kwargs)
+    """Return a trained agent as a method, whether an action of it is a whole movement or lasts a control step.
+
+    Raises:
+        ValueError: The agent cannot check its proposals.
+    """
+    if checks and not hasattr(model.policy, "checks"):
+        raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
+    env_id, env_kwargs = env_arguments(model.get_env())
+    if is_step_wise(env_id):
+        return StepAgentMethod(name, model, env_id, env_kwargs)
     return AgentMethod(name, model, checks)
 
 
@@ -170,20 +177,20 @@ ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
 
 
 def check_method(name: str, env_id: str) -> None:
-    """Refuse what cannot be measured in an environment.
+    """Check that a baseline of this name exists for an environment.
 
     Raises:
         ValueError: There is none of that name.
     """
     known = _known(env_id)
-    if name not in known and name not in ("agent", "untrained"):
+    if name not in known:
         raise ValueError(
-            f"method must be agent, untrained or one of {', '.join(known)} in {env_id}, got {name!r}"
+            f"baselines in {env_id} must be some of {', '.join(known)}, or untrained with an agent, got {name!r}"
         )
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
-    """A baseline for an environment made with `kwargs`.
+    """Return a baseline for an environment made with `kwargs`.
 
     Raises:
         ValueError: There is none of that name.

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
 from viapoint.envs.mdp.rewards import RewardTerms
-from viapoint.envs.registration import check_registered
+from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.training.config.discount import ELAPSED
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
@@ -26,6 +26,31 @@ REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration"
 """What of an episode's outcome goes into the info dictionaries."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which go into the info dictionaries."""
+
+
+def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
+    """Return the id of a vector environment and the keyword arguments that its id does not imply.
+
+    Args:
+        env: A :class:`ViaVecEnv`, or environments of this package in a vector environment of Stable-Baselines3.
+
+    Raises:
+        ValueError: The environment is another one.
+    """
+    inner = env.unwrapped if env is not None else None
+    if isinstance(inner, ViaVecEnv):
+        return inner.env_id, dict(inner.env_kwargs)
+    spec: Any = None if inner is None else inner.get_attr("spec", [0])[0]
+    if spec is None or spec.id not in ENV_IDS:
+        raise ValueError(
+            f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
+        )
+    usual = gym.spec(spec.id).kwargs
+    return spec.id, {
+        name: value
+        for name, value in spec.kwargs.items()
+        if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
+    }
 
 
 class ViaVecEnv(VecEnv):

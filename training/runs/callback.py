@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
-from viapoint.training.evaluation.evaluator import MethodResult, evaluate
+from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.step_rollout import whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -195,7 +195,7 @@ class Monitor(BaseCallback):
             return
         seconds, began = self.seconds, time.monotonic()
         with self._showing(f"validating in {len(frozen.share)} scenes"):
-            result = evaluate(
+            result = evaluate_methods(
                 [agent_method("agent", self.model)],
                 frozen,
                 frozen.env_id,

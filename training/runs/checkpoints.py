@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 
+from viapoint.training.algorithms.model_io import describe
 from viapoint.training.io.files import (
     BadFileError,
     read_arrays,
@@ -30,7 +31,6 @@ from viapoint.training.io.files import (
     write_json,
 )
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.model_io import describe
 
 FORMAT = 2
 READABLE = (1, 2)

@@ -23,6 +23,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from viapoint.training.algorithms.agent import best_model
+from viapoint.training.algorithms.model_io import save_model
 from viapoint.training.config.checks import check_folder
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.config_json import as_json, from_json
@@ -36,9 +38,6 @@ from viapoint.training.io.files import (
     write_json,
 )
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
-from viapoint.training.runs.model_io import load_model, save_model
-
-__all__ = ["BadFileError", "Run", "check_free", "find_model", "load_model", "save_model", "versions"]
 
 KEPT_CHECKPOINTS = 2
 PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
@@ -54,7 +53,8 @@ class Run:
         BadFileError: The folder is not a run.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: str | Path) -> None:
+        folder = Path(folder)
         if not folder.is_dir():
             what = "it is a file" if folder.exists() else "there is no such folder"
             raise BadFileError(folder, f"is no run folder: {what}")
@@ -134,18 +134,18 @@ class Run:
         return int(checkpoints[-1].name) if checkpoints else 0
 
     @property
-    def model_folder(self) -> Path:
-        """The best model where there is one, otherwise the last.
+    def best(self) -> Path:
+        """Folder of the best model on the validation scenes; of the last model where training did not validate.
 
         Raises:
-            BadFileError: There is none yet.
+            BadFileError: There is no model yet.
         """
-        for name in ("best", "final"):
-            replaced = sorted(self.folder.glob(f".{name}.*.old"))  # there is one amid a replacement only
-            for folder in (self.folder / name, *replaced):
-                if (folder / "model.json").is_file():
-                    return folder
-        raise BadFileError(self.folder, "holds no model yet")
+        return best_model(self.folder)
+
+    @property
+    def final(self) -> Path:
+        """Folder of the last model, which is there once training has ended."""
+        return self.folder / "final"
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
         """Write a model as `best` or `final`."""
@@ -241,15 +241,6 @@ def check_free(folder: Path) -> None:
 def _write_config(folder: Path, config: TrainConfig) -> None:
     """The last file to be written: a folder is a run from then on. What is of one call only is left out."""
     write_json(folder / "config.json", {**as_json(config), "out": None, "resume": False})
-
-
-def find_model(folder: Path) -> Path:
-    """The folder of the model that a user means: of the model itself, or of a run.
-
-    Raises:
-        BadFileError: It is neither.
-    """
-    return folder if (folder / "model.json").is_file() else Run(folder).model_folder
 
 
 def versions() -> dict[str, str]:

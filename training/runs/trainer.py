@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.training.algorithms.model_io import build
 from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.discount import ELAPSED
@@ -22,12 +24,13 @@ from viapoint.training.io.config_json import as_json
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import Monitor, TrainingStoppedError
-from viapoint.training.runs.model_io import build
 from viapoint.training.runs.run_dir import Run, check_free, versions
 
 __all__ = [
     "TrainingFailedError", "TrainingStoppedError", "check_unchanged", "new_model", "one_thread", "resolved", "train",
 ]  # fmt: skip
+
+Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
 MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """What a call that resumes a run may tell anew."""
@@ -41,17 +44,40 @@ class TrainingFailedError(Exception):
     """Training could not go on, for example for want of disk space; what was saved before is whole."""
 
 
-def train(config: TrainConfig) -> Run:
-    """Train an agent and leave everything in a run folder.
+def train(config: TrainConfig, callback: Callbacks = None) -> Run:
+    """Train an agent and write everything about the training to a run folder.
 
-    With `config.resume` the run in the folder goes on with its own configuration, from its last checkpoint,
-    to the same result as if it had never stopped; `n_timesteps` may extend it.
+    With `config.resume` the run in the folder continues with its own configuration from its last checkpoint, to the
+    same result as if it had never stopped; `n_timesteps` may extend it.
+
+    Args:
+        config: Environment, algorithm, seed, run folder and everything else that a training depends on.
+        callback: Callback of Stable-Baselines3, or a list of them. The checkpoints of a run do not contain their state.
+
+    Returns:
+        The run. `run.best` and `run.final` are model folders, which :func:`evaluate` and :func:`load_agent` accept.
 
     Raises:
-        BadFileError: The folder cannot take the run, or does not hold the one to resume.
-        ValueError: There is no such environment or model; nothing is left in the folder.
-        TrainingStoppedError: Ctrl-C; a checkpoint and a model are saved.
+        BadFileError: The folder cannot hold the run, or does not hold the one to resume.
+        ValueError: There is no such environment or model; the folder is left empty.
+        TrainingStoppedError: Ctrl-C was pressed; a checkpoint and a model are saved.
         TrainingFailedError: A file could not be written.
+
+    Example:
+        >>> import tempfile
+        >>> from viapoint.training import TrainConfig, train
+        >>> run = train(
+        ...     TrainConfig(
+        ...         env="viapoint/PlanarReach-v0",
+        ...         n_timesteps=64,
+        ...         n_envs=32,
+        ...         eval_scenes=8,
+        ...         out=tempfile.mkdtemp(),
+        ...         progress=False,
+        ...     )
+        ... )
+        >>> run.best.name, run.final.name
+        ('best', 'final')
     """
     with one_thread():
         if config.resume:
@@ -59,7 +85,7 @@ def train(config: TrainConfig) -> Run:
             with run.locked():
                 _take_up(run, config)
                 with _built(run.config) as model:
-                    _carry_on(run, model)
+                    _carry_on(run, model, callback)
             return run
         check_free(config.folder)
         begun = resolved(config)
@@ -67,7 +93,7 @@ def train(config: TrainConfig) -> Run:
             _check_tells_time(begun)
             run = Run.create(begun)
             with run.locked():
-                _carry_on(run, model)
+                _carry_on(run, model, callback)
         return run
 
 
@@ -180,15 +206,15 @@ def _check_tells_time(config: TrainConfig) -> None:
         )
 
 
-def _carry_on(run: Run, model: BaseAlgorithm) -> None:
-    """Train from where the run is to its end.
+def _carry_on(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
+    """Train from the last checkpoint of the run to its end.
 
     Raises:
         TrainingFailedError: A file could not be written.
     """
     try:
         with _logging(model, run), Monitor(run) as monitor:
-            _learn(model, run, monitor)
+            _learn(model, run, monitor, callback)
     except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
@@ -230,7 +256,7 @@ def _take_up(run: Run, config: TrainConfig) -> None:
         )
 
 
-def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:
+def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor, callback: Callbacks) -> None:
     restored, passed_over = run.restore(model)
     for reason in passed_over:
         print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
@@ -239,7 +265,8 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor) -> None:
     run.write_curve(monitor.curve)
     remaining = run.config.total_timesteps - model.num_timesteps
     if remaining > 0:
-        callbacks = [monitor, ElapsedTimeCallback()]
+        given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
+        callbacks = [monitor, ElapsedTimeCallback(), *given]
         model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
     run.save("final", model)
 

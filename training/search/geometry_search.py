@@ -153,18 +153,12 @@ class GeometrySearch:
             ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
                 or an obstacle is too large.
         """
-        d = self.task.arm.dimension
-        first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
-        given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
-        scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
-        for wrong, reason in problems(scene, self.task.collision_model):
-            if wrong.any():
-                raise ValueError(reason(0))
+        scene = scene_from_rest(self.task, start, goal, obstacles)
         rows: Float = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1)
-        observation: dict[str, Float] = {"hand": first, "goal": last}
+        observation: dict[str, Float] = {"hand": scene.start, "goal": scene.goal}
         if rows.size:
             observation["obstacles"] = rows.reshape(1, -1)
-        return self.task.action.decode(self.decide(observation), first, last).take(0)
+        return self.task.action.decode(self.decide(observation), scene.start, scene.goal).take(0)
 
     def _steps(self, replanning: bool) -> Single:
         """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""
@@ -203,6 +197,24 @@ def worth_of_plans(
         checks = check_plans(part(observation, rows), actions[rows], task)
         worth[rows] = merit(checks, *margins)
     return worth
+
+
+def scene_from_rest(
+    task: Task, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None
+) -> Scenes:
+    """Return one scene with a start, a goal and obstacles that stand still; see :meth:`GeometrySearch.plan`.
+
+    Raises:
+        ValueError: An argument has another shape or is not finite, or the scene is impossible.
+    """
+    d = task.arm.dimension
+    first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
+    given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
+    scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
+    for wrong, reason in problems(scene, task.collision_model):
+        if wrong.any():
+            raise ValueError(reason(0))
+    return scene
 
 
 def task_of(env_id: str, **kwargs: Any) -> Task:

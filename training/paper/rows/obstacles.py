@@ -14,16 +14,16 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
+from viapoint.training.algorithms.agent import find_model, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
 from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
 from viapoint.training.paper.reference_movements import construction, passage_share, smoothest
 from viapoint.training.paper.rows.timing import FAST, SLOW
 from viapoint.training.paper.simulated import Performed, perform
-from viapoint.training.planners.baselines import Method, PlannerMethod
+from viapoint.training.planners.baselines import Method, PlannerMethod, agent_method
 from viapoint.training.planners.cma_planner import PlannerBudget
 from viapoint.training.rollouts.rollout import Trial
-from viapoint.training.runs.agents import load_agent, pretrained_folder
 
 LENGTHS = (0.15, 0.2, 0.25)
 """Of the rows of lights, [m]; the paper's were up to 25 cm."""
@@ -89,8 +89,8 @@ def check_agent(agent: Path) -> None:
     Raises:
         ValueError: It moves in space, sees no obstacles, or needs several decisions for a movement.
     """
-    found = load_agent(agent, None)
-    (task,) = found.model.get_env().get_attr("task", 0)
+    found = load_agent(agent)
+    (task,) = found.get_env().get_attr("task", 0)  # type: ignore[union-attr]
     if found.env_id not in TASKS or task.arm.dimension != 2 or not task.scenes.n_obstacles[1]:
         raise ValueError(
             f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
@@ -100,16 +100,15 @@ def check_agent(agent: Path) -> None:
 
 def _method(agent: Path | None) -> tuple[Method, Trial]:
     if agent is not None or _is_shipped():
-        found = load_agent(agent, None if agent else DEFAULT_ENV)
-        method: Method = found.method()
-        return method, Trial(found.env_id, 256, **found.env_kwargs)
+        found = load_agent(agent or DEFAULT_ENV)
+        return agent_method("agent", found, 0), Trial(found.env_id, 256, **found.env_kwargs)
     trial = Trial(DEFAULT_ENV, 256)
     return PlannerMethod(trial, budget=BUDGET), trial
 
 
 def _is_shipped() -> bool:
     try:
-        pretrained_folder(DEFAULT_ENV)
+        find_model(DEFAULT_ENV)
     except ValueError:
         return False
     return True

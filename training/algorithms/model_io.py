@@ -1,14 +1,15 @@
-"""Model files: saving, loading and importing models of Stable-Baselines3."""
+"""Model folders: agents as JSON and safetensors, which hold numbers and names but no code.
+
+model.json             algorithm, policy, environment and hyperparameters
+weights.safetensors    tensors of the policy
+"""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.metadata
 import inspect
-import json
-import sys
 import warnings
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,25 +17,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from sb3_contrib import TQC
-from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.training.algorithms.extractors import EXTRACTORS
 from viapoint.training.algorithms.minimum_critic import POLICIES as MINIMUM
 from viapoint.training.algorithms.smdp_buffers import timed, unit_of
-from viapoint.training.algorithms.viaq import ViaQ
-from viapoint.training.config.configs import ImportConfig
 from viapoint.training.config.discount import check_discount_unit
 from viapoint.training.io.files import (
     BadFileError,
     read_arrays,
     read_json,
     write_arrays,
-    write_folder,
     write_json,
 )
 from viapoint.training.io.model_limits import (
@@ -43,16 +40,8 @@ from viapoint.training.io.model_limits import (
     check_env_arguments,
     parameter_budget,
 )
-from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "viaq": ViaQ,
-    "sac": SAC,
-    "td3": TD3,
-    "ppo": PPO,
-    "tqc": TQC,
-}
-"""The learning algorithms by the name the command line knows them by."""
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 }
@@ -60,6 +49,8 @@ MINIMUM_CRITIC = "MinimumCriticPolicy"
 """Name of the policies with a minimum critic."""
 FORMAT = 1
 """Version of the two files."""
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
+"""Learning algorithms by their names on the command line; the modules that define them add them."""
 NOT_STORED = frozenset(
     {
         "self",
@@ -82,7 +73,7 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
     """Write what is needed to decide with a model and to train it on from its weights.
 
     Raises:
-        ValueError: It is of a class that is not in ALGORITHMS, or was not trained on a :class:`ViaVecEnv`.
+        ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "weights.safetensors"
@@ -90,7 +81,7 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
     write_json(folder / "model.json", {**describe(model), "weights_sha256": _digest(path)})
 
 
-def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
+def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     """Read a model.
 
     Args:
@@ -135,7 +126,7 @@ def load_model(folder: Path, env: ViaVecEnv | None = None) -> BaseAlgorithm:
 def build(
     algorithm: str,
     policy: str,
-    env: ViaVecEnv,
+    env: VecEnv,
     hyperparameters: Mapping[str, Any],
     *,
     discount_unit: float | None = None,
@@ -200,7 +191,7 @@ def _policy_with(critic: Any, algorithm: str) -> str:
 def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
     """Return a model like this one before its training, with weights of seed 0."""
     record, env = describe(model), model.get_env()
-    assert isinstance(env, ViaVecEnv)
+    assert env is not None
     hyperparameters = dict(record["hyperparameters"])
     hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
     return build(
@@ -215,21 +206,19 @@ def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
     """Everything but the weights, as JSON can hold it."""
-    names = {kind: name for name, kind in ALGORITHMS.items()}
-    env = model.get_env()
-    if type(model) not in names or not isinstance(env, ViaVecEnv):
-        raise ValueError(
-            f"only {', '.join(kind.__name__ for kind in names)} on a ViaVecEnv can be saved, "
-            f"not {type(model).__name__} on {type(env).__name__}"
-        )
-    policies = {kind: name for name, kind in _policies(names[type(model)]).items()}
+    names = [name for name, kind in ALGORITHMS.items() if issubclass(kind, type(model))]
+    if len(names) != 1:
+        known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
+        raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
+    (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
+    policies = {kind: each for each, kind in _policies(name).items()}
     stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
     return {
         "format": FORMAT,
         "viapoint": importlib.metadata.version("viapoint"),
-        "algorithm": names[type(model)],
+        "algorithm": name,
         "policy": policies[model.policy_class],
-        "env": {"id": env.env_id, "kwargs": _encode(env.env_kwargs)},
+        "env": {"id": env_id, "kwargs": _encode(env_kwargs)},
         "num_timesteps": model.num_timesteps,
         "discount_unit": unit_of(model),
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
@@ -274,9 +263,9 @@ def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
     return ViaVecEnv(record["id"], 1, **record["kwargs"])
 
 
-def _by_time(algorithm: str, env: ViaVecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
+def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
     """Arguments that make an algorithm discount by time."""
-    check_discount_unit(algorithm, unit, env.env_id)
+    check_discount_unit(algorithm, unit, env_arguments(env)[0])
     if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
         raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
     kind = ALGORITHMS[algorithm]
@@ -345,92 +334,3 @@ def _decode(value: Any, size: int) -> Any:
     if isinstance(value, list) and len(value) == 2 and isinstance(value[1], str):
         return tuple(value)
     return [_decode(each, size) for each in value] if isinstance(value, list) else value
-
-
-WARNING = (
-    "{file} is an archive of Stable-Baselines3. Opening one runs whatever code its author put into it, with your "
-    "rights. Open only archives that you made or whose author you trust."
-)
-LARGEST_DATA = 64 << 20
-"""Size of an archive's description at most, [bytes]."""
-TELLTALE = {
-    "tqc": "top_quantiles_to_drop_per_net",
-    "sac": "target_entropy",
-    "td3": "policy_delay",
-    "ppo": "clip_range",
-}
-"""A name that is in the description of each algorithm's archives, and of none below it."""
-
-
-class NotTrustedError(Exception):
-    """Nobody said that the archive may be opened."""
-
-
-def run(config: ImportConfig) -> None:
-    """Convert an archive and say where the model is.
-
-    Raises:
-        NotTrustedError: Neither `--trust` was given nor the question answered with yes.
-        BadFileError: It is no such archive, or not of a model for the environment; or the folder is in use.
-    """
-    if config.out.exists() and (not config.out.is_dir() or any(config.out.iterdir())):
-        raise BadFileError(config.out, "is not empty; name another folder")
-    algo = config.algo or algorithm_of(config.file)
-    print(WARNING.format(file=config.file), file=sys.stderr)
-    if not (config.trust or _answered_yes()):
-        raise NotTrustedError(f"{config.file} was not opened; --trust says that it may be")
-    model = convert(config.file, algo, config.env, config.out)
-    print(f"{algo} of {model.num_timesteps} decisions on {config.env}: {config.out}")
-    print(f"measure it with: viapoint evaluate {config.out}")
-
-
-def algorithm_of(path: Path) -> str:
-    """The algorithm of an archive by what its description names; nothing in it is opened.
-
-    Raises:
-        BadFileError: It is no archive of Stable-Baselines3, or of an algorithm that is not known here.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if archive.getinfo("data").file_size > LARGEST_DATA:
-                raise BadFileError(path, f"has a description of more than {LARGEST_DATA} bytes")
-            names = set(json.loads(archive.read("data")))
-            archive.getinfo("policy.pth")
-    except FileNotFoundError:
-        raise BadFileError(path, "is missing") from None
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise BadFileError(path, f"is no archive of Stable-Baselines3 ({error})") from None
-    for algo, telltale in TELLTALE.items():
-        if telltale in names:
-            return algo
-    raise BadFileError(path, f"is of none of {', '.join(TELLTALE)}")
-
-
-def convert(path: Path, algo: str, env_id: str, out: Path) -> Any:
-    """Open an archive, which runs its code, and write its model; the model as it is read back.
-
-    Raises:
-        BadFileError: It cannot be opened, is not for the environment, or has parts of its own making.
-    """
-    kind = ALGORITHMS[algo]
-    try:
-        model: Any = (
-            kind.load(path, device="cpu", buffer_size=1) if algo != "ppo" else kind.load(path, device="cpu")
-        )
-    except Exception as error:  # whatever the archive does
-        raise BadFileError(path, f"cannot be opened as {algo} ({type(error).__name__}: {error})") from None
-    env = ViaVecEnv(env_id, model.n_envs or 1)
-    try:
-        model.set_env(env)
-        write_folder(out, lambda temporary: save_model(model, temporary))
-    except (ValueError, KeyError) as error:
-        if isinstance(error, BadFileError):
-            raise
-        raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
-    finally:
-        env.close()
-    return load_model(out)
-
-
-def _answered_yes() -> bool:
-    return sys.stdin.isatty() and input("open it? [yes/no] ").strip().lower() == "yes"

@@ -1,0 +1,204 @@
+"""Agents: algorithms of Stable-Baselines3 that are saved as model folders and plan without an environment."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+from numpy.typing import ArrayLike
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, STEP_TASKS
+from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, save_model
+from viapoint.training.io.files import BadFileError, write_folder
+from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.search.geometry_search import scene_from_rest
+
+SHIPPED = Path(str(files("viapoint.training") / "pretrained"))
+"""Folder of the agents that come with the package."""
+
+
+class Agent(BaseAlgorithm):
+    """Learning algorithm of Stable-Baselines3 whose models are folders of JSON and safetensors.
+
+    All agents that :func:`load_agent` returns are of this class. `predict`, `learn` and `set_env` are those of
+    Stable-Baselines3.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.training import load_agent
+        >>> agent = load_agent("viapoint/PlanarObstacles-v0")
+        >>> plan = agent.plan(start=(-0.2, 0.3), goal=(0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
+        >>> plan.waypoints.shape  # start, via-point and goal, [m]
+        (3, 2)
+        >>> hand = plan.trajectory().position(np.linspace(0.0, plan.durations.sum(), 50))
+    """
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment that the agent decides in."""
+        return env_arguments(self.get_env())[0]
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of that environment, without those that belong to its id."""
+        return env_arguments(self.get_env())[1]
+
+    def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
+        """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.
+
+        The plan is the one that an environment with this scene would execute after `predict`.
+
+        Args:
+            start: Position of the hand, shape (D,), [m].
+            goal: Position of the target, shape (D,), [m].
+            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; None for none. At most as many
+                as the environment of the agent may have.
+
+        Raises:
+            ValueError: An argument has another shape or is not finite, the scene is impossible, or an action of the
+                agent is not a whole movement.
+        """
+        env_id = self.env_id
+        if env_id in STEP_TASKS or env_id in ONLINE_TASKS:
+            raise ValueError(
+                f"plan() needs an agent whose actions are whole movements; in {env_id} an action depends on the motion "
+                "under way: step the environment with predict()"
+            )
+        (task,) = self.env.get_attr("task", [0])  # type: ignore[union-attr]
+        scene = scene_from_rest(task, start, goal, obstacles)
+        most, number = task.observation.n_rows, scene.obstacles.shape[1]
+        if number > most:
+            raise ValueError(f"obstacles must have at most {most} rows, as in {env_id}, got {number}")
+        scene = scene._replace(obstacles=np.pad(scene.obstacles, ((0, 0), (0, most - number), (0, 0))))
+        joints = np.asarray(task.arm.inverse_kinematics(scene.start))
+        actions, _ = self.predict(task.observation.observe(joints, scene.start, scene), deterministic=True)
+        plan: Plan = task.action.decode(np.asarray(actions, dtype=np.float64), scene.start, scene.goal)
+        return plan.take(0)
+
+    def save(self, path: str | Path) -> None:  # type: ignore[override]
+        """Write the agent as a folder of `model.json` and `weights.safetensors`.
+
+        The folder is replaced as a whole. It holds what decisions and further training from these weights need; the
+        replay buffer and the state of the optimizer are in the checkpoints of a run only.
+
+        Args:
+            path: Folder to write; a suffix `.zip`, which callbacks of Stable-Baselines3 add, is dropped.
+
+        Raises:
+            ValueError: The agent has no environment of this package, or holds objects that JSON cannot represent.
+        """
+        write_folder(Path(str(path).removesuffix(".zip")), lambda folder: save_model(self, folder))
+
+    @classmethod
+    def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]
+        """Load an agent of this algorithm; see :func:`load_agent`, which loads those of every algorithm.
+
+        Args:
+            path: Model folder, run folder, or id of an environment with a shipped agent.
+            env: Environment to continue training on; one environment of the agent's own kind if not given.
+
+        Raises:
+            ValueError: There is no agent, its files are damaged, or it is of another algorithm.
+        """
+        model = load_model(find_model(path), env)
+        if not isinstance(model, cls):
+            raise ValueError(
+                f"{path} holds an agent of {type(model).__name__}, not of {cls.__name__}; load_agent() loads both"
+            )
+        return model
+
+
+class SAC(Agent, stable_baselines3.SAC):
+    """SAC of Stable-Baselines3."""
+
+
+class TD3(Agent, stable_baselines3.TD3):
+    """TD3 of Stable-Baselines3."""
+
+
+class PPO(Agent, stable_baselines3.PPO):
+    """PPO of Stable-Baselines3."""
+
+
+class TQC(Agent, sb3_contrib.TQC):
+    """TQC of sb3-contrib."""
+
+
+ALGORITHMS.update(sac=SAC, td3=TD3, ppo=PPO, tqc=TQC)
+
+
+def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
+    """Load a trained agent of any algorithm.
+
+    Args:
+        source: Id of an environment, for the agent that is shipped for it; a run folder, for its best model; or a
+            model folder, such as `runs/first/final`.
+        env: Environment to continue training on; one environment of the agent's own kind if not given.
+
+    Returns:
+        The agent, with `predict`, `plan`, `learn` and `save`.
+
+    Raises:
+        ValueError: There is no agent, or its files are damaged; the message lists the shipped agents.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
+        >>> observation, _ = env.reset(seed=3)
+        >>> agent = load_agent("viapoint/PlanarObstacles-v0")
+        >>> action, _ = agent.predict(observation, deterministic=True)
+        >>> *_, info = env.step(action)
+        >>> info["is_success"]
+        True
+    """
+    return Agent.load(source, env)
+
+
+def find_model(source: str | Path) -> Path:
+    """Return the model folder that an id, a run folder or a model folder stands for.
+
+    Raises:
+        ValueError: It is none of them.
+    """
+    folder, name = Path(source), str(source).removeprefix("viapoint/")
+    if str(source) in ENV_IDS:
+        shipped = SHIPPED / name
+        if not (shipped / "model.json").is_file():
+            raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {_shipped()}")
+        return shipped
+    if (folder / "model.json").is_file():
+        return folder
+    if (folder / "config.json").is_file():
+        return best_model(folder)
+    what = "it holds no config.json and no model.json" if folder.is_dir() else "there is no such folder"
+    raise BadFileError(
+        folder,
+        f"is no run folder or model folder: {'it is a file' if folder.is_file() else what}; agents are shipped for "
+        f"{_shipped()}",
+    )
+
+
+def best_model(run: Path) -> Path:
+    """Return the folder of the best model of a run, or of the last one where training did not validate.
+
+    Raises:
+        BadFileError: The run has no model yet.
+    """
+    for name in ("best", "final"):
+        replaced = sorted(run.glob(f".{name}.*.old"))  # there is one amid a replacement only
+        for folder in (run / name, *replaced):
+            if (folder / "model.json").is_file():
+                return folder
+    raise BadFileError(run, "holds no model yet")
+
+
+def _shipped() -> str:
+    """Return the ids of environments with a shipped agent, as a list in words."""
+    return ", ".join(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))

@@ -1,0 +1,102 @@
+"""Command `import-sb3`: convert an archive of Stable-Baselines3 into a model folder."""
+
+from __future__ import annotations
+
+import json
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from viapoint.training.algorithms.agent import Agent, load_agent
+from viapoint.training.algorithms.model_io import ALGORITHMS, save_model
+from viapoint.training.config.configs import ImportConfig
+from viapoint.training.io.files import BadFileError, write_folder
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+
+WARNING = (
+    "{file} is an archive of Stable-Baselines3. Opening one runs whatever code its author put into it, with your "
+    "rights. Open only archives that you made or whose author you trust."
+)
+LARGEST_DATA = 64 << 20
+"""Size of an archive's description at most, [bytes]."""
+TELLTALE = {
+    "tqc": "top_quantiles_to_drop_per_net",
+    "sac": "target_entropy",
+    "td3": "policy_delay",
+    "ppo": "clip_range",
+}
+"""A name that is in the description of each algorithm's archives, and of none below it."""
+
+
+class NotTrustedError(Exception):
+    """Nobody said that the archive may be opened."""
+
+
+def run(config: ImportConfig) -> None:
+    """Convert an archive and say where the model is.
+
+    Raises:
+        NotTrustedError: Neither `--trust` was given nor the question answered with yes.
+        BadFileError: It is no such archive, or not of a model for the environment; or the folder is in use.
+    """
+    if config.out.exists() and (not config.out.is_dir() or any(config.out.iterdir())):
+        raise BadFileError(config.out, "is not empty; name another folder")
+    algo = config.algo or algorithm_of(config.file)
+    print(WARNING.format(file=config.file), file=sys.stderr)
+    if not (config.trust or _answered_yes()):
+        raise NotTrustedError(f"{config.file} was not opened; --trust says that it may be")
+    model = convert(config.file, algo, config.env, config.out)
+    print(f"{algo} of {model.num_timesteps} decisions on {config.env}: {config.out}")
+    print(f"measure it with: viapoint evaluate {config.out}")
+
+
+def algorithm_of(path: Path) -> str:
+    """The algorithm of an archive by what its description names; nothing in it is opened.
+
+    Raises:
+        BadFileError: It is no archive of Stable-Baselines3, or of an algorithm that is not known here.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.getinfo("data").file_size > LARGEST_DATA:
+                raise BadFileError(path, f"has a description of more than {LARGEST_DATA} bytes")
+            names = set(json.loads(archive.read("data")))
+            archive.getinfo("policy.pth")
+    except FileNotFoundError:
+        raise BadFileError(path, "is missing") from None
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise BadFileError(path, f"is no archive of Stable-Baselines3 ({error})") from None
+    for algo, telltale in TELLTALE.items():
+        if telltale in names:
+            return algo
+    raise BadFileError(path, f"is of none of {', '.join(TELLTALE)}")
+
+
+def convert(path: Path, algo: str, env_id: str, out: Path) -> Agent:
+    """Open an archive, which runs its code, and write its model; the model as it is read back.
+
+    Raises:
+        BadFileError: It cannot be opened, is not for the environment, or has parts of its own making.
+    """
+    kind: Any = ALGORITHMS[algo]
+    try:
+        small: dict[str, Any] = {} if algo == "ppo" else {"buffer_size": 1}
+        model = super(Agent, kind).load(path, device="cpu", **small)
+    except Exception as error:  # whatever the archive does
+        raise BadFileError(path, f"cannot be opened as {algo} ({type(error).__name__}: {error})") from None
+    env = ViaVecEnv(env_id, model.n_envs or 1)
+    try:
+        model.set_env(env)
+        write_folder(out, lambda temporary: save_model(model, temporary))
+    except (ValueError, KeyError) as error:
+        if isinstance(error, BadFileError):
+            raise
+        raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
+    finally:
+        env.close()
+    return load_agent(out)
+
+
+def _answered_yes() -> bool:
+    return sys.stdin.isatty() and input("open it? [yes/no] ").strip().lower() == "yes"
