@@ -198,5 +198,5 @@ def test_comparisons_are_with_the_first(small_scenes):
 def test_unknown_methods_and_none_are_refused(small_scenes):
     with pytest.raises(ValueError, match="straight, constant, random"):
         make_method("magic", ENV)
-    with pytest.raises(ValueError, match="at least one method"):
+    with pytest.raises(ValueError, match="nothing to evaluate"):
         run([], small_scenes)
