@@ -38,7 +38,7 @@ from viapoint.training.rollouts.rollout import new_trial
 from viapoint.training.runs.trainer import one_thread
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 from viapoint.training.search.candidates import candidate_actions
-from viapoint.training.search.geometry_search import GeometrySearch, worth_of_plans
+from viapoint.training.search.geometry_search import GeometrySearch, score_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 CHECKS = (0, 4, 16, 64)
@@ -67,7 +67,7 @@ class RandomOrder:
         actions[..., self._task.action.n_via * self._task.action.dimension] = layout[
             self._task.action.n_via * self._task.action.dimension
         ]
-        worth = worth_of_plans(observation, actions, self._task, (CLEARANCE_MARGIN, REACH_MARGIN))
+        worth = score_plans(observation, actions, self._task, (CLEARANCE_MARGIN, REACH_MARGIN))
         return actions[np.arange(number), worth.argmax(axis=1)]
 
 

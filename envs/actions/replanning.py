@@ -169,21 +169,20 @@ class Reviser:
 
     def _revised(self, default: NominalPlan, actions: Float) -> MovingPlan:
         layout, state = self.layout, default.state
-        d, number = layout.dimension, layout.n_via
-        axes = frame(self._line(default))
-        scale = np.array(layout.via_scale[:d])
-        offsets = actions[:, : number * d].reshape(len(actions), number, d) * scale
-        vias = default.vias + sum(offsets[..., i : i + 1] * axis[:, None] for i, axis in enumerate(axes))
-        low, high = layout.duration_range
-        factor = (high / low) ** (0.5 * actions[:, number * d])
-        remaining = np.maximum(default.remaining, self.least_remaining)
-        duration = np.clip(remaining * factor, self.least_remaining, np.maximum(remaining, high))
-        points = np.concatenate((state.position[:, None], vias, default.goal[:, None]), axis=1)
+        points, duration = revised_waypoints(
+            layout,
+            self._line(default),
+            state.position,
+            default.vias,
+            default.goal,
+            default.remaining,
+            actions,
+        )
         plan = timed(points, duration, state)
         zero = (actions == 0.0).all(axis=-1)[
             :, None
         ]  # the default itself: its via-points are evenly spaced in time
-        even = np.broadcast_to(duration[:, None] / (number + 1), plan.durations.shape)
+        even = np.broadcast_to(duration[:, None] / (layout.n_via + 1), plan.durations.shape)
         return plan._replace(durations=np.where(zero, even, plan.durations))
 
     @staticmethod
@@ -193,6 +192,41 @@ class Reviser:
         for other in (default.goal - default.start, np.eye(1, line.shape[-1])):
             line = np.where((norm(line) < MIN_GOAL_DISTANCE)[:, None], other, line)
         return line
+
+
+def revised_waypoints(
+    layout: ActionLayout,
+    line: Float,
+    position: Float,
+    vias: Float,
+    goal: Float,
+    remaining: Float,
+    actions: NDArray[Any],
+) -> tuple[Float, Float]:
+    """Return waypoints (..., K + 2, D), [m], and durations (...,), [s], of revised plans; batch dimensions broadcast.
+
+    Args:
+        layout: Layout of the actions.
+        line: Vector along which offsets are measured, shape (..., D), [m].
+        position: Commanded position, shape (..., D), [m].
+        vias: Default via-points, shape (..., K, D), [m].
+        goal: Present goal, shape (..., D), [m].
+        remaining: Default remaining time, shape (...,), [s].
+        actions: Shape (..., m), in [-1, 1].
+    """
+    d, number = layout.dimension, layout.n_via
+    low, high = layout.duration_range
+    offsets = actions[..., : number * d].reshape(*actions.shape[:-1], number, d) * np.array(
+        layout.via_scale[:d]
+    )
+    moved = vias + sum(offsets[..., i : i + 1] * axis[..., None, :] for i, axis in enumerate(frame(line)))
+    remaining = np.maximum(remaining, 0.5 * low)
+    duration = np.clip(
+        remaining * (high / low) ** (0.5 * actions[..., number * d]), 0.5 * low, np.maximum(remaining, high)
+    )
+    shape = (*actions.shape[:-1], 1, d)
+    first, last = (np.broadcast_to(end[..., None, :], shape) for end in (position, goal))
+    return np.concatenate((first, moved, last), axis=-2), duration
 
 
 def timed(waypoints: Float, duration: Float, state: Motion) -> MovingPlan:

@@ -101,13 +101,47 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
     """
     relative: Any = outcome.duration / centre_duration
     log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
+    return weighted_terms(
+        outcome.is_success,
+        outcome.collision,
+        outcome.planned_clearance,
+        outcome.goal_error,
+        log_jerk,
+        relative,
+        weights,
+    )
+
+
+def weighted_terms(
+    success: NDArray[Any],
+    collision: NDArray[np.bool_],
+    clearance: NDArray[Any],
+    goal_error: NDArray[Any],
+    log_jerk: NDArray[Any],
+    relative_duration: NDArray[Any],
+    weights: RewardWeights,
+) -> RewardTerms:
+    """Return the weighted terms from arrays of one shape; shared by environments and planners.
+
+        r = w_success s - w_collision 1[collision] + w_clearance clip(c, -0.05 m, 0.01 m) / 0.05 m
+            - w_goal min(e / 0.1 m, 1) - w_smoothness log_jerk - w_duration (T / T_0 - 1)
+
+    Args:
+        success: Success s, or its probability in [0, 1].
+        collision: Contact at any time.
+        clearance: Planned clearance c, [m].
+        goal_error: Distance e from the goal at the end, [m].
+        log_jerk: Log of the jerk cost relative to the zero action.
+        relative_duration: Duration T relative to the duration T_0 of the zero action.
+        weights: Weights of the terms.
+    """
     return RewardTerms(
-        success=np.multiply(weights.success, outcome.is_success, dtype=np.float64),
-        collision=np.multiply(-weights.collision, outcome.collision, dtype=np.float64),
-        clearance=weights.clearance * np.clip(outcome.planned_clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
-        goal_error=-weights.goal_error * np.minimum(outcome.goal_error / GOAL_ERROR_UNIT, 1.0),
+        success=float(weights.success) * success,
+        collision=np.multiply(-float(weights.collision), collision, dtype=np.float64),
+        clearance=weights.clearance * np.clip(clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT,
+        goal_error=-weights.goal_error * np.minimum(goal_error / GOAL_ERROR_UNIT, 1.0),
         smoothness=-weights.smoothness * log_jerk,
-        duration=-weights.duration * (relative - 1.0),
+        duration=-weights.duration * (relative_duration - 1.0),
     )
 
 

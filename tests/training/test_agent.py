@@ -133,13 +133,13 @@ def test_it_takes_the_candidate_of_the_greatest_value(trial):
 def test_of_the_candidates_that_are_checked_it_takes_the_best(trial, checks, monkeypatch):
     policy, observation = policy_for(trial, checks=checks), trial.observe(scenes_of(trial))
     every, values = policy.propose(observation)
-    seen, worth_of_plans = [], viaq_policy.worth_of_plans
+    seen, score_plans = [], viaq_policy.score_plans
 
     def observed(observation, actions, *rest, **kwargs):
         seen.append(actions)
-        return worth_of_plans(observation, actions, *rest, **kwargs)
+        return score_plans(observation, actions, *rest, **kwargs)
 
-    monkeypatch.setattr(viaq_policy, "worth_of_plans", observed)
+    monkeypatch.setattr(viaq_policy, "score_plans", observed)
     decided = policy.decide(observation)
     (checked,) = seen
     assert checked.shape[1] == min(checks, every.shape[1])

@@ -12,15 +12,15 @@ from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.search import geometry_search
 from viapoint.training.search.geometry_search import GeometrySearch
 from viapoint.training.search.plan_checks import (
-    CLOSE,
-    DEEP,
+    MAX_REFINED,
+    MIN_REFINED,
     NODES,
     best_plan,
     check_plans,
     merit,
-    worth_of_best,
+    pruned_merit,
 )
-from viapoint.training.search.planned_movements import planned
+from viapoint.training.search.planned_movements import plan_movements
 
 PLANE, WHOLE_ARM, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")
@@ -66,7 +66,7 @@ def test_planned_movements_are_those_of_the_environment(env_id, n_via, timing):
     actions[:, 0] = 0.0
     plan = decoded(env, actions)
     duration = plan.durations.sum(axis=-1)
-    found = planned(observation, actions, env.task, SHARES)
+    found = plan_movements(observation, actions, env.task, SHARES)
     trajectory = plan.trajectory()
     np.testing.assert_allclose(found.duration, duration, rtol=1e-6)
     np.testing.assert_allclose(found.path, trajectory(duration[..., None] * SHARES), atol=1e-6)
@@ -81,8 +81,8 @@ def test_a_via_point_on_an_end_is_a_straight_movement(at_end):
     distance = np.linalg.norm(env.scenes.goal - env.scenes.start, axis=-1)
     actions = np.zeros((8, 1, 3), dtype=np.float32)
     actions[:, 0, 0] = at_end * 0.5 * distance / env.task.action.via_scale[0]
-    straight = planned(observation, np.zeros_like(actions), env.task, SHARES)
-    found = planned(observation, actions, env.task, SHARES)
+    straight = plan_movements(observation, np.zeros_like(actions), env.task, SHARES)
+    found = plan_movements(observation, actions, env.task, SHARES)
     assert np.isfinite(found.path).all()
     np.testing.assert_allclose(found.path, straight.path, atol=1e-3)
 
@@ -93,7 +93,7 @@ def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, d
     env, observation, some = under_way(env_id, decisions=decisions)
     actions = random_actions(env.task, len(some))
     plan, _ = env.reviser.revise(env.default, env._episodes.plan, actions.astype(np.float64))
-    found = planned(observation, actions[:, None], env.task, SHARES)
+    found = plan_movements(observation, actions[:, None], env.task, SHARES)
     commanded = plan.trajectory()(plan.duration[:, None] * SHARES)
     assert some.sum() > 4
     np.testing.assert_allclose(found.duration[some, 0], plan.duration[some], rtol=1e-5)
@@ -118,12 +118,12 @@ def test_clearance_is_that_of_many_instants(env_id):
     margin = np.asarray(env.arm.reach_margin(hand)).min(axis=-1).reshape(number, tried)
     near = np.abs(margin) < 0.03
     np.testing.assert_allclose(checks.reach_margin[near], margin[near], atol=1e-3)
-    some = (exact > -0.05) & (exact < CLOSE) & (margin > 0.0)
+    some = (exact > -0.05) & (exact < MAX_REFINED) & (margin > 0.0)
     error = np.abs(checks.clearance - exact)[some]
     assert some.sum() > 80
     assert np.quantile(error, 0.98) < 5e-4
     assert error.max() < 2e-3
-    assert (checks.clearance[exact < DEEP] < -0.04).all()
+    assert (checks.clearance[exact < MIN_REFINED] < -0.04).all()
 
 
 def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
@@ -135,7 +135,7 @@ def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
     hand = plan.trajectory()(ahead)
     exact = env.task.collision_model.clearance_profile(hand, rows, env.scenes.present).min(axis=(1, 2))
     found = check_plans(observation, actions[:, None], env.task).clearance[:, 0]
-    some &= (exact > -0.05) & (exact < CLOSE)
+    some &= (exact > -0.05) & (exact < MAX_REFINED)
     assert some.sum() > 8
     np.testing.assert_allclose(found[some], exact[some], atol=1e-3)
 
@@ -156,7 +156,7 @@ def test_clearance_after_a_time_does_not_matter():
         rows = env.scenes.places(time, unturned=np.zeros(number))
         clearance = env.task.collision_model.clearance_profile(hand, rows, env.scenes.present)
         least.append(clearance.min(axis=(1, 2)))
-    some = (found > -0.05) & (found < CLOSE)
+    some = (found > -0.05) & (found < MAX_REFINED)
     assert (found >= every - 1e-4).all()
     assert (found > every + 1e-3).any()
     assert (found <= least[0] + 1e-3)[some].all()
@@ -200,12 +200,12 @@ def test_looking_at_the_most_promising_plans_first_finds_the_same(env_id):
     env, observation = made(env_id)
     actions = random_actions(env.task, 16, 200)
     checked = merit(check_plans(observation, actions, env.task), *MARGINS)
-    worth = worth_of_best(observation, actions, env.task, MARGINS)
-    known = np.isfinite(worth)
+    merits = pruned_merit(observation, actions, env.task, MARGINS)
+    known = np.isfinite(merits)
     solved = known.any(axis=-1)
-    np.testing.assert_allclose(worth[known], checked[known], atol=1e-4)
+    np.testing.assert_allclose(merits[known], checked[known], atol=1e-4)
     np.testing.assert_array_equal(solved, checked.max(axis=-1) > -1e3)
-    np.testing.assert_array_equal(worth.argmax(axis=-1)[solved], checked.argmax(axis=-1)[solved])
+    np.testing.assert_array_equal(merits.argmax(axis=-1)[solved], checked.argmax(axis=-1)[solved])
     assert solved.any()
     clear = checked > -1e3
     assert (clear & ~known).sum() > 0.2 * clear.sum()  # most plans are not looked at
@@ -217,9 +217,9 @@ def test_more_checks_never_give_a_worse_computed_reward(env_id):
     before = np.full(16, -np.inf)
     for more in ({"n_checks": 1}, {"n_checks": 16}, {"n_checks": 64}, {"n_checks": 64, "refinements": 3}):
         actions = GeometrySearch(env.task, **more).decide(observation).astype(np.float32)
-        worth = merit(check_plans(observation, actions[:, None], env.task), *MARGINS)[:, 0]
-        assert (worth >= before - 2e-3).all()
-        before = worth
+        merits = merit(check_plans(observation, actions[:, None], env.task), *MARGINS)[:, 0]
+        assert (merits >= before - 2e-3).all()
+        before = merits
     assert (before > -1e3).mean() > 0.5
 
 
@@ -287,9 +287,9 @@ def test_any_number_of_via_points_is_searched(n_via, timing):
     env, observation = made(PLANE, 8, n_via=n_via, timing=timing)
     search = GeometrySearch(env.task, 64, refinements=1, per_round=16)
     actions = search.decide(observation).astype(np.float32)
-    worth = merit(check_plans(observation, actions[:, None], env.task), *MARGINS)[:, 0]
+    merits = merit(check_plans(observation, actions[:, None], env.task), *MARGINS)[:, 0]
     straight = np.zeros_like(actions[:, None])
-    assert (worth >= merit(check_plans(observation, straight, env.task), *MARGINS)[:, 0] - 1e-4).all()
+    assert (merits >= merit(check_plans(observation, straight, env.task), *MARGINS)[:, 0] - 1e-4).all()
 
 
 @pytest.mark.parametrize(("duration", "component"), [(0.1, 1.0), (0.5, 0.0), (2.0, -1.0)])
@@ -301,8 +301,8 @@ def test_movements_take_the_time_of_the_greatest_reward(duration, component):
 
 
 def test_a_refinement_is_around_plans_that_are_worth_something():
-    actions, worth = np.arange(12.0).reshape(2, 3, 2), np.array([[-np.inf, 1.0, -np.inf], [1.0, 2.0, 3.0]])
-    best, value = geometry_search._top(actions, worth)
+    actions, merits = np.arange(12.0).reshape(2, 3, 2), np.array([[-np.inf, 1.0, -np.inf], [1.0, 2.0, 3.0]])
+    best, value = geometry_search._best(actions, merits)
     np.testing.assert_array_equal(best[0], np.repeat(actions[0, 1:2], 3, axis=0))
     np.testing.assert_array_equal(best[1], actions[1, ::-1])
     np.testing.assert_array_equal(value[1], [3.0, 2.0, 1.0])
@@ -314,9 +314,9 @@ def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
 
     def counting(observation, actions, *args, **kwargs):
         counted.append(actions.shape[1])
-        return worth_of_best(observation, actions, *args, **kwargs)
+        return pruned_merit(observation, actions, *args, **kwargs)
 
-    monkeypatch.setattr(geometry_search, "worth_of_best", counting)
+    monkeypatch.setattr(geometry_search, "pruned_merit", counting)
     search = GeometrySearch(env.task, 50, refinements=3, per_round=10)
     search.decide(observation)
     assert sum(counted) == search.total_checks == 80

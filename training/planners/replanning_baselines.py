@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from viapoint.envs.common.types import Float, Observation
 from viapoint.training.rollouts.rollout import OnlineTrial, Trials
 from viapoint.training.search.candidates import sobol_actions
-from viapoint.training.search.planned_movements import planned
+from viapoint.training.search.planned_movements import plan_movements
 
 ENOUGH = 0.004
 """Clearance from which on more of it is worth nothing to the planner, [m]."""
@@ -88,7 +88,7 @@ class OnlinePlanner:
 
     def _merit(self, observation: Observation, actions: NDArray[np.float32], scenes: Any) -> Float:
         """Clearance as far as it is wanting, then effort and time, shape (N, H)."""
-        task, moves = self._task, planned(observation, actions, self._task, INSTANTS)
+        task, moves = self._task, plan_movements(observation, actions, self._task, INSTANTS)
         number, tried = actions.shape[:2]
         reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
         effort = task.weights.smoothness * moves.effort

@@ -24,7 +24,7 @@ from viapoint.training.planners.replanning_baselines import INSTANTS, OnlinePlan
 from viapoint.training.rollouts.rollout import OnlineTrial
 from viapoint.training.scene_sets.scene_set import FrozenScenes
 from viapoint.training.scene_sets.scene_set_diff import add_arguments, compare_with_shipped
-from viapoint.training.search.planned_movements import planned
+from viapoint.training.search.planned_movements import plan_movements
 
 SIZES = {"validation": 200, "test": 500}
 SEEDS = {"validation": 1_000_000, "test": 2_000_000}
@@ -70,7 +70,7 @@ def shares(trial: OnlineTrial, scenes: ChangingScenes) -> NDArray[np.float64]:
     for row in range(number if scenes.present.any() else 0):
         scene, generator = scenes.take([row]), np.random.default_rng(row)
         actions = generator.uniform(-1.0, 1.0, (1, PLANS, task.action.size)).astype(np.float32)
-        moves = planned(trial.observe(scene), actions, task, INSTANTS)
+        moves = plan_movements(trial.observe(scene), actions, task, INSTANTS)
         every = scene.take(np.zeros(PLANS, dtype=np.int64))
         rows = every.places(moves.duration[0, :, None] * INSTANTS)
         least: Any = task.collision_model.clearance_profile(moves.path[0], rows, every.present).min(

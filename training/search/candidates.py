@@ -1,4 +1,4 @@
-"""Candidate actions that are spread evenly over the action space, the same ones in every scene."""
+"""Candidate actions that cover the action space evenly, the same ones in every scene."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     the greatest reward, and only their via-points and the split of their duration differ.
 
     Args:
-        task: Of the environment.
-        number: How many candidates, 1 or more.
-        replanning: Whether a movement may be under way; then candidates differ in their duration, too.
+        task: Task of the environment.
+        number: Number of candidates, 1 or more.
+        replanning: True where a movement may be under way; then candidates differ in their duration, too.
     """
     size, at = task.action.size, task.action.n_via * task.action.dimension
     if replanning or not at:
@@ -33,10 +33,14 @@ def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
 def best_duration(task: Task) -> float:
     """Return the duration component of the greatest reward.
 
-    It is where 5 w_smoothness log(T) - w_duration T is greatest, for T relative to the duration of the zero action.
+    With T relative to the duration of the zero action, the reward depends on it by
+
+        (1)  5 w_smoothness log(T) - w_duration T,   greatest at   T = 5 w_smoothness / w_duration,
+
+    as the jerk cost of a path scales with T^-5.
     """
     weights, (low, high) = task.weights, task.action.duration_range
-    relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)
+    relative = 5.0 * weights.smoothness / max(weights.duration, 1e-9)  # (1)
     return float(np.clip(2.0 * np.log(max(relative, 1e-9)) / np.log(high / low), -1.0, 1.0))
 
 
@@ -54,8 +58,7 @@ def normal_steps(number: int, size: int, seed: int) -> Single:
     """Return evenly spread steps of the standard normal distribution, shape (number, size)."""
     import torch
 
-    kind: Any = torch.quasirandom.SobolEngine
-    engine = kind(size, scramble=True, seed=seed)
+    engine = _sobol_engine(size, scramble=True, seed=seed)
     uniform = engine.draw(number).clamp(1e-4, 1.0 - 1e-4)
     steps: Single = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
     steps.flags.writeable = False
@@ -64,10 +67,14 @@ def normal_steps(number: int, size: int, seed: int) -> Single:
 
 def sobol_points(number: int, size: int) -> Single:
     """Return points of the Sobol sequence in the unit cube, shape (number, size), without its corner and its middle."""
-    import torch
-
-    kind: Any = torch.quasirandom.SobolEngine
-    engine = kind(size)
+    engine = _sobol_engine(size)
     engine.fast_forward(2)
     points: Single = engine.draw(number).numpy()
     return points
+
+
+def _sobol_engine(size: int, **kwargs: Any) -> Any:
+    import torch
+
+    kind: Any = torch.quasirandom.SobolEngine
+    return kind(size, **kwargs)

@@ -1,4 +1,4 @@
-"""Search for a movement with computed geometry: no network and no simulation."""
+"""Search for a movement with computed geometry, without a network and without simulation."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from viapoint.envs.scenes.scene import Scenes, problems
 from viapoint.training.search.candidates import candidate_actions, sobol_actions
 from viapoint.training.search.plan_checks import (
     CLEARANCE_MARGIN,
-    OUTSIDE,
+    INFEASIBLE,
     REACH_MARGIN,
     check_plans,
     merit,
-    worth_of_best,
+    pruned_merit,
 )
-from viapoint.training.search.planned_movements import Observation, is_replanning, part
+from viapoint.training.search.planned_movements import Observation, is_replanning, take_rows
 
-CENTRES = 4
-"""Best candidates that a round of refinement samples around."""
-KEEP = 0.1
-"""Reward by which another plan must be better than the one under way, as each change of plan costs jerk."""
+N_CENTRES = 4
+"""Number of best candidates that a round of refinement samples around."""
+KEEP_BONUS = 0.1
+"""Reward by which another plan must be better than the present one, as each change of plan costs jerk."""
 HORIZONS = (1.2, 0.9, 0.6, 0.3)
-"""Times for which a plan shall at least be clear where none is clear to its end, [s]: obstacles may change course."""
-SHORTER = 1e3
-"""Merit lost with each of these horizons, more than any reward."""
+"""Times for which a plan is checked where none is clear to its end, [s]: obstacles may change course."""
+HORIZON_PENALTY = 1e3
+"""Merit lost with each shorter horizon, more than any reward."""
 SPREAD = 0.25
-"""Half the side of the cube around each of them, in the action space; each round halves it."""
+"""Half the side of the cube that the first round samples around each centre; each further round halves it."""
 
 
 class GeometrySearch:
@@ -45,17 +45,17 @@ class GeometrySearch:
     depend on the duration; then all candidates but the first have the duration of the greatest reward. Candidates
     that jerk, duration or reach rule out count as checked, though their clearance is not computed.
 
-    Where plans are revised, the plan under way is kept as long as it is clear and no other one is better by KEEP. Where
-    none is clear to its end, one that is clear for the next HORIZONS seconds is taken.
+    When replanning, the present plan is kept as long as it is clear and no other plan is better by KEEP_BONUS. Where no
+    plan is clear to its end, the search takes one that is clear for the longest of HORIZONS.
 
     Args:
-        task: The task of an environment, or the id of a registered one.
+        task: Task of an environment, or id of a registered environment.
         n_checks: Candidates checked before any refinement, 1 or more.
         refinements: Rounds in which `per_round` more candidates are checked around the best ones.
         per_round: Candidates of each round.
         clearance_margin: Clearance that the chosen plan exceeds if any candidate does, [m].
-        reach_margin: Reach margin that it exceeds likewise, [m].
-        **kwargs: Of the environment, if an id is given.
+        reach_margin: Reach margin that the chosen plan exceeds if any candidate does, [m].
+        **kwargs: Arguments of the environment, if an id is given.
 
     Raises:
         ValueError: A number is out of range.
@@ -86,7 +86,7 @@ class GeometrySearch:
         ):
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
                 raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
-        self.task = task_of(task, **kwargs) if isinstance(task, str) else task
+        self.task = registered_task(task, **kwargs) if isinstance(task, str) else task
         self.n_checks, self.refinements, self.per_round = int(n_checks), int(refinements), int(per_round)
         self._margins = float(clearance_margin), float(reach_margin)
 
@@ -105,22 +105,21 @@ class GeometrySearch:
 
         Args:
             observation: Parts of shape (B, .) each.
-            scenes: Not looked at; part of the protocol :class:`~viapoint.training.planners.baselines.Method`.
+            scenes: Unused; part of the protocol :class:`~viapoint.training.planners.baselines.Method`.
         """
         number = len(observation["hand"])
         replanning = is_replanning(observation)
         actions = candidate_actions(self.task, self.n_checks, replanning=replanning)
-        tried = np.broadcast_to(actions, (number, *actions.shape))
-        best, value = _top(tried, worth_of_plans(observation, tried, self.task, self._margins))
+        candidates = np.broadcast_to(actions, (number, *actions.shape))
+        best, merits = _best(candidates, score_plans(observation, candidates, self.task, self._margins))
         for each in range(self.refinements):
             steps = SPREAD * 0.5**each * self._steps(replanning)
             centres = best[:, np.arange(self.per_round) % best.shape[1]]
             near = np.clip(centres + steps, -1.0, 1.0)
-            every = np.concatenate((best, near), axis=1)
-            best, value = _top(
-                every,
-                np.concatenate((value, worth_of_plans(observation, near, self.task, self._margins)), axis=1),
+            merits = np.concatenate(
+                (merits, score_plans(observation, near, self.task, self._margins)), axis=1
             )
+            best, merits = _best(np.concatenate((best, near), axis=1), merits)
         return best[:, 0].astype(np.float64)
 
     def predict(
@@ -142,12 +141,12 @@ class GeometrySearch:
     def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
         """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
 
-        Where no candidate stays clear and in reach, it is the one that comes nearest to that.
+        Where no candidate stays clear and in reach, the plan is the one with the least violation.
 
         Args:
-            start: Place of the hand, shape (D,), [m].
-            goal: Shape (D,), [m].
-            obstacles: Any number of rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; None for none.
+            start: Hand position, shape (D,), [m].
+            goal: Goal position, shape (D,), [m].
+            obstacles: Rows of centre (D), half-axis (D) and radius, shape (n, 2 D + 1), [m]; None for none.
 
         Raises:
             ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
@@ -168,35 +167,34 @@ class GeometrySearch:
         return np.insert(sobol_actions(self.per_round + 1, task.action.size - 1)[1:], at, 0.0, axis=1)
 
 
-def worth_of_plans(
+def score_plans(
     observation: Observation, actions: Numbers, task: Task, margins: tuple[float, float]
 ) -> Float:
-    """Return the merit of actions, shape (B, H); minus infinity where another one is certainly no worse.
+    """Return the merit of actions, shape (B, H); minus infinity where another action is certainly no worse.
 
-    On the way a first action of zero, which keeps the plan, is worth KEEP more, and where no plan is clear to its end,
+    When replanning, a first action of zero, which keeps the plan, gains KEEP_BONUS; where no plan is clear to its end,
     plans are compared by how long they stay clear.
 
     Args:
         observation: Parts of B observations, shape (B, .) each.
         actions: Shape (B, H, m), in [-1, 1].
-        task: The environment's.
-        margins: Of clearance and reach, [m].
+        task: Task of the environment.
+        margins: Least clearance and least reach margin, [m].
     """
     replanning = is_replanning(observation)
-    bonus = KEEP if replanning and not actions[:, 0].any() else 0.0
-    worth = worth_of_best(observation, actions, task, margins, bonus=bonus)
+    bonus = KEEP_BONUS if replanning and not actions[:, 0].any() else 0.0
+    merits = pruned_merit(observation, actions, task, margins, bonus=bonus)
     for rank, horizon in enumerate(HORIZONS if replanning else (), start=1):
-        rows = np.flatnonzero(worth.max(axis=-1) < 0.5 * OUTSIDE)
+        rows = np.flatnonzero(merits.max(axis=-1) < 0.5 * INFEASIBLE)
         if rows.size:
-            some = part(observation, rows)
-            shorter = worth_of_best(some, actions[rows], task, margins, horizon, bonus)
-            solved = shorter.max(axis=-1) > 0.5 * OUTSIDE
-            worth[rows[solved]] = shorter[solved] - rank * SHORTER
-    rows = np.flatnonzero(np.isneginf(worth).all(axis=-1))
-    if rows.size:
-        checks = check_plans(part(observation, rows), actions[rows], task)
-        worth[rows] = merit(checks, *margins)
-    return worth
+            some = take_rows(observation, rows)
+            shorter = pruned_merit(some, actions[rows], task, margins, horizon, bonus)
+            solved = shorter.max(axis=-1) > 0.5 * INFEASIBLE
+            merits[rows[solved]] = shorter[solved] - rank * HORIZON_PENALTY
+    rows = np.flatnonzero(np.isneginf(merits).all(axis=-1))
+    if rows.size:  # nothing is within the margins: order all plans by their violation
+        merits[rows] = merit(check_plans(take_rows(observation, rows), actions[rows], task), *margins)
+    return merits
 
 
 def scene_from_rest(
@@ -217,7 +215,7 @@ def scene_from_rest(
     return scene
 
 
-def task_of(env_id: str, **kwargs: Any) -> Task:
+def registered_task(env_id: str, **kwargs: Any) -> Task:
     """Return the task of a registered environment made with `kwargs`."""
     check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
@@ -226,22 +224,22 @@ def task_of(env_id: str, **kwargs: Any) -> Task:
     return task
 
 
-def _top(actions: Numbers, worth: Float) -> tuple[Single, Float]:
-    """Return the CENTRES best of H actions in each of B scenes, shape (B, CENTRES, m), and their merit.
+def _best(actions: Numbers, merits: Float) -> tuple[Single, Float]:
+    """Return the N_CENTRES best of H actions in each of B scenes, shape (B, N_CENTRES, m), and their merits.
 
-    The best one stands in for those of which nothing is known.
+    The best action replaces pruned ones, whose merit is unknown.
     """
-    each = np.arange(len(worth))[:, None]
-    order = np.argsort(-worth, axis=-1, kind="stable")[:, :CENTRES]
-    order = np.where(np.isneginf(worth[each, order]), order[:, :1], order)
-    return np.asarray(actions[each, order], np.float32), worth[each, order]
+    each = np.arange(len(merits))[:, None]
+    order = np.argsort(-merits, axis=-1, kind="stable")[:, :N_CENTRES]
+    order = np.where(np.isneginf(merits[each, order]), order[:, :1], order)
+    return np.asarray(actions[each, order], np.float32), merits[each, order]
 
 
 def _numbers(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float:
     """Return finite numbers of a shape.
 
     Raises:
-        ValueError: They are something else.
+        ValueError: The value has another type or shape, or is not finite.
     """
     wanted = f"({', '.join('n' if size is None else str(size) for size in shape)}{',' * (len(shape) == 1)})"
     try:
