@@ -19,9 +19,15 @@ from viapoint.envs.sim.executor import SETTLING
 from viapoint.training.algorithms.critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
 from viapoint.training.algorithms.pair_networks import Poses, cut_obstacles
 from viapoint.training.search.candidates import candidate_actions, normal_steps
-from viapoint.training.search.geometry_search import worth_of_plans
+from viapoint.training.search.geometry_search import score_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
-from viapoint.training.search.planned_movements import Observation, direction, is_replanning, part, planned
+from viapoint.training.search.planned_movements import (
+    Observation,
+    direction,
+    is_replanning,
+    plan_movements,
+    take_rows,
+)
 
 Numbers = NDArray[np.floating[Any]]
 
@@ -154,7 +160,7 @@ class ViaQPolicy(BasePolicy):
             shares: Fractions of the duration at which the pair networks are evaluated; those of training if not given.
         """
         shares = self.shares if shares is None else shares
-        moves = planned(observation, actions, self.task, shares)
+        moves = plan_movements(observation, actions, self.task, shares)
         relative = moves.duration / self.task.action.centre_duration
         spare = np.zeros_like(relative)
         if self.replanning:
@@ -191,7 +197,9 @@ class ViaQPolicy(BasePolicy):
         block = max(POSITIONS // (self.candidates * self.instants), 1)
         number = len(observation["hand"])
         if number > block:
-            pieces = [self.propose(part(observation, slice(i, i + block))) for i in range(0, number, block)]
+            pieces = [
+                self.propose(take_rows(observation, slice(i, i + block))) for i in range(0, number, block)
+            ]
             actions, values = (np.concatenate(each) for each in zip(*pieces, strict=True))
             return actions, values
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
@@ -220,7 +228,7 @@ class ViaQPolicy(BasePolicy):
         if not self.checks:
             return np.asarray(actions[rows, values.argmax(axis=1)])
         checked = np.take_along_axis(actions, self._promising(values)[..., None], axis=1)
-        worth = worth_of_plans(observation, checked, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
+        worth = score_plans(observation, checked, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
         return np.asarray(checked[rows, worth.argmax(axis=1)])
 
     def _promising(self, values: Numbers) -> NDArray[np.intp]:

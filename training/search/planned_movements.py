@@ -6,7 +6,6 @@ from collections.abc import Container, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint import primitives
 from viapoint.envs.actions.replanning import revised_waypoints
