@@ -80,20 +80,20 @@ def test_a_second_call_does_nothing_again(done, monkeypatch):
         pytest.fail("did again what was done")
 
     before = {path: path.read_bytes() for path in (done / "docs").rglob("*.*")}
-    for name in ("train", "evaluate"):
+    for name in ("train", "evaluate_methods"):
         monkeypatch.setattr(work, name, never)
     assert learning.main(words(done, *STEPS)) == 0
     assert before == {path: path.read_bytes() for path in (done / "docs").rglob("*.*")}
 
 
 def test_what_is_lost_is_measured_again(done, monkeypatch):
-    measured, evaluate = [], work.evaluate
+    measured, evaluate = [], work.evaluate_methods
 
     def counted(methods, *rest, **kwargs):
         measured.append([method.name for method in methods])
         return evaluate(methods, *rest, **kwargs)
 
-    monkeypatch.setattr(work, "evaluate", counted)
+    monkeypatch.setattr(work, "evaluate_methods", counted)
     lost = done / "runs" / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "study-test.json"
     before = lost.read_bytes()
     lost.unlink()

@@ -100,7 +100,7 @@ def test_help_lists_the_environments(capsys):
             "heads in policy_kwargs of viaq must be a whole",
         ),
         (f"evaluate --env {ENV} --baselines straight random straight", "straight is there twice"),
-        ("evaluate viapoint/Nothing-v0", "agents are shipped for viapoint/PandaMovingObstacles-v0"),
+        ("evaluate viapoint/Nothing-v0", "a shipped agent are viapoint/PandaMovingObstacles-v0"),
         (f"evaluate --baselines magic --env {ENV} --scenes test", "magic"),
         (f"evaluate --baselines straight --env {ENV} --scenes nowhere.npz", "nowhere.npz"),
         ("evaluate --baselines straight", "--env"),

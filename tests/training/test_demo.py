@@ -48,7 +48,7 @@ def test_everything_is_there_and_a_second_call_only_shows_it(quick, capsys, monk
     def never(*args, **kwargs):
         pytest.fail("did again what was done")
 
-    for name in ("train", "evaluate", "gallery", "film"):
+    for name in ("train", "evaluate_methods", "gallery", "film"):
         monkeypatch.setattr(demo, name, never)
     demo.run(quick)
     second = capsys.readouterr().out

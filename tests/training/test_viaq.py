@@ -58,17 +58,17 @@ def test_it_learns_in_pieces_is_saved_and_goes_on(made, tmp_path, env_id):
     model.learn(16, reset_num_timesteps=False)
     assert model.num_timesteps == 40
     model.save(tmp_path / "model")
-    buffer = io.BytesIO()
-    model.save(buffer)
-    buffer.seek(0)
+    with pytest.raises(TypeError, match="BytesIO"):
+        model.save(io.BytesIO())
     observation = env.reset()
     one = {name: part[0] for name, part in observation.items()}
-    for again in (ViaQ.load(tmp_path / "model"), ViaQ.load(buffer, env=env)):
+    for again in (ViaQ.load(tmp_path / "model"), ViaQ.load(tmp_path / "model.zip", env=env)):
         decided = again.predict(observation, deterministic=True)[0]
         np.testing.assert_array_equal(decided, model.predict(observation)[0])
         np.testing.assert_allclose(again.predict(one)[0], decided[0], atol=1e-5)
-        again.set_env(env)
-        assert again.learn(8, reset_num_timesteps=False).num_timesteps == 48
+    assert again.learn(8, reset_num_timesteps=False).num_timesteps == 48
+    with pytest.raises(ValueError, match=r"loaded for decisions; ViaQ\.load\(path, env="):
+        ViaQ.load(tmp_path / "model").learn(8)
 
 
 @pytest.mark.parametrize(

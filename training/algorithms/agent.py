@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
@@ -39,6 +40,9 @@ class Agent(BaseAlgorithm):
         (3, 2)
         >>> hand = plan.trajectory().position(np.linspace(0.0, plan.durations.sum(), 50))
     """
+
+    trainable: bool = True
+    """Mark of an agent that has a replay buffer to learn with."""
 
     @property
     def env_id(self) -> str:
@@ -94,7 +98,7 @@ class Agent(BaseAlgorithm):
         Raises:
             ValueError: The agent has no environment of this package, or holds objects that JSON cannot represent.
         """
-        write_folder(Path(str(path).removesuffix(".zip")), lambda folder: save_model(self, folder))
+        write_folder(Path(os.fspath(path).removesuffix(".zip")), lambda folder: save_model(self, folder))
 
     @classmethod
     def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]
@@ -102,7 +106,8 @@ class Agent(BaseAlgorithm):
 
         Args:
             path: Model folder, run folder, or id of an environment with a shipped agent.
-            env: Environment to continue training on; one environment of the agent's own kind if not given.
+            env: Environment to continue training on, with any number of copies; if not given, the agent can decide but
+                not learn.
 
         Raises:
             ValueError: There is no agent, its files are damaged, or it is of another algorithm.
@@ -112,7 +117,16 @@ class Agent(BaseAlgorithm):
             raise ValueError(
                 f"{path} holds an agent of {type(model).__name__}, not of {cls.__name__}; load_agent() loads both"
             )
+        model.trainable = env is not None
         return model
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        if not self.trainable:
+            kind = type(self).__name__
+            raise ValueError(
+                f"this agent was loaded for decisions; {kind}.load(path, env=ViaVecEnv(...)) loads it for training"
+            )
+        return super()._setup_learn(*args, **kwargs)
 
 
 class SAC(Agent, stable_baselines3.SAC):
@@ -140,7 +154,8 @@ def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
     Args:
         source: Id of an environment, for the agent that is shipped for it; a run folder, for its best model; or a
             model folder, such as `runs/first/final`.
-        env: Environment to continue training on; one environment of the agent's own kind if not given.
+        env: Environment to continue training on, with any number of copies; if not given, the agent can decide but not
+            learn.
 
     Returns:
         The agent, with `predict`, `plan`, `learn` and `save`.
@@ -167,21 +182,25 @@ def find_model(source: str | Path) -> Path:
     Raises:
         ValueError: It is none of them.
     """
-    folder, name = Path(source), str(source).removeprefix("viapoint/")
+    folder, known = Path(source), ", ".join(f"viapoint/{each.name}" for each in sorted(SHIPPED.glob("*-v*")))
     if str(source) in ENV_IDS:
-        shipped = SHIPPED / name
-        if not (shipped / "model.json").is_file():
-            raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {_shipped()}")
-        return shipped
+        if str(source) not in known.split(", "):
+            raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {known}")
+        return SHIPPED / folder.name
+    if folder.suffix == ".zip" and not folder.exists():
+        folder = folder.with_suffix("")
     if (folder / "model.json").is_file():
         return folder
     if (folder / "config.json").is_file():
         return best_model(folder)
-    what = "it holds no config.json and no model.json" if folder.is_dir() else "there is no such folder"
+    reason = "there is no such folder"
+    if folder.is_dir():
+        reason = "it holds no config.json and no model.json"
+    elif folder.exists():
+        reason = "it is a file (viapoint import-sb3 converts archives of Stable-Baselines3)"
     raise BadFileError(
         folder,
-        f"is no run folder or model folder: {'it is a file' if folder.is_file() else what}; agents are shipped for "
-        f"{_shipped()}",
+        f"is no run folder or model folder: {reason}; ids of environments with a shipped agent are {known}",
     )
 
 
@@ -197,8 +216,3 @@ def best_model(run: Path) -> Path:
             if (folder / "model.json").is_file():
                 return folder
     raise BadFileError(run, "holds no model yet")
-
-
-def _shipped() -> str:
-    """Return the ids of environments with a shipped agent, as a list in words."""
-    return ", ".join(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))

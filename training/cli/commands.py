@@ -49,6 +49,7 @@ def train(config: TrainConfig) -> None:
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     agent = None if config.agent is None else load_agent(config.agent)
+    run = Run(str(config.agent)) if config.agent and (Path(config.agent) / "config.json").is_file() else None
     if config.failures is not None:
         _check_failures(agent)
     env_id, env_kwargs = task_of(agent, config.env, None)
@@ -66,9 +67,9 @@ def evaluate(config: EvaluateConfig) -> None:
         )
     record = result.to_dict()
     report.show(record)
-    if config.agent is not None and (Path(config.agent) / "config.json").is_file():
+    if run is not None:
         name = _kept_as(config.scenes, whole, len(scenes.share), partial=result.partial)
-        print(f"kept as {Run(config.agent).write_evaluation(name, record)}")
+        print(f"kept as {run.write_evaluation(name, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
