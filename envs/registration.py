@@ -1,4 +1,4 @@
-"""The table of environments."""
+"""Ids of the environments and their keyword arguments."""
 
 from __future__ import annotations
 
@@ -23,22 +23,25 @@ TASKS: dict[str, dict[str, Any]] = {
         "duration_range": (1.0, 2.0),
     },
 }
-"""Every id with what it sets of the keyword arguments of :class:`~viapoint.envs.vector_env.ReachVectorEnv`."""
+"""Tasks with one action per movement: ids and keyword arguments.
+
+Their class is :class:`~viapoint.envs.vector_env.ReachVectorEnv`.
+"""
 
 OWN_ARM_TASKS: dict[str, str] = {
     "viapoint/Reach-v0": "viapoint/PandaReach-v0",
     "viapoint/Obstacles-v0": "viapoint/PandaObstacles-v0",
 }
-"""Every id that is meant for an arm of one's own, `gym.make(id, arm=...)`, and the task whose arguments it has."""
+"""Tasks for an arm of your own, `gym.make(id, arm=...)`: ids and the ids whose keyword arguments they share."""
 
 STEP_TASKS: dict[str, str] = {
     "viapoint/PlanarObstaclesStep-v0": "viapoint/PlanarObstacles-v0",
     "viapoint/PlanarWholeArmStep-v0": "viapoint/PlanarWholeArm-v0",
     "viapoint/PandaObstaclesStep-v0": "viapoint/PandaObstacles-v0",
 }
-"""Every id of a task with an action in every control step, and its twin, whose keyword arguments it sets.
+"""Tasks with one action per control step: ids and the ids whose keyword arguments they share.
 
-They are :class:`~viapoint.envs.velocity_env.StepReachVectorEnv`.
+Their class is :class:`~viapoint.envs.velocity_env.StepReachVectorEnv`.
 """
 
 ONLINE_TASKS: dict[str, dict[str, Any]] = {
@@ -53,38 +56,43 @@ ONLINE_TASKS: dict[str, dict[str, Any]] = {
         "horizon": 0.5,
     },
 }
-"""Every id of a task whose plans are revised on the way, with what it sets of the keyword arguments.
+"""Tasks with online replanning: ids and keyword arguments.
 
-They are those of :class:`~viapoint.envs.replanning_env.OnlineReachVectorEnv`.
+Their class is :class:`~viapoint.envs.replanning_env.OnlineReachVectorEnv`.
 """
 
 ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
-"""Every id."""
+"""All ids."""
 
 
 def register_all() -> None:
-    """Make every id known to Gymnasium; a second call changes nothing."""
-    for name, kwargs in TASKS.items():
-        _register(
-            name, "viapoint.envs.single_env:ReachEnv", "viapoint.envs.vector_env:ReachVectorEnv", kwargs
-        )
-    for name, like in OWN_ARM_TASKS.items():
-        _register(
-            name, "viapoint.envs.single_env:ReachEnv", "viapoint.envs.vector_env:ReachVectorEnv", TASKS[like]
-        )
-    for name, twin in STEP_TASKS.items():
-        module = "viapoint.envs.velocity_env"
-        _register(name, f"{module}:StepReachEnv", f"{module}:StepReachVectorEnv", TASKS[twin])
-    for name, kwargs in ONLINE_TASKS.items():
-        module = "viapoint.envs.replanning_env"
-        _register(name, f"{module}:OnlineReachEnv", f"{module}:OnlineReachVectorEnv", kwargs)
+    """Register every id with Gymnasium; a second call changes nothing."""
+    tables = (
+        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS),
+        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", {a: TASKS[b] for a, b in OWN_ARM_TASKS.items()}),
+        (
+            "velocity_env:StepReachEnv",
+            "velocity_env:StepReachVectorEnv",
+            {a: TASKS[b] for a, b in STEP_TASKS.items()},
+        ),
+        ("replanning_env:OnlineReachEnv", "replanning_env:OnlineReachVectorEnv", ONLINE_TASKS),
+    )
+    for single, batch, table in tables:
+        for env_id, kwargs in table.items():
+            if env_id not in gym.registry:
+                gym.register(
+                    env_id,
+                    entry_point=f"viapoint.envs.{single}",
+                    vector_entry_point=f"viapoint.envs.{batch}",
+                    kwargs=kwargs,
+                )
 
 
 def check_registered(env_id: str) -> None:
-    """Check that Gymnasium knows an id; otherwise the error lists those of this package.
+    """Check that Gymnasium knows an id.
 
     Raises:
-        ValueError: No such environment is registered.
+        ValueError: No such environment is registered; the message lists the ids of this package.
     """
     try:
         gym.spec(env_id)
@@ -95,10 +103,10 @@ def check_registered(env_id: str) -> None:
 
 
 def twin_of(env_id: str) -> str:
-    """The id of the task in which one action is a whole movement; of most ids themselves."""
+    """Return the id of the same task with one action per movement; for most ids, the id itself.
+
+    Example:
+        >>> twin_of("viapoint/PlanarObstaclesStep-v0")
+        'viapoint/PlanarObstacles-v0'
+    """
     return STEP_TASKS.get(env_id, env_id)
-
-
-def _register(name: str, entry_point: str, vector_entry_point: str, kwargs: dict[str, Any]) -> None:
-    if name not in gym.registry:
-        gym.register(name, entry_point=entry_point, vector_entry_point=vector_entry_point, kwargs=kwargs)

@@ -1,4 +1,4 @@
-"""An arm of one's own: from any MJCF file with hinges to a record and a model of our kind."""
+"""Import of arms from MJCF files."""
 
 from __future__ import annotations
 
@@ -9,46 +9,38 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arm_import.capsule_fit import around_points, surface
-from viapoint.envs.arm_import.mjcf_reader import (
-    ParsedMjcf,
-    box_of,
-    name_of,
-    names_of,
-    parse_mjcf,
-    path_of,
-    point_of,
-    radius_of,
-)
+from viapoint.envs.arm_import import mjcf_reader
+from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
+from viapoint.envs.arm_import.mjcf_reader import ParsedMjcf
 from viapoint.envs.arm_import.reachability import (
     FIRST_OFF_TABLE,
-    Body,
-    Reachable,
+    Feasibility,
+    LinkCapsule,
     check_room,
     check_strength,
-    good_map,
-    postures_at_corners,
+    corner_configurations,
+    fit_feasible_table,
 )
-from viapoint.envs.arms.kinematics import Chain
 from viapoint.envs.arms.mjcf import (
-    at_zero,
-    chain_of,
+    Pose,
+    as_box,
+    bodies_moved_by,
     in_frame,
     joint_frames,
-    moving_with,
-    principal,
+    kinematic_chain,
+    principal_inertia,
+    quaternion_of,
     read_spec,
+    zero_configuration,
 )
 from viapoint.envs.arms.serial_arm import SerialArm, serial_arm
-from viapoint.envs.common.types import Box, Float
-
-Frames = list[tuple[Float, Float]]
+from viapoint.envs.common.types import Float
 
 STAGE = "stage.xml"
-"""Table, lamp and cameras."""
-INSIDE = 0.03
-"""How far inside its reach movements start and end, [m]."""
-OBSTACLES, SELF, TABLE = 1, 2, 4
+"""Asset with table, light and cameras."""
+WORKSPACE_MARGIN = 0.03
+"""Distance of the default workspace from the faces of the reach, [m]."""
+OBSTACLE_BIT, SELF_BIT, TABLE_BIT = 1, 2, 4
 """Contact bits."""
 
 
@@ -66,142 +58,164 @@ def load_arm(
     velocity_limit: Any = None,
     hand_radius: float = 0.02,
 ) -> SerialArm:
-    """The record of the arm in an MJCF file.
+    """Load an arm from an MJCF file.
 
-    The file's links, joints, inertias and limits are taken over into a model of our kind: one capsule around the geoms
-    of each link, other joints held where the first keyframe has them, everything else left out. The hand keeps the turn
-    that it has at home.
+    The arm keeps the file's joints, inertias and limits. Each link gets one capsule around its geoms. Other joints are
+    fixed as in the file's first keyframe, and everything else is left out. The hand keeps the orientation that it has
+    at home; the reach is a box of hand positions around home.
 
     Args:
-        path: The file.
-        hand_site: A site that moves with the last joint: where the hand is.
-        joints: Limited hinges from the base to the hand, five or more.
-        name: Of the arm; by default the file's.
-        home: A posture in the middle of things, shape (J,), [rad]; by default the file's first keyframe, or else the
-            middle of the joints' ranges.
-        origin: The point of the file's world that is ours, on the table, [m]; by default below the first joint, z = 0.
-        workspace: Two opposite corners of the box in which movements start and end, [m]; by default it is searched for.
+        path: MJCF file.
+        hand_site: Site of the hand's position, which moves with the last joint.
+        joints: Names of the limited hinges from the base to the hand, five or more.
+        name: Name of the arm; by default that of the file.
+        home: Home configuration, shape (J,), [rad]; by default the file's first keyframe, or else the middle of the
+            joint ranges.
+        origin: Point of the file's world that becomes the origin, on the table, [m]; by default the point below the
+            first joint with z = 0.
+        workspace: Two opposite corners of the box in which movements start and end, [m]; by default the reach less 3 cm
+            on each side.
         joint_range: Lowest and highest angle of each joint, shape (J, 2), [rad]; by default those of the file.
-        torque_limit: Of the joints, [N m]; by default those of the file's joints or actuators.
-        velocity_limit: Of the joints, [rad/s]; by default the file's custom number of that name, or 2.
-        hand_radius: [m].
+        torque_limit: Torque limit of each joint or of all, [N m]; by default those of the file's joints or actuators.
+        velocity_limit: Velocity limit of each joint or of all, [rad/s]; by default the file's custom number of that
+            name, or 2.
+        hand_radius: Radius of the sphere that is the hand, [m].
+
+    Returns:
+        The arm. Pass it to `gymnasium.make(id, arm=...)`, or register it with `register_arm`.
 
     Raises:
-        TypeError: The path is no name of a file.
-        ValueError: Something is missing, with what there is, or the arm is too weak or has too little room.
+        TypeError: The path is not the name of a file.
+        ValueError: An argument is invalid, the file lacks something, or the arm is too weak or has too little room. The
+            message lists the allowed values.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs.arm_import import load_arm
+        >>> arm = load_arm(
+        ...     "docs/ur5e.xml",
+        ...     hand_site="hand",
+        ...     joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
+        ...     home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
+        ... )
+        >>> joints = arm.inverse_kinematics(np.array([[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]]))  # m
+        >>> joints.shape  # rad
+        (2, 6)
+        >>> arm.hand_position(joints).round(6).tolist()
+        [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]]
     """
-    file = path_of(path)
-    given = None if workspace is None else box_of(workspace)
-    there = None if origin is None else point_of("origin", origin)
-    hand_radius = radius_of(hand_radius)
-    name = name_of(file.stem if name is None else name)
-    foreign = parse_mjcf(
+    file = mjcf_reader.file_path(path)
+    corners = None if workspace is None else mjcf_reader.workspace_corners(workspace)
+    zero = None if origin is None else mjcf_reader.point("origin", origin)
+    hand_radius = mjcf_reader.positive_radius(hand_radius)
+    name = mjcf_reader.arm_name(file.stem if name is None else name)
+    parsed = mjcf_reader.parse_mjcf(
         file,
         hand_site,
-        names_of(joints),
+        mjcf_reader.joint_names(joints),
         home=home,
         joint_range=joint_range,
         torque_limit=torque_limit,
         velocity_limit=velocity_limit,
     )
-    frames = joint_frames(foreign.model, foreign.joints)
-    zero = np.array([*frames[0][1][:2], 0.0]) if there is None else there
-    bodies = _bodies(foreign, frames, hand_radius)
-    chain = chain_of(_written(foreign, frames, zero, bodies, [], hand_radius).compile(), foreign.joints)
-    hand_at = in_frame(frames[-1], at_zero(foreign.model).site(hand_site).xpos)
-    reachable = Reachable(chain, hand_at, foreign, bodies, hand_radius)
-    check_strength(foreign, chain, foreign.home[None], ["at home"])
-    kept = np.stack((reachable.middle, reachable.middle)) if given is None else given
-    place = good_map(chain, hand_at, foreign.home, reachable, reachable.box(given), kept)
+    frames = joint_frames(parsed.model, parsed.joints)
+    zero = np.array([*frames[0][1][:2], 0.0]) if zero is None else zero
+    capsules = _link_capsules(parsed, frames, hand_radius)
+    # The chain is that of the written model, whose first frame is relative to the new origin.
+    chain = kinematic_chain(_write(parsed, frames, zero, capsules, [], hand_radius).compile(), parsed.joints)
+    hand_offset = in_frame(frames[-1], zero_configuration(parsed.model).site(hand_site).xpos)
+    check = Feasibility(chain, hand_offset, parsed, capsules, hand_radius)
+    check_strength(parsed, chain, parsed.home[None], ["at home"])
+    required = np.stack((check.home_position, check.home_position)) if corners is None else corners
+    table = fit_feasible_table(check, check.reachable_box(corners), required)
+    if corners is None:
+        low, high = (np.array(corner) for corner in table.box)
+        corners = np.stack((low + WORKSPACE_MARGIN, high - WORKSPACE_MARGIN))
     arm = serial_arm(
-        _written(foreign, frames, zero, bodies, reachable.touching, hand_radius).to_xml(),
+        _write(parsed, frames, zero, capsules, check.overlapping, hand_radius).to_xml(),
         name=name,
-        joint_names=foreign.joints,
+        joint_names=parsed.joints,
         hand_site="hand",
-        place=place,
-        workspace=_inside(place.box) if given is None else _box(given),
+        ik=table,
+        workspace=as_box(corners),
     )
-    check_room(arm, place.box)
-    check_strength(foreign, chain, *postures_at_corners(arm))
+    check_room(arm, table.box)
+    check_strength(parsed, chain, *corner_configurations(arm))
     return arm
 
 
-def _bodies(foreign: ParsedMjcf, frames: Frames, hand_radius: float) -> list[Body]:
-    """A capsule around each link's geoms, those that collide if there are any, and one from the last to the hand."""
-    model, data, bodies = foreign.model, at_zero(foreign.model), []
+def _link_capsules(parsed: ParsedMjcf, frames: list[Pose], hand_radius: float) -> list[LinkCapsule]:
+    """Return one capsule around each link's geoms, those that collide if any do, and one from the last to the hand."""
+    model, data, capsules = parsed.model, zero_configuration(parsed.model), []
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    for index, joint in enumerate(foreign.joints):
-        moved = np.isin(model.geom_bodyid, moving_with(model, joint))
+    for index, (joint, frame) in enumerate(zip(parsed.joints, frames, strict=True)):
+        moved = np.isin(model.geom_bodyid, bodies_moved_by(model, joint))
         geoms = np.flatnonzero(moved & collides) if (moved & collides).any() else np.flatnonzero(moved)
-        parts = [surface(model, data, int(geom)) for geom in geoms]
-        points = np.concatenate([np.empty((0, 3)), *(part[0] for part in parts)])
-        if len(points):
-            around = np.concatenate([np.full(len(part[0]), part[1]) for part in parts])
-            ends, radius = around_points(points, around, np.array([frames[index][0][:, 2]]))
-            bodies.append(
-                Body(index, (in_frame(frames[index], ends[0]), in_frame(frames[index], ends[1])), radius)
-            )
-    if not bodies:
+        balls = [bounding_balls(model, data, int(geom)) for geom in geoms]
+        centres = np.concatenate([np.empty((0, 3)), *(each[0] for each in balls)])
+        if len(centres):
+            radii = np.concatenate([np.full(len(each[0]), each[1]) for each in balls])
+            (first, second), radius = fit_capsule(centres, radii, np.array([frame[0][:, 2]]))
+            capsules.append(LinkCapsule(index, (in_frame(frame, first), in_frame(frame, second)), radius))
+    if not capsules:
         raise ValueError(
-            f"no geom moves with any of {', '.join(foreign.joints)}: there is nothing to collide"
+            f"no geom moves with any of {', '.join(parsed.joints)}: nothing of the arm can collide"
         )
-    last, hand = len(frames) - 1, in_frame(frames[-1], data.site(foreign.hand_site).xpos)
-    ends = np.array(bodies[-1].ends if bodies[-1].joint == last else [(0.0, 0.0, 0.0)])
+    last, hand = len(frames) - 1, in_frame(frames[-1], data.site(parsed.hand_site).xpos)
+    ends = np.array(capsules[-1].ends if capsules[-1].joint == last else [(0.0, 0.0, 0.0)])
     nearest = ends[np.linalg.norm(ends - hand, axis=-1).argmin()]
-    if np.linalg.norm(nearest - hand) < 1e-3:
+    if np.linalg.norm(nearest - hand) < 1e-3:  # a capsule needs a length
         nearest = nearest - (0.0, 0.0, 2e-3)
-    return [*bodies, Body(last, (tuple(map(float, nearest)), hand), hand_radius)]  # type: ignore[arg-type]
+    x, y, z = map(float, nearest)
+    return [*capsules, LinkCapsule(last, ((x, y, z), hand), hand_radius)]
 
 
-def _written(
-    foreign: ParsedMjcf,
-    frames: Frames,
+def _write(
+    parsed: ParsedMjcf,
+    frames: list[Pose],
     origin: Float,
-    bodies: list[Body],
-    touching: list[tuple[int, int]],
+    capsules: list[LinkCapsule],
+    overlapping: list[tuple[int, int]],
     hand_radius: float,
 ) -> mujoco.MjSpec:
-    """The arm as a model of our kind."""
+    """Return the arm as a complete model: one body, hinge and capsule for each link.
+
+    Args:
+        parsed: Arm in the form of its file.
+        frames: Joint frames at angle 0.
+        origin: Point that becomes the origin, shape (3,), [m].
+        capsules: Links.
+        overlapping: Pairs of capsules between which contacts do not count.
+        hand_radius: Radius of the hand, [m].
+    """
     spec = read_spec(STAGE)
-    spec.add_numeric(name="velocity_limit", data=foreign.velocity_limit, size=len(foreign.joints))
-    parent, before = spec.worldbody, (np.eye(3), origin)
-    links: Chain = chain_of(foreign.model, foreign.joints)
-    for index, (joint, hinge) in enumerate(zip(foreign.joints, links.hinges, strict=True)):
-        turn = before[0].T @ frames[index][0]
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, turn.flatten())
-        place = before[0].T @ (frames[index][1] - before[1])
-        parent = parent.add_body(name=f"link_{index}", pos=place, quat=quaternion, gravcomp=1.0)
+    spec.add_numeric(name="velocity_limit", data=parsed.velocity_limit, size=len(parsed.joints))
+    parent, (turn, place) = spec.worldbody, (np.eye(3), origin)
+    chain = kinematic_chain(parsed.model, parsed.joints)
+    for index, (joint, hinge, frame) in enumerate(zip(parsed.joints, chain.hinges, frames, strict=True)):
+        parent = parent.add_body(
+            name=f"link_{index}", pos=turn.T @ (frame[1] - place), quat=quaternion_of(turn.T @ frame[0]), gravcomp=1.0,
+        )  # fmt: skip
         parent.mass, parent.ipos, parent.explicitinertial = hinge.mass, hinge.centre, True
-        parent.inertia, parent.iquat = principal(hinge.inertia)
-        torque = foreign.torque_limit[index]
+        parent.inertia, parent.iquat = principal_inertia(hinge.inertia)
+        torque = parsed.torque_limit[index]
         parent.add_joint(
-            name=joint, axis=(0.0, 0.0, 1.0), range=foreign.joint_range[index], limited=True,
+            name=joint, axis=(0.0, 0.0, 1.0), range=parsed.joint_range[index], limited=True,
             actfrcrange=(-torque, torque), actfrclimited=True, actgravcomp=True,
         )  # fmt: skip
-        before = frames[index]
-    for number, body in enumerate(bodies):
-        spec.body(f"link_{body.joint}").add_geom(
-            name=f"capsule_{number}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=np.ravel(body.ends),
-            size=(body.radius, 0.0, 0.0), conaffinity=SELF,
-            contype=OBSTACLES | SELF | (TABLE if body.joint >= FIRST_OFF_TABLE else 0),
+        turn, place = frame
+    for number, capsule in enumerate(capsules):
+        spec.body(f"link_{capsule.joint}").add_geom(
+            name=f"capsule_{number}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=np.ravel(capsule.ends),
+            size=(capsule.radius, 0.0, 0.0), conaffinity=SELF_BIT,
+            contype=OBSTACLE_BIT | SELF_BIT | (TABLE_BIT if capsule.joint >= FIRST_OFF_TABLE else 0),
         )  # fmt: skip
-    hand = bodies[-1].ends[1]
+    hand = capsules[-1].ends[1]
     parent.add_geom(
         name="hand", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(hand_radius, 0.0, 0.0), pos=hand,
-        contype=OBSTACLES | TABLE, conaffinity=0, rgba=(0.16, 0.20, 0.28, 1.0),
+        contype=OBSTACLE_BIT | TABLE_BIT, conaffinity=0, rgba=(0.16, 0.20, 0.28, 1.0),
     )  # fmt: skip
     parent.add_site(name="hand", pos=hand, size=(0.004, 0.0, 0.0), rgba=(0.0, 0.0, 0.0, 0.0))
-    for first, second in {(bodies[i].joint, bodies[j].joint) for i, j in touching}:
+    for first, second in {(capsules[i].joint, capsules[j].joint) for i, j in overlapping}:
         spec.add_exclude(bodyname1=f"link_{first}", bodyname2=f"link_{second}", name=f"near_{first}_{second}")
     return spec
-
-
-def _inside(box: Box) -> Box:
-    low, high = (np.array(corner) for corner in box)
-    return _box((low + INSIDE, high - INSIDE))
-
-
-def _box(corners: Any) -> Box:
-    low, high = np.asarray(corners, dtype=np.float64)
-    return tuple(map(float, low)), tuple(map(float, high))

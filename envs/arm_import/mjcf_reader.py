@@ -1,4 +1,4 @@
-"""MJCF files of other projects and the arguments that describe an arm in them."""
+"""Arguments of `load_arm`, and MJCF files of other projects."""
 
 from __future__ import annotations
 
@@ -11,16 +11,26 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from viapoint.envs.arms.mjcf import quaternion_of
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import as_real_array
 
-FLATTEST = 1e-3
-"""Least width of a workspace, in which places are drawn, [m]."""
-BOUND = 0.95
-"""Greatest coordinate of a place of the hand, [m]: observations end at 1."""
+MIN_WORKSPACE_WIDTH = 1e-3
+"""Least width of a workspace along each axis, [m]."""
+MAX_COORDINATE = 0.95
+"""Greatest coordinate of a hand position, [m]: observations end at 1."""
+POSITION_TOLERANCE = 1e-6
+"""Greatest difference of positions and axes that count as equal, [m]."""
+DEFAULT_VELOCITY_LIMIT = 2.0
+"""Velocity limit of joints without one, [rad/s]."""
+MIN_JOINTS = 5
+"""Least number of hinges: three for the hand's position, two for its direction."""
+JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""Transmissions of actuators that drive a hinge directly."""
 
 
-def path_of(value: Any) -> Path:
-    """Of the arm's file."""
+def file_path(value: Any) -> Path:
+    """Return the path of an existing file."""
     if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
         raise TypeError(f"path must be the name of an MJCF file, got {value!r}")
     path = Path(value)
@@ -29,15 +39,15 @@ def path_of(value: Any) -> Path:
     return path
 
 
-def name_of(value: Any) -> str:
-    """Of the arm, by which files of runs and models know it."""
+def arm_name(value: Any) -> str:
+    """Return a name that is a non-empty string."""
     if not isinstance(value, str) or not value:
-        raise ValueError(f"name must be a string of a character or more, got {value!r}")
+        raise ValueError(f"name must be a string of one or more characters, got {value!r}")
     return value
 
 
-def names_of(joints: Any) -> tuple[str, ...]:
-    """Of the joints."""
+def joint_names(joints: Any) -> tuple[str, ...]:
+    """Return different names of joints."""
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
     if not names or not all(isinstance(each, str) for each in names):
         raise ValueError(f"joints must be names, in order from the base to the hand, got {joints!r}")
@@ -46,95 +56,86 @@ def names_of(joints: Any) -> tuple[str, ...]:
     return names
 
 
-def one_for_each(name: str, values: Any, joints: tuple[str, ...]) -> Float:
-    """A number for each joint; one that is given stands for all."""
-    numbers = _numbers(values)
+def per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
+    """Return one number for each joint, shape (J,); a single number applies to all."""
+    numbers = as_real_array(values)
     if numbers is None or numbers.shape not in ((), (1,), (len(joints),)):
         raise ValueError(f"{name} must be {len(joints)} numbers, one for each joint, got {values!r}")
-    return np.array(np.broadcast_to(numbers, (len(joints),)))
+    return np.array(np.broadcast_to(numbers, (len(joints),)), np.float64)
 
 
-def ranges_of(values: Any, joints: tuple[str, ...]) -> Float:
-    """Lowest and highest angle of each joint, shape (J, 2), [rad]."""
-    ranges = _numbers(values)
-    good = ranges is not None and ranges.shape == (len(joints), 2) and bool(np.isfinite(ranges).all())
-    if ranges is None or not good or not (ranges[:, 0] < ranges[:, 1]).all():
+def joint_ranges(values: Any, joints: tuple[str, ...]) -> Float:
+    """Return the lowest and the highest angle of each joint, shape (J, 2), [rad]."""
+    ranges = _finite(values, (len(joints), 2))
+    if ranges is None or not (ranges[:, 0] < ranges[:, 1]).all():
         raise ValueError(
             f"joint_range must be {len(joints)} pairs of finite numbers in increasing order, got {values!r}"
         )
     return ranges
 
 
-def point_of(name: str, values: Any) -> Float:
-    """A place, shape (3,), [m]."""
-    point = _numbers(values)
-    if point is None or point.shape != (3,) or not np.isfinite(point).all():
+def point(name: str, values: Any) -> Float:
+    """Return a position, shape (3,), [m]."""
+    numbers = _finite(values, (3,))
+    if numbers is None:
         raise ValueError(f"{name} must be three finite numbers, x, y and z in m, got {values!r}")
-    return point
+    return numbers
 
 
-def box_of(values: Any) -> Float:
-    """Lowest and highest corner of a box of which two opposite corners are given, shape (2, 3), [m]."""
-    corners = _numbers(values)
-    if corners is None or corners.shape != (2, 3) or not np.isfinite(corners).all():
+def workspace_corners(values: Any) -> Float:
+    """Return the lowest and the highest corner of a box from any two opposite corners, shape (2, 3), [m]."""
+    corners = _finite(values, (2, 3))
+    if corners is None:
         raise ValueError(
             f"workspace must be two opposite corners, each of three finite numbers in m, got {values!r}"
         )
-    far = corners[(np.abs(corners) >= BOUND).any(axis=-1)]
+    far = corners[(np.abs(corners) >= MAX_COORDINATE).any(axis=-1)]
     if len(far):
         raise ValueError(
             f"the hand does not get to ({', '.join(f'{x:.4g}' for x in far[0])}) m: coordinates must be less than "
-            f"{BOUND} m, where observations end; give another workspace or origin"
+            f"{MAX_COORDINATE} m, where observations end; give another workspace or origin"
         )
-    if (np.abs(corners[1] - corners[0]) < FLATTEST).any():
+    if (np.abs(corners[1] - corners[0]) < MIN_WORKSPACE_WIDTH).any():
         raise ValueError(
-            f"workspace must be a box that is {1e3 * FLATTEST:g} mm wide or more in x, y and z, got {values!r}"
+            f"workspace must be a box that is {1e3 * MIN_WORKSPACE_WIDTH:g} mm wide or more in x, y and z, "
+            f"got {values!r}"
         )
     return np.sort(corners, axis=0)
 
 
-def radius_of(value: Any) -> float:
-    """Of the hand, [m]."""
+def positive_radius(value: Any) -> float:
+    """Return the radius of the hand, [m]."""
     number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (number and 0.0 < float(value) < BOUND):
-        raise ValueError(f"hand_radius must be a positive number of m, less than {BOUND}, got {value!r}")
+    if not (number and 0.0 < float(value) < MAX_COORDINATE):
+        raise ValueError(
+            f"hand_radius must be a positive number of m, less than {MAX_COORDINATE}, got {value!r}"
+        )
     return float(value)
 
 
-def _numbers(values: Any) -> Float | None:
-    """Real numbers as an array; None where they are something else."""
-    try:
-        array = np.asarray(values)
-    except (TypeError, ValueError):  # rows of different lengths, say
+def _finite(values: Any, shape: tuple[int, ...]) -> Float | None:
+    """Return finite real numbers of a shape, or None."""
+    array = as_real_array(values)
+    if array is None or array.shape != shape or not np.isfinite(array).all():
         return None
-    return array.astype(np.float64) if array.dtype.kind in "fiu" else None
-
-
-CLOSE = 1e-6
-"""Within which places and axes are the same, [m]."""
-VELOCITY = 2.0
-"""Limit of the joints where nothing is said, [rad/s]."""
-
-
-ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-"""What drives a hinge itself."""
+    return array.astype(np.float64)
 
 
 class ParsedMjcf(NamedTuple):
-    """An arm as its file has it."""
+    """Arm in the form of its file."""
 
     model: mujoco.MjModel
-    """With the arm's joints alone; all others are held still."""
+    """Model with the arm's joints only; all other joints are fixed."""
     joints: tuple[str, ...]
     hand_site: str
     home: Float
-    """Shape (J,), [rad]."""
+    """Home configuration, shape (J,), [rad]."""
     joint_range: Float
-    """Shape (J, 2), [rad]."""
+    """Lowest and highest angles, shape (J, 2), [rad]."""
     torque_limit: Float
-    """Shape (J,), [N m]."""
+    """Torque limits, shape (J,), [N m]."""
     velocity_limit: Float
-    """Shape (J,), [rad/s]."""
+    """Velocity limits, shape (J,), [rad/s]."""
 
 
 def parse_mjcf(
@@ -147,59 +148,54 @@ def parse_mjcf(
     torque_limit: Any,
     velocity_limit: Any,
 ) -> ParsedMjcf:
-    """Read and check a file; see :func:`~viapoint.envs.arm_import.loader.load_arm`."""
+    """Read and check a file; see :func:`~viapoint.envs.arm_import.loader.load_arm` for arguments and errors."""
     spec = _read(path)
-    _known("site", (hand_site,), [site.name for site in spec.sites])
-    _known("joint", joints, [joint.name for joint in spec.joints])
-    whole = _compiled(spec, path)
+    _check_exist("site", (hand_site,), [site.name for site in spec.sites])
+    _check_exist("joint", joints, [joint.name for joint in spec.joints])
+    whole = _compile(spec, path)
     ranges = _ranges(whole, joints, joint_range)
     torque = (
-        _torques(whole, joints)
-        if torque_limit is None
-        else one_for_each("torque_limit", torque_limit, joints)
+        _torques(whole, joints) if torque_limit is None else per_joint("torque_limit", torque_limit, joints)
     )
-    if (
-        velocity_limit is None
-        and mujoco.mj_name2id(whole, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0
-    ):
-        velocity_limit = whole.numeric("velocity_limit").data
-    velocity = one_for_each("velocity_limit", VELOCITY if velocity_limit is None else velocity_limit, joints)
+    if velocity_limit is None:
+        given = mujoco.mj_name2id(whole, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0
+        velocity_limit = whole.numeric("velocity_limit").data if given else DEFAULT_VELOCITY_LIMIT
+    velocity = per_joint("velocity_limit", velocity_limit, joints)
     for name, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (np.isfinite(limit).all() and (limit > 0.0).all()):
             raise ValueError(f"{name} must be positive and finite, got {limit}")
     if home is None:
         address = [int(whole.joint(joint).qposadr[0]) for joint in joints]
         home = whole.key_qpos[0, address] if whole.nkey else ranges.mean(axis=1)
-    home = one_for_each("home", home, joints)
+    home = per_joint("home", home, joints)
     outside = [
-        joint for joint, q, (low, high) in zip(joints, home, ranges, strict=True) if not low <= q <= high
+        name for name, q, (low, high) in zip(joints, home, ranges, strict=True) if not low <= q <= high
     ]
     if outside:
         raise ValueError(f"home is outside the range of {', '.join(outside)}")
-    model = _alone(spec, joints, whole)
+    model = _isolate(spec, joints, whole)
     _check_order(model, joints, hand_site)
     return ParsedMjcf(model, joints, hand_site, home, ranges, torque, velocity)
 
 
 def _read(path: Path) -> mujoco.MjSpec:
-    """The file, in which something must be there to collide."""
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ValueError(f"{str(path)!r} is no MJCF file that MuJoCo can read: {error}") from None
+        raise ValueError(f"MuJoCo cannot read {str(path)!r} as an MJCF file: {error}") from None
     if not spec.geoms:
-        raise ValueError(f"there are no geoms in {str(path)!r}: there is nothing to collide")
+        raise ValueError(f"there are no geoms in {str(path)!r}: nothing of the arm can collide")
     return spec
 
 
-def _compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo can make no model of {str(path)!r}: {error}") from None
+        raise ValueError(f"MuJoCo cannot compile {str(path)!r}: {error}") from None
 
 
-def _known(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
+def _check_exist(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
     missing = [name for name in wanted if name not in there]
     if missing:
         named = ", ".join(filter(None, there)) or "none"
@@ -209,85 +205,93 @@ def _known(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
 
 
 def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
-    if len(joints) < 5:
+    if len(joints) < MIN_JOINTS:
         raise ValueError(f"joints must be five or more, got {joints}")
     for name in joints:
         joint = model.joint(name)
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ValueError(f"joint {name!r} is no hinge; leave it out to hold it still")
+            raise ValueError(f"joint {name!r} is not a hinge; leave it out to fix it")
         if given is None and not model.jnt_limited[joint.id]:
             raise ValueError(
                 f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
             )
     if given is not None:
-        return ranges_of(given, joints)
+        return joint_ranges(given, joints)
     return np.array([model.joint(name).range for name in joints])
 
 
 def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
-    """Of each joint: its own limit, or that of the actuator that drives it."""
+    """Return the torque limit of each joint: its own, or the greatest of the actuators that drive it."""
     found = []
     for name in joints:
         joint = model.joint(name).id
         if model.jnt_actfrclimited[joint]:
-            found.append(_both_ways(model.jnt_actfrcrange[joint]))
+            found.append(_symmetric_limit(model.jnt_actfrcrange[joint]))
             continue
-        driven = np.isin(model.actuator_trntype, ON_JOINTS) & (model.actuator_trnid[:, 0] == joint)
+        driven = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(driven)]
         found.append(max(limits, default=np.nan))
-    missing = [name for name, limit in zip(joints, found, strict=True) if not np.isfinite(limit)]
+    torques = np.array(found)
+    missing, one_way = (
+        ", ".join(name for name, bad in zip(joints, each, strict=True) if bad)
+        for each in (~np.isfinite(torques), torques <= 0.0)
+    )
     if missing:
-        raise ValueError(
-            f"no actuator with a limited force drives {', '.join(missing)}; add one, or give torque_limit"
-        )
-    one_way = [name for name, limit in zip(joints, found, strict=True) if limit <= 0.0]
+        raise ValueError(f"no actuator with a limited force drives {missing}; add one, or give torque_limit")
     if one_way:
         raise ValueError(
-            f"the force on {', '.join(one_way)} is limited to one direction; give it a range about 0 in the file, or "
-            "give torque_limit"
+            f"the force on {one_way} is limited to one direction; give it a range about 0 in the file, or give "
+            "torque_limit"
         )
-    return np.array(found)
+    return torques
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
+    """Return an actuator's torque limit: that of its force, or that of its control where force is gain * control."""
     gear = abs(float(model.actuator_gear[index, 0]))
     if model.actuator_forcelimited[index]:
-        return gear * _both_ways(model.actuator_forcerange[index])
+        return gear * _symmetric_limit(model.actuator_forcerange[index])
     plain = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
     if plain and model.actuator_ctrllimited[index]:
         gain = abs(float(model.actuator_gainprm[index, 0]))
-        return gear * gain * _both_ways(model.actuator_ctrlrange[index])
+        return gear * gain * _symmetric_limit(model.actuator_ctrlrange[index])
     return np.nan
 
 
-def _both_ways(limits: Float) -> float:
-    """What a range leaves in either direction; 0 where it is one-sided."""
+def _symmetric_limit(limits: Float) -> float:
+    """Return the limit that a range leaves in both directions; 0 if it is one-sided."""
     return max(min(-float(limits[0]), float(limits[1])), 0.0)
 
 
-def _alone(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
-    """The model without what drives, couples or measures, every other joint held as in the first keyframe, if any."""
+def _isolate(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model without actuators, constraints and sensors, all other joints fixed as in the first keyframe.
+
+    Args:
+        spec: Model of the file, which is changed.
+        joints: Joints of the arm.
+        whole: Compiled model of the whole file.
+    """
     for part in (
         *spec.actuators, *spec.equalities, *spec.sensors, *spec.tendons, *spec.keys, *spec.excludes, *spec.pairs,
     ):  # fmt: skip
         spec.delete(part)
     others = [joint for joint in spec.joints if joint.name not in joints]
-    held = _held(whole, joints) if whole.nkey else None
-    if held:
+    fixed = _keyframe_positions(whole, joints) if whole.nkey else None
+    if fixed:
         for body in {joint.parent.id: joint.parent for joint in others}.values():
-            _put(body, whole, held)
+            _fix_body(body, whole, fixed)
     for joint in others:
         spec.delete(joint)
     for body in spec.bodies:
         body.mocap = False
     model = spec.compile()
-    if held:
-        _check_held(model, whole, held, joints)
+    if fixed:
+        _check_fixed(model, whole, fixed, joints)
     return model
 
 
-def _held(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
-    """The places of everything with the arm as it is drawn and all other joints as in the first keyframe."""
+def _keyframe_positions(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
+    """Return the positions of all parts with the arm's joints at rest and the others as in the first keyframe."""
     data = mujoco.MjData(whole)
     data.qpos[:] = whole.key_qpos[0]
     for name in joints:
@@ -297,46 +301,44 @@ def _held(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
     return data
 
 
-def _put(body: Any, whole: mujoco.MjModel, held: mujoco.MjData) -> None:
-    """Write a body's place into it, in a frame of its own: it may be in another."""
+def _fix_body(body: Any, whole: mujoco.MjModel, fixed: mujoco.MjData) -> None:
+    """Write a body's pose into the model, in a frame of its own because the body may be inside another frame."""
     number, parent = body.id, whole.body_parentid[body.id]
-    turn = held.xmat[parent].reshape(3, 3).T
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, (turn @ held.xmat[number].reshape(3, 3)).flatten())
+    turn = fixed.xmat[parent].reshape(3, 3).T
     body.set_frame(body.parent.add_frame())
-    body.pos, body.quat = turn @ (held.xpos[number] - held.xpos[parent]), quaternion
+    body.pos = turn @ (fixed.xpos[number] - fixed.xpos[parent])
+    body.quat = quaternion_of(turn @ fixed.xmat[number].reshape(3, 3))
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def _check_held(
-    model: mujoco.MjModel, whole: mujoco.MjModel, held: mujoco.MjData, joints: tuple[str, ...]
+def _check_fixed(
+    model: mujoco.MjModel, whole: mujoco.MjModel, fixed: mujoco.MjData, joints: tuple[str, ...]
 ) -> None:
-    """Whether the arm's joints are still where the file has them."""
+    """Check that the arm's joints are still where the file has them."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for name in joints:
         here, there = model.joint(name).id, whole.joint(name).id
-        apart = np.abs(data.xanchor[here] - held.xanchor[there]).max()
-        if max(apart, np.abs(data.xaxis[here] - held.xaxis[there]).max()) > CLOSE:
+        apart = np.abs(data.xanchor[here] - fixed.xanchor[there]).max()
+        if max(apart, np.abs(data.xaxis[here] - fixed.xaxis[there]).max()) > POSITION_TOLERANCE:
             raise ValueError(
-                f"joints that are left out cannot be held where the file's keyframe has them, as that moves {name}; "
-                "write that place into the file and leave the keyframe out"
+                f"joints that are left out cannot be fixed as in the file's keyframe, because that moves {name}; "
+                "write their positions into the file and remove the keyframe"
             )
 
 
 def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> None:
-    """Whether each joint carries the next, and the last the hand."""
+    """Check that each joint carries the next one, and the last one the hand."""
     bodies = [int(model.joint(name).bodyid[0]) for name in joints]
-    for (before, carrier), (after, body) in zip(
-        zip(joints, bodies, strict=True), zip(joints[1:], bodies[1:], strict=True), strict=False
-    ):
-        if carrier == body:
+    for i in range(1, len(joints)):
+        first, second = joints[i - 1], joints[i]
+        if bodies[i - 1] == bodies[i]:
             raise ValueError(
-                f"joints {before!r} and {after!r} belong to one body; leave one out to hold it still, or give each a "
-                "body of its own in the file"
+                f"joints {first!r} and {second!r} belong to one body; leave one out to fix it, or give each a body of "
+                "its own in the file"
             )
-        if carrier not in _ancestors(model, body):
-            raise ValueError(f"joints must be in order from the base: {before!r} does not carry {after!r}")
+        if bodies[i - 1] not in _ancestors(model, bodies[i]):
+            raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
     last = int(model.site(hand_site).bodyid[0])
     if model.body_weldid[last] != bodies[-1]:
         raise ValueError(f"site {hand_site!r} does not move with the last joint, {joints[-1]!r}")

@@ -3,327 +3,323 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arm_import.mjcf_reader import BOUND, ParsedMjcf
+from viapoint.envs.arm_import.mjcf_reader import MAX_COORDINATE, ParsedMjcf
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.arms.ik_table import PostureMap, hand_pose, solve_map, solve_postures
+from viapoint.envs.arms.ik_table import IKTable, fit_ik_table, hand_pose, solve_inverse_kinematics
 from viapoint.envs.arms.kinematics import Chain, Constants
-from viapoint.envs.arms.serial_arm import RESERVE, SerialArm
+from viapoint.envs.arms.mjcf import as_box, grid
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE, SerialArm
 from viapoint.envs.common.types import Bool, Box, Float
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.spatial import SpaceSampler
 
 SPACING, SEARCH_RADIUS = 0.05, 0.45
-"""Of the places that are tried, and how far from home, [m]."""
-CLOSE, TURNED, SPARE = 2e-4, 0.35, 0.05
-"""How near the hand must come [m], how far it may be turned [rad], how far inside their ranges joints stay [rad]."""
-ROOM = 0.01
-"""Between links, and above the table, [m]."""
+"""Distance of the positions that are tried, and how far from home they lie, [m]."""
+HAND_TOLERANCE, ORIENTATION_TOLERANCE = 2e-4, 0.35
+"""Greatest error of the hand's position [m], and greatest rotation of the hand from home [rad]."""
+JOINT_MARGIN = 0.05
+"""Least distance of joints from the ends of their ranges, [rad]."""
+LINK_MARGIN = 0.01
+"""Least distance between links, and of links and hand from the table, [m]."""
 FIRST_OFF_TABLE = 2
-"""Links of earlier joints may be near the table."""
-NARROWEST = 0.3
-"""Least width of the box along some axis, [m]: movements must find room in it."""
+"""Index of the first joint whose link must not come near the table."""
+MIN_LENGTH = 0.3
+"""Least length of the reach along its longest axis, [m]: movements must fit in."""
+TABLE_CHECKS = 16
+"""Positions along each axis at which a table is checked."""
+TABLE_MARGIN_FACTOR = 2.0
+"""Factor by which margins may be smaller, and rotations greater, between the nodes of a table than at them."""
+MAX_JOINT_SLOPE = 25.0
+"""Greatest rotation of a joint per distance of the hand, [rad/m]: several times that of smooth solutions."""
+ROOM_SCENES = 64
+"""Scenes that are sampled to check that movements fit into the workspace."""
 
 
-def shown(place: Float) -> str:
-    """A place in words."""
-    return f"({', '.join(f'{x:.3f}' for x in place)})"
-
-
-def check_size(low: Float, high: Float) -> None:
-    """Refuse a reach in which movements do not fit."""
-    if (high - low).max() < NARROWEST or (high - low).min() < 2 * SPACING:
-        raise ValueError(
-            f"the hand reaches only a box of {np.round(high - low, 2)} m around its place at home, turned as there; "
-            "give another home"
-        )
-
-
-class Body(NamedTuple):
-    """A link's capsule in its joint's frame."""
+class LinkCapsule(NamedTuple):
+    """Collision capsule of a link in its joint's frame."""
 
     joint: int
     ends: tuple[Constants, Constants]
     radius: float
 
 
-class Reachable:
-    """Tries places of the hand."""
+class Feasibility:
+    """Check of configurations and hand positions of an imported arm.
+
+    A position is feasible if the inverse kinematics that starts at home finds a configuration that puts the hand there,
+    oriented as at home, with all margins of this module. Links that overlap at home already are not compared, because
+    capsules are wider than links.
+    """
 
     def __init__(
-        self, chain: Chain, hand_at: Constants, foreign: ParsedMjcf, bodies: list[Body], hand_radius: float
-    ) -> None:
-        self._chain, self._hand_at, self._foreign = chain, hand_at, foreign
-        self._bodies, self._hand_radius = bodies, hand_radius
-        self._pairs = [
+        self, chain: Chain, hand_offset: Constants, parsed: ParsedMjcf, capsules: list[LinkCapsule], hand_radius: float
+    ) -> None:  # fmt: skip
+        self.chain, self.hand_offset, self.home = chain, hand_offset, parsed.home
+        self._parsed, self._capsules, self._hand_radius = parsed, capsules, hand_radius
+        self.home_position, self._home_axes = hand_pose(chain, hand_offset, parsed.home)
+        """Hand position at home, shape (3,), [m]."""
+        pairs = [
             (i, j)
-            for i, first in enumerate(bodies)
-            for j, second in enumerate(bodies)
+            for i, first in enumerate(capsules)
+            for j, second in enumerate(capsules)
             if second.joint - first.joint >= 2
         ]
-        self.middle = hand_pose(chain, hand_at, foreign.home)[0]
-        """The hand's place at home, shape (3,), [m]."""
-        close = self._between(foreign.home[None])[0] < ROOM
-        self.touching = [pair for pair, near in zip(self._pairs, close, strict=True) if near]
-        """Pairs of capsules that overlap at home already, as capsules are wider than links."""
-        self._apart = [pair for pair, near in zip(self._pairs, close, strict=True) if not near]
+        close = [self._clearance(parsed.home[None], [pair])[0, 0] < LINK_MARGIN for pair in pairs]
+        self.overlapping = [pair for pair, near in zip(pairs, close, strict=True) if near]
+        """Pairs of capsules that overlap at home."""
+        self._pairs = [pair for pair, near in zip(pairs, close, strict=True) if not near]
 
-    def box(self, workspace: Float | None) -> Box:
-        """The reach: around home, or around a given workspace.
+    def reachable_box(self, workspace: Float | None) -> Box:
+        """Return the largest box of feasible positions around home, or around a given workspace, shape (2, 3).
+
+        The box lies on a grid of SPACING, and grows face by face.
 
         Raises:
-            ValueError: A place of the workspace is out of reach, or the box is too small to move in.
+            ValueError: A position of the workspace is infeasible, or the box is too small for movements.
         """
-        low, high = (self.middle, self.middle) if workspace is None else workspace
+        low, high = (self.home_position, self.home_position) if workspace is None else workspace
         beyond = np.arange(1, round(SEARCH_RADIUS / SPACING) + 1) * SPACING
-        between = [
+        inner = [
             np.linspace(a, b, int(np.ceil((b - a) / SPACING)) + 1) for a, b in zip(low, high, strict=True)
         ]
-        axes = [
-            np.concatenate((a - beyond[::-1], inner, b + beyond))
-            for a, inner, b in zip(low, between, high, strict=True)
-        ]
-        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        good = self.good(places.reshape(-1, 3)).reshape(places.shape[:3])
-        begin, end = [len(beyond)] * 3, [len(beyond) + len(inner) - 1 for inner in between]
-        inside = tuple(slice(b, e + 1) for b, e in zip(begin, end, strict=True))
-        if not good[inside].all():
-            bad = places[inside][~good[inside]][0]
+        axes = [np.concatenate((each[0] - beyond[::-1], each, each[-1] + beyond)) for each in inner]
+        positions = grid(axes)
+        feasible = self.positions_feasible(positions.reshape(-1, 3)).reshape(positions.shape[:3])
+        first, last = [len(beyond)] * 3, [len(beyond) + len(each) - 1 for each in inner]
+        inside = tuple(slice(b, e + 1) for b, e in zip(first, last, strict=True))
+        if not feasible[inside].all():
+            bad = positions[inside][~feasible[inside]][0]
             raise ValueError(
-                f"the hand does not get to {shown(bad)} m, turned as at home: {self._why_not(bad)}; give another "
-                "home, origin or workspace"
+                f"the hand does not get to {_in_words([bad], 3)} m, oriented as at home: {self._reason(bad)}; give "
+                "another home, origin or workspace"
             )
-        begin, end = _grown(good, begin, end)
-        corners = [np.array([axis[k] for axis, k in zip(axes, ks, strict=True)]) for ks in (begin, end)]
-        check_size(corners[0], corners[1])
-        return (tuple(map(float, corners[0])), tuple(map(float, corners[1])))
+        first, last = _grown(feasible, first, last)
+        corners = np.array([[axis[k] for axis, k in zip(axes, ks, strict=True)] for ks in (first, last)])
+        _check_size(corners)
+        return as_box(corners)
 
-    def good(self, places: Float) -> Bool:
-        """To which places the hand gets, shape (N,)."""
-        return self.fits(places, solve_postures(self._chain, self._hand_at, self._foreign.home, places))
+    def positions_feasible(self, hand: Float) -> Bool:
+        """Return True for hand positions that are feasible, shape (N,)."""
+        return self.feasible(hand, solve_inverse_kinematics(self.chain, self.hand_offset, self.home, hand))
 
-    def fits(self, places: Float, joints: Float, *, loose: float = 1.0) -> Bool:
-        """Which postures put the hand at places as it should get there, shape (N,).
+    def feasible(self, hand: Float, joints: Float, *, factor: float = 1.0) -> Bool:
+        """Return True for configurations that put the hand at its position with all margins, shape (N,).
 
         Args:
-            places: Shape (N, 3), [m].
-            joints: Shape (N, J), [rad].
-            loose: By which factor limits may be nearer than they should, 1 or more.
+            hand: Hand positions, shape (N, 3), [m].
+            joints: Configurations, shape (N, J), [rad].
+            factor: Factor by which margins may be smaller and rotations greater, 1 or more.
         """
-        (off, turned), (spare, high, apart) = self._errors(places, joints), self._room(joints)
-        good = (off < CLOSE) & (turned < TURNED * loose) & (spare > SPARE / loose).all(axis=-1)
-        good &= (np.abs(places).max(axis=-1) < BOUND) & (places[:, 2] > self._hand_radius + ROOM / loose)
-        return np.asarray(good & (high > ROOM / loose).all(axis=-1) & (apart > ROOM / loose).all(axis=-1))
-
-    def _errors(self, places: Float, joints: Float) -> tuple[Float, Float]:
-        """How far the hand is from places [m], and turned from home [rad], shape (N,) each."""
-        place, turn = hand_pose(self._chain, self._hand_at, joints)
-        home = hand_pose(self._chain, self._hand_at, self._foreign.home)[1]
-        cosine = np.clip((np.einsum("nij,ij->n", turn, home) - 1.0) / 2.0, -1.0, 1.0)
-        return np.abs(place - places).max(axis=-1), np.arccos(cosine)
-
-    def _room(self, joints: Float) -> tuple[Float, Float, Float]:
-        """How far joints are inside their ranges (N, J) [rad], links above the table and apart (N, .) [m]."""
-        low, high = self._foreign.joint_range.T
-        ends = self._ends(joints)
-        above = [
-            ends[:, i, :, 2].min(axis=-1) - self._bodies[i].radius
-            for i in range(len(self._bodies))
-            if self._bodies[i].joint >= FIRST_OFF_TABLE
-        ]
-        return (
-            np.minimum(joints - low, high - joints),
-            np.stack(above, axis=-1),
-            self._between(joints, self._apart),
+        (error, rotation), (inside, above, apart) = self._errors(hand, joints), self._margins(joints)
+        good = (error < HAND_TOLERANCE) & (rotation < ORIENTATION_TOLERANCE * factor)
+        good &= (inside > JOINT_MARGIN / factor).all(axis=-1) & (np.abs(hand).max(axis=-1) < MAX_COORDINATE)
+        good &= hand[:, 2] > self._hand_radius + LINK_MARGIN / factor
+        return np.asarray(
+            good & (np.concatenate((above, apart), axis=-1) > LINK_MARGIN / factor).all(axis=-1)
         )
 
-    def _why_not(self, place: Float) -> str:
-        """What is wrong with the posture that is found for a place that is not good."""
-        if np.abs(place).max() >= BOUND:
-            return f"coordinates must be less than {BOUND} m, where observations end"
-        if place[2] <= self._hand_radius + ROOM:
-            return f"the hand, of radius {self._hand_radius:g} m, comes closer than {1e3 * ROOM:.0f} mm to the table"
-        joints = solve_postures(self._chain, self._hand_at, self._foreign.home, place[None])
-        ((off,), (turned,)), (spare, above, apart) = self._errors(place[None], joints), self._room(joints)
-        names = self._foreign.joints
-        if off >= CLOSE or turned >= TURNED:
-            return f"no posture near home gets nearer than {1e3 * off:.0f} mm and {turned:.2f} rad"
-        if (spare <= SPARE).any():
-            worst = int(spare[0].argmin())
-            return (
-                f"{names[worst]} comes to {joints[0, worst]:.2f} rad, less than {SPARE} rad inside its range"
-            )
-        if (above <= ROOM).any():
-            off_table = [body for body in self._bodies if body.joint >= FIRST_OFF_TABLE]
-            link = names[off_table[int(above[0].argmin())].joint]
-            return f"the link of {link} comes closer than {1e3 * ROOM:.0f} mm to the table"
-        first, second = (names[self._bodies[k].joint] for k in self._apart[int(apart[0].argmin())])
-        return f"the links of {first} and {second} come closer than {1e3 * ROOM:.0f} mm to one another"
+    def _errors(self, hand: Float, joints: Float) -> tuple[Float, Float]:
+        """Return the hand's position error [m] and its rotation from home [rad], shape (N,) each."""
+        position, axes = hand_pose(self.chain, self.hand_offset, joints)
+        cosine = np.clip((np.einsum("nij,ij->n", axes, self._home_axes) - 1.0) / 2.0, -1.0, 1.0)
+        return np.abs(position - hand).max(axis=-1), np.arccos(cosine)
+
+    def _margins(self, joints: Float) -> tuple[Float, Float, Float]:
+        """Return margins of joints in their ranges, (N, J) [rad], of links to the table and each other, (N, .) [m]."""
+        low, high = self._parsed.joint_range.T
+        ends = self._ends(joints)
+        above = [
+            ends[:, i, :, 2].min(axis=-1) - capsule.radius
+            for i, capsule in enumerate(self._capsules)
+            if capsule.joint >= FIRST_OFF_TABLE
+        ]
+        inside = np.minimum(joints - low, high - joints)
+        return inside, np.stack(above, axis=-1), self._clearance(joints, self._pairs)
+
+    def _reason(self, hand: Float) -> str:
+        """Return the reason for which a position is infeasible."""
+        if np.abs(hand).max() >= MAX_COORDINATE:
+            return f"coordinates must be less than {MAX_COORDINATE} m, where observations end"
+        near = f"comes closer than {1e3 * LINK_MARGIN:.0f} mm to"
+        if hand[2] <= self._hand_radius + LINK_MARGIN:
+            return f"the hand, of radius {self._hand_radius:g} m, {near} the table"
+        joints = solve_inverse_kinematics(self.chain, self.hand_offset, self.home, hand[None])
+        ((error,), (rotation,)), (inside, above, apart) = (
+            self._errors(hand[None], joints),
+            self._margins(joints),
+        )
+        names = self._parsed.joints
+        if error >= HAND_TOLERANCE or rotation >= ORIENTATION_TOLERANCE:
+            return f"no configuration near home gets nearer than {1e3 * error:.0f} mm and {rotation:.2f} rad"
+        if (inside <= JOINT_MARGIN).any():
+            worst = int(inside[0].argmin())
+            return f"{names[worst]} comes to {joints[0, worst]:.2f} rad, less than {JOINT_MARGIN} rad inside its range"
+        if (above <= LINK_MARGIN).any():
+            off_table = [capsule for capsule in self._capsules if capsule.joint >= FIRST_OFF_TABLE]
+            return f"the link of {names[off_table[int(above[0].argmin())].joint]} {near} the table"
+        first, second = (names[self._capsules[k].joint] for k in self._pairs[int(apart[0].argmin())])
+        return f"the links of {first} and {second} come closer than {1e3 * LINK_MARGIN:.0f} mm to one another"
 
     def _ends(self, joints: Float) -> Float:
-        places = tuple((body.joint, end) for body in self._bodies for end in body.ends)
-        return np.asarray(self._chain.points(joints, places)).reshape(len(joints), -1, 2, 3)
+        places = tuple((capsule.joint, end) for capsule in self._capsules for end in capsule.ends)
+        return np.asarray(self.chain.points(joints, places)).reshape(len(joints), -1, 2, 3)
 
-    def _between(self, joints: Float, pairs: list[tuple[int, int]] | None = None) -> Float:
-        """Clearance of pairs of links, shape (N, pairs), [m]."""
+    def _clearance(self, joints: Float, pairs: list[tuple[int, int]]) -> Float:
+        """Return the clearance of pairs of capsules, shape (N, pairs), [m]."""
         ends, each = self._ends(joints), []
-        for i, j in self._pairs if pairs is None else pairs:
+        for i, j in pairs:
             middle, half = ends[:, j].mean(axis=1), 0.5 * (ends[:, j, 1] - ends[:, j, 0])
             row = np.concatenate((middle, half, np.zeros((len(joints), 1))), axis=-1)[:, None]
             squared = segment_distance_squared(ends[:, i, :1], ends[:, i, 1:], row)[:, 0, 0]
-            each.append(np.sqrt(squared) - self._bodies[i].radius - self._bodies[j].radius)
+            each.append(np.sqrt(squared) - self._capsules[i].radius - self._capsules[j].radius)
         return np.stack(each, axis=-1) if each else np.full((len(joints), 1), np.inf)
 
 
-def _grown(good: Bool, begin: list[int], end: list[int]) -> tuple[list[int], list[int]]:
-    """A box of good places, grown layer by layer, where it is narrowest first, as long as the layers are good."""
-    begin, end = list(begin), list(end)
-    stuck: set[tuple[int, int]] = set()
-    while len(stuck) < 6:
-        free = [(axis, step) for axis in range(3) for step in (-1, 1) if (axis, step) not in stuck]
-        axis, step = min(free, key=lambda face: end[face[0]] - begin[face[0]])
-        side = begin if step < 0 else end
-        following = side[axis] + step
-        layer = [slice(b, e + 1) for b, e in zip(begin, end, strict=True)]
-        layer[axis] = slice(following, following + 1)
-        if 0 <= following < good.shape[axis] and good[tuple(layer)].all():
-            side[axis], stuck = following, set()
-        else:
-            stuck.add((axis, step))
-    return begin, end
-
-
-LOOKS = 16
-"""Places along each axis where a map is looked at."""
-LOOSE = 2.0
-"""By which factor limits may be nearer between the nodes than at them."""
-STEEPEST = 25.0
-"""How far a joint may turn while the hand moves, [rad/m]: several times as far as where postures run smoothly."""
-
-
-def good_map(
-    chain: Chain, hand_at: Constants, home: Float, reachable: Reachable, box: Box, kept: Float
-) -> PostureMap:
-    """The map of a chain, where necessary in a smaller box.
+def fit_feasible_table(check: Feasibility, box: Box, required: Float) -> IKTable:
+    """Return an inverse-kinematics table that is feasible in its whole box, in a smaller box where necessary.
 
     Args:
-        chain: Of J hinges.
-        hand_at: The hand in the last joint's frame, [m].
-        home: Angles, shape (J,), [rad].
-        reachable: Knows which postures are good.
-        box: The reach, [m].
-        kept: Two corners of what must stay inside, shape (2, 3), [m].
+        check: Feasibility of the arm.
+        box: Reach, [m].
+        required: Two corners of the part of the box that must remain, shape (2, 3), [m].
 
     Raises:
-        ValueError: There is no such map.
+        ValueError: No such table exists.
     """
     while True:
-        place = solve_map(chain, hand_at, home, box)
-        bad = _bad(place, reachable)
+        table = fit_ik_table(check.chain, check.hand_offset, check.home, box)
+        bad = infeasible_positions(table, check)
         if not len(bad):
-            return place
-        box = _smaller(box, bad, kept)
+            return table
+        box = _shrunk(box, bad, required)
 
 
-def _bad(place: PostureMap, reachable: Reachable) -> Float:
-    """Where a map does not put the hand as it should get there, or turns a joint too fast, shape (M, 3), [m]."""
-    axes = [np.linspace(low, high, LOOKS) for low, high in zip(*place.box, strict=True)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    joints = np.asarray(place(places))
-    good = reachable.fits(places.reshape(-1, 3), joints.reshape(-1, joints.shape[-1]), loose=LOOSE)
-    good = good.reshape(places.shape[:3])
+def infeasible_positions(table: IKTable, check: Feasibility) -> Float:
+    """Return hand positions of a grid at which a table is infeasible or turns a joint too fast, shape (M, 3), [m]."""
+    axes = [np.linspace(low, high, TABLE_CHECKS) for low, high in zip(*table.box, strict=True)]
+    positions = grid(axes)
+    joints = np.asarray(table(positions))
+    flat = joints.reshape(-1, joints.shape[-1])
+    good = check.feasible(positions.reshape(-1, 3), flat, factor=TABLE_MARGIN_FACTOR).reshape(
+        positions.shape[:3]
+    )
     for axis in range(3):
-        turned = np.abs(np.diff(joints, axis=axis)).max(axis=-1) / (axes[axis][1] - axes[axis][0])
-        steep = np.moveaxis(turned > STEEPEST, axis, 0)
+        slope = np.abs(np.diff(joints, axis=axis)).max(axis=-1) / (axes[axis][1] - axes[axis][0])
+        steep = np.moveaxis(slope > MAX_JOINT_SLOPE, axis, 0)
         smooth = np.moveaxis(good, axis, 0)
         smooth[:-1] &= ~steep
         smooth[1:] &= ~steep
-    return np.asarray(places[~good])
+    return np.asarray(positions[~good])
 
 
-def _smaller(box: Box, bad: Float, kept: Float) -> Box:
-    """A box with one face moved inwards, such that as few bad places as possible are left."""
+def check_strength(parsed: ParsedMjcf, chain: Chain, joints: Float, places: Sequence[str]) -> None:
+    """Check that the joints can hold the arm against gravity.
+
+    Args:
+        parsed: Arm with its torque limits.
+        chain: Chain with its masses.
+        joints: Configurations, shape (N, J), [rad].
+        places: Descriptions of these configurations for the error, N of them.
+
+    Raises:
+        ValueError: A joint is too weak; the message names it with its limit and the torque that it needs.
+    """
+    weight = np.abs(chain.torques(joints, 0.0 * joints, 0.0 * joints)[1])
+    lacking = weight - LIMIT_SHARE * parsed.torque_limit
+    if (lacking >= 0.0).any():
+        where, joint = np.unravel_index(lacking.argmax(), lacking.shape)
+        raise ValueError(
+            f"torque_limit of {parsed.joints[joint]} is {parsed.torque_limit[joint]:g} N m, of which {LIMIT_SHARE:.0%} "
+            f"are used, but to hold the arm {places[where]} against gravity takes {weight[where, joint]:.4g} N m"
+        )
+
+
+def corner_configurations(arm: SerialArm) -> tuple[Float, list[str]]:
+    """Return configurations with the hand in the workspace's corners, shape (8, J), [rad], and their descriptions."""
+    corners = np.array(list(itertools.product(*zip(*arm.workspace, strict=True))))
+    return np.asarray(arm.inverse_kinematics(corners)), [
+        f"with its hand at {_in_words([each])} m" for each in corners
+    ]
+
+
+def check_room(arm: SerialArm, reach: Box) -> None:
+    """Check that movements can be sampled in an arm's workspace.
+
+    Raises:
+        ValueError: The workspace is too small; the message has the workspace, the reach and the size of movements.
+    """
+    wanted = SpaceDistribution(n_obstacles=(0, 0))
+    sampler = SpaceSampler(CollisionModel(arm, whole_arm=True), wanted)
+    try:
+        sampler([np.random.default_rng(seed) for seed in range(ROOM_SCENES)])
+    except RuntimeError:
+        low, high = wanted.distance
+        raise ValueError(
+            f"workspace {_in_words(arm.workspace)} m, within a reach of {_in_words(reach)} m, is too small: start and "
+            f"goal are {low:g} to {high:g} m apart, and a movement through one via-point beside the straight line must "
+            "stay within reach; give another workspace or home"
+        ) from None
+
+
+def _grown(feasible: Bool, first: list[int], last: list[int]) -> tuple[list[int], list[int]]:
+    """Return a box of feasible grid points, grown by one feasible layer at a time, along its shortest side first.
+
+    Args:
+        feasible: Feasibility of the grid points, shape (A, B, C).
+        first: Lowest indices of the box to start with.
+        last: Highest indices.
+    """
+    first, last = list(first), list(last)
+    stuck: set[tuple[int, int]] = set()
+    while len(stuck) < 6:
+        free = [(axis, step) for axis in range(3) for step in (-1, 1) if (axis, step) not in stuck]
+        axis, step = min(free, key=lambda face: last[face[0]] - first[face[0]])
+        side = first if step < 0 else last
+        following = side[axis] + step
+        layer = [slice(b, e + 1) for b, e in zip(first, last, strict=True)]
+        layer[axis] = slice(following, following + 1)
+        if 0 <= following < feasible.shape[axis] and feasible[tuple(layer)].all():
+            side[axis], stuck = following, set()
+        else:
+            stuck.add((axis, step))
+    return first, last
+
+
+def _shrunk(box: Box, bad: Float, required: Float) -> Box:
+    """Return a box with one face moved inwards, so that as few bad positions as possible remain."""
     faces = []
     for axis, side in itertools.product(range(3), (0, 1)):
         corners = np.array(box)
         corners[side, axis] += SPACING if side == 0 else -SPACING
-        within = corners[0, axis] <= kept[0, axis] if side == 0 else corners[1, axis] >= kept[1, axis]
-        if not within:
+        if corners[0, axis] > required[0, axis] or corners[1, axis] < required[1, axis]:
             continue
         left = int(((bad >= corners[0]) & (bad <= corners[1])).all(axis=-1).sum())
         faces.append((left, -float(corners[1, axis] - corners[0, axis]), corners))
     if not faces:
         raise ValueError(
-            f"postures near {shown(bad[0])} m do not follow the hand smoothly from home; give another home or a "
-            "smaller workspace"
+            f"configurations near {_in_words(bad[:1], 3)} m do not follow the hand smoothly from home; give another "
+            "home or a smaller workspace"
         )
     _, _, corners = min(faces, key=lambda face: face[:2])
-    check_size(corners[0], corners[1])
-    return tuple(map(float, corners[0])), tuple(map(float, corners[1]))
+    _check_size(corners)
+    return as_box(corners)
 
 
-SCENES = 64
-"""That are drawn to see whether there is room."""
-
-
-def check_strength(foreign: ParsedMjcf, chain: Chain, joints: Float, places: Sequence[str]) -> None:
-    """Refuse an arm that cannot hold itself.
-
-    Args:
-        foreign: With its limits.
-        chain: With its masses.
-        joints: Some postures, shape (N, J), [rad].
-        places: Words for where the hand is then, N of them.
-
-    Raises:
-        ValueError: With the joint, its limit and what it would need.
-    """
-    weight = np.abs(chain.torques(joints, 0.0 * joints, 0.0 * joints)[1])
-    lacking = weight - RESERVE * foreign.torque_limit
-    if (lacking >= 0.0).any():
-        where, joint = np.unravel_index(lacking.argmax(), lacking.shape)
+def _check_size(corners: Float) -> None:
+    size = corners[1] - corners[0]
+    if size.max() < MIN_LENGTH or size.min() < 2 * SPACING:
         raise ValueError(
-            f"torque_limit of {foreign.joints[joint]} is {foreign.torque_limit[joint]:g} N m, of which {RESERVE:.0%} "
-            f"are used, but to hold the arm {places[where]} against gravity takes {weight[where, joint]:.4g} N m"
+            f"the hand reaches only a box of {np.round(size, 2)} m around its position at home, oriented as there; "
+            "give another home"
         )
 
 
-def postures_at_corners(arm: SerialArm) -> tuple[Float, list[str]]:
-    """Postures with the hand in the corners of the workspace, shape (8, J), [rad], and words for these places."""
-    corners = np.array(list(itertools.product(*zip(*arm.workspace, strict=True))))
-    return np.asarray(arm.inverse_kinematics(corners)), [
-        f"with its hand at {_shown((each,))} m" for each in corners
-    ]
-
-
-def check_room(arm: SerialArm, box: Box) -> None:
-    """Refuse an arm in whose workspace no movements can be drawn.
-
-    Args:
-        arm: With its workspace.
-        box: Its reach.
-
-    Raises:
-        ValueError: With the workspace, the reach around it, and what must have room.
-    """
-    wanted = SpaceDistribution(n_obstacles=(0, 0))
-    try:
-        SpaceSampler(CollisionModel(arm, whole_arm=True), wanted)(
-            [np.random.default_rng(seed) for seed in range(SCENES)]
-        )
-    except RuntimeError:
-        low, high = wanted.distance
-        raise ValueError(
-            f"workspace {_shown(arm.workspace)} m, within a reach of {_shown(box)} m, is too small: start and goal are "
-            f"{low:g} to {high:g} m apart, and a movement through one via-point beside the straight line must stay "
-            "within reach; give another workspace or home"
-        ) from None
-
-
-def _shown(corners: Iterable[Iterable[float]]) -> str:
-    return " to ".join(f"({', '.join(f'{x:.2f}' for x in corner)})" for corner in corners)
+def _in_words(points: Any, digits: int = 2) -> str:
+    """Return points as text."""
+    return " to ".join(f"({', '.join(f'{x:.{digits}f}' for x in each)})" for each in points)

@@ -1,4 +1,4 @@
-"""The arms: one record each."""
+"""Arms: a two-joint arm in the plane, serial arms with any number of hinges, and the registry of their names."""
 
 from __future__ import annotations
 
@@ -9,47 +9,52 @@ from viapoint.envs.arms.panda import PANDA
 from viapoint.envs.arms.planar import ADULT
 
 ARMS: dict[str, Arm] = {arm.name: arm for arm in (ADULT, PANDA)}
-"""Every known arm by its name."""
+"""Registered arms by name."""
 
-OF_ONES_OWN = "viapoint.envs.arms.register_arm makes an arm of your own known by its name"
-"""What to do where an arm is not known."""
+REGISTER_HINT = "viapoint.envs.register_arm registers an arm of your own under its name"
+"""Hint of error messages about unknown arms."""
 
 
 def register_arm(arm: Arm) -> None:
-    """Make an arm of one's own known by its name, so that environments, runs and models find it.
+    """Register an arm under its name, so that environments, runs and models find it.
 
-    Files of runs and models hold no more of an arm than its name: whoever loads one makes the arm known first.
+    Files of runs and models, and environment specs as JSON, store an arm's name only. Register the arm before you load
+    one of them. Registering an equal arm again changes nothing.
 
     Raises:
-        TypeError: It is no record of an arm.
-        ValueError: Another arm is known by that name.
+        TypeError: The argument is not an arm.
+        ValueError: A different arm is registered under that name.
+
+    Example:
+        >>> from viapoint.envs.arms import PANDA, register_arm
+        >>> register_arm(PANDA)
     """
-    _check_record(arm)
+    _check_arm(arm)
     if ARMS.setdefault(arm.name, arm) != arm:
-        raise ValueError(f"another arm is known as {arm.name!r}; give this one another name")
+        raise ValueError(f"another arm is registered as {arm.name!r}; give this one another name")
 
 
 def arm_of(arm: Any) -> Arm:
-    """An arm itself, or the one with that name.
+    """Return an arm itself, or the registered arm of a name.
 
     Raises:
-        TypeError: It is neither.
-        ValueError: There is none of that name.
+        TypeError: The argument is neither an arm nor a string.
+        ValueError: No arm of that name is registered.
     """
     if isinstance(arm, str):
         if arm not in ARMS:
-            raise ValueError(f"arm must be a record or one of {', '.join(ARMS)}, got {arm!r}; {OF_ONES_OWN}")
+            raise ValueError(f"arm must be an arm or one of {', '.join(ARMS)}, got {arm!r}; {REGISTER_HINT}")
         return ARMS[arm]
-    _check_record(arm)
+    _check_arm(arm)
     found: Arm = arm
     return found
 
 
-def _check_record(arm: Any) -> None:
+def _check_arm(arm: Any) -> None:
     if not hasattr(arm, "reach_margin") or not isinstance(getattr(arm, "name", None), str):
         raise TypeError(
-            f"arm must be a record of viapoint.envs.arms, got {arm!r:.80}; files and JSON know arms by "
-            f"their names: {OF_ONES_OWN}"
+            f"arm must be an arm of viapoint.envs.arms, got {arm!r:.80}; files and JSON store an arm's name only: "
+            f"{REGISTER_HINT}"
         )
 
 

@@ -8,22 +8,31 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.types import Bool, Box, Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, clearance_profile, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.primitives.array_api import Array
 
 
 class Arm(Protocol):
-    """An arm: its size, its reach, its two kinematic directions and its inverse side.
+    """Arm: its size and reach, forward and inverse kinematics, and the controls that track a movement.
 
-    The kinematic functions are batched over leading dimensions and accept NumPy arrays and torch tensors.
-    Positions are in the frame of the arm's base, which is the world's.
+    The functions are batched over leading dimensions and accept NumPy arrays and torch tensors. Positions are in the
+    frame of the arm's base, which is the world.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs.arms import PANDA
+        >>> joints = PANDA.inverse_kinematics(np.array([0.5, 0.1, 0.3]))
+        >>> PANDA.hand_position(joints).round(4).tolist()
+        [0.5, 0.1, 0.3]
+        >>> round(float(PANDA.reach_margin(np.array([0.5, 0.1, 0.3]))), 3)
+        0.148
     """
 
     @property
     def name(self) -> str:
-        """A short name, unlike every other arm's."""
+        """Short name, different from that of every other arm."""
 
     @property
     def dimension(self) -> int:
@@ -43,47 +52,70 @@ class Arm(Protocol):
 
     @property
     def velocity_limit(self) -> tuple[float, ...]:
-        """Of the joints, [rad/s]; empty where there is none."""
+        """Velocity limits of the joints, [rad/s]; empty if there are none."""
 
     @property
-    def workspace(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def workspace(self) -> Box:
         """Two opposite corners of the box in which movements start and end, [m]."""
 
     @property
     def traced(self) -> tuple[str, ...]:
-        """Sites of the model that the physics records: the hand, then both ends of each link; none where that is slow.
+        """Names of the sites that the simulation records: the hand, then both ends of each link.
 
-        Where there are none, positions are computed from the joints.
+        Without names, positions are computed from the joints; for few links that is faster.
         """
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
-        """The MuJoCo model of the arm with `n_obstacles` movable capsules.
+        """Return the MuJoCo model of the arm with movable obstacles.
 
-        `whole_arm`: every link collides with the obstacles, not the hand alone.
+        Args:
+            n_obstacles: Number of movable capsules.
+            whole_arm: True if every link collides with the obstacles, False for the hand alone.
         """
 
     def hand_position(self, joints: Array) -> Array:
-        """Hand position, shape (..., D), [m], at `joints`, shape (..., J), [rad]."""
+        """Return the hand's position by forward kinematics, shape (..., D), [m].
+
+        Args:
+            joints: Joint angles, shape (..., J), [rad].
+        """
 
     def links(self, joints: Array) -> Array:
-        """End points of the links' axes, shape (..., L, 2, D), [m], at `joints`, shape (..., J), [rad]."""
+        """Return both ends of the axis of each link's capsule, shape (..., L, 2, D), [m].
+
+        Args:
+            joints: Joint angles, shape (..., J), [rad].
+        """
 
     def inverse_kinematics(self, hand: Array) -> Array:
-        """Joint angles, shape (..., J), [rad], that put the hand at `hand`, shape (..., D), [m]."""
+        """Return the joint angles that put the hand at a position, shape (..., J), [rad].
+
+        Each position has one configuration, which depends on it smoothly. Positions out of reach give angles of a
+        position nearby, not an error; check :meth:`reach_margin`.
+
+        Args:
+            hand: Hand positions, shape (..., D), [m].
+        """
 
     def reach_margin(self, hand: Array) -> Array:
-        """How far inside its reach the hand is, shape (...,), [m]; negative where no posture gets there."""
+        """Return the distance of a hand position inside the reach, shape (...,), [m]; negative out of reach."""
 
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """By which factor a movement must be slowed down for the arm's limits, shape (...,); 1 where it need not.
+        """Return the factor by which a movement's duration must grow to keep the arm's limits, shape (...,), 1 or more.
 
-        The movement is given at some times, shape (..., T, D) each; they need not be evenly spaced.
+        Args:
+            position: Hand positions at T times, not necessarily evenly spaced, shape (..., T, D), [m].
+            velocity: Hand velocities, shape (..., T, D), [m/s].
+            acceleration: Hand accelerations, shape (..., T, D), [m/s^2].
         """
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Actuator controls, shape (..., T, U), that make the hand follow references, shape (..., T, D) each.
+        """Return the actuator controls that make the hand follow references, shape (..., T, U).
 
-        The references are those of T consecutive physics steps.
+        Args:
+            position: Hand positions at T consecutive physics steps, shape (..., T, D), [m].
+            velocity: Hand velocities, shape (..., T, D), [m/s].
+            acceleration: Hand accelerations, shape (..., T, D), [m/s^2].
         """
 
 

@@ -1,4 +1,4 @@
-"""MuJoCo models: reading them, turning their joints into kinematic chains, adding obstacles."""
+"""MuJoCo models of arms: files, joint frames, kinematic chains, and the bodies of obstacles."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Constants, Hinge
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Box, Float
 
-SMALLEST = 1e-12
-"""Principal moment of inertia of a link, [kg m^2]."""
-THICK = 2e-5
-"""By how much less than the sum of the others a moment is at least, relative to it: files have six digits."""
+Pose = tuple[Float, Float]
+"""Axes, as the columns of a rotation matrix, and origin of a frame in the world, [m]."""
+
+MIN_INERTIA = 1e-12
+"""Least principal moment of inertia of a link, [kg m^2]."""
+INERTIA_MARGIN = 2e-5
+"""Relative margin of the triangle inequality of principal moments; model files keep six digits."""
 DIGITS = 12
-"""To which constants are rounded, so that what should be zero is and costs nothing."""
+"""Decimal places of constants, so that entries that should be 0 are 0, and cost nothing."""
 
 
 def read_spec(model_file: str) -> mujoco.MjSpec:
-    """An MJCF file: one of the package's `assets` by its name, any other by its path, or its text."""
+    """Return an MJCF model: one of the package's `assets` by name, another file by its path, or the text of a file."""
     if model_file.lstrip().startswith("<"):
         return mujoco.MjSpec.from_string(model_file)
     own = files("viapoint.envs") / "assets" / model_file
@@ -30,19 +33,18 @@ def read_spec(model_file: str) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_file(model_file)
 
 
-def at_zero(model: mujoco.MjModel) -> mujoco.MjData:
-    """The model's places with all joints at 0."""
+def zero_configuration(model: mujoco.MjModel) -> mujoco.MjData:
+    """Return the positions of all parts of the model with every hinge at angle 0."""
     data = mujoco.MjData(model)
-    for joint in range(model.njnt):
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-            data.qpos[model.jnt_qposadr[joint]] = 0.0
+    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    data.qpos[model.jnt_qposadr[hinges]] = 0.0
     mujoco.mj_kinematics(model, data)
     return data
 
 
-def joint_frames(model: mujoco.MjModel, names: tuple[str, ...]) -> list[tuple[Float, Float]]:
-    """Axes, as columns of a matrix whose last is the joint's, and origin of each joint's frame at angle 0."""
-    data, frames = at_zero(model), []
+def joint_frames(model: mujoco.MjModel, names: tuple[str, ...]) -> list[Pose]:
+    """Return the frame of each joint at angle 0; its z axis is the joint's axis."""
+    data, frames = zero_configuration(model), []
     for name in names:
         joint = model.joint(name).id
         turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
@@ -50,56 +52,83 @@ def joint_frames(model: mujoco.MjModel, names: tuple[str, ...]) -> list[tuple[Fl
     return frames
 
 
-def chain_of(model: mujoco.MjModel, names: tuple[str, ...]) -> Chain:
-    """The chain of the hinges `names`, in order from the base; everything else moves with the hinge before it."""
-    data, frames, hinges = at_zero(model), joint_frames(model, names), []
-    before: tuple[Float, Float] = np.eye(3), np.zeros(3)
-    for name, (turn, origin) in zip(names, frames, strict=True):
-        moved = moving_with(model, name)
+def kinematic_chain(model: mujoco.MjModel, names: tuple[str, ...]) -> Chain:
+    """Return the chain of some hinges, in order from the base; other bodies move with the nearest hinge below them."""
+    data, hinges = zero_configuration(model), []
+    previous: Pose = np.eye(3), np.zeros(3)
+    for name, (turn, origin) in zip(names, joint_frames(model, names), strict=True):
+        moved = bodies_moved_by(model, name)
         mass = float(model.body_mass[moved].sum())
         centre = (model.body_mass[moved, None] * data.xipos[moved]).sum(axis=0) / mass
-        relative = before[0].T @ turn
+        relative = previous[0].T @ turn
         hinges.append(
             Hinge(
                 turn=(_constants(relative[:, 0]), _constants(relative[:, 1]), _constants(relative[:, 2])),
-                offset=_constants(before[0].T @ (origin - before[1])),
+                offset=in_frame(previous, origin),
                 mass=mass,
-                centre=_constants(turn.T @ (centre - origin)),
+                centre=in_frame((turn, origin), centre),
                 inertia=_rows(turn.T @ _inertia(model, data, moved, centre) @ turn),
             )
         )
-        before = turn, origin
+        previous = turn, origin
     return Chain(hinges=tuple(hinges))
 
 
-def moving_with(model: mujoco.MjModel, name: str) -> list[int]:
-    """The bodies that move with a joint and no later one."""
-    body = model.jnt_bodyid[model.joint(name).id]
+def bodies_moved_by(model: mujoco.MjModel, joint: str) -> list[int]:
+    """Return the bodies that move with a joint and with no later one."""
+    body = model.jnt_bodyid[model.joint(joint).id]
     return [other for other in range(model.nbody) if model.body_weldid[other] == body]
 
 
-def in_frame(frame: tuple[Float, Float], point: Any) -> Constants:
-    """A point of the world in a joint's frame."""
+def in_frame(frame: Pose, point: Any) -> Constants:
+    """Return a point of the world in a frame."""
     return _constants(frame[0].T @ (np.asarray(point) - frame[1]))
 
 
-def principal(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
-    """Principal moments, shape (3,), and the quaternion that turns their axes into the frame's.
+def quaternion_of(matrix: Float) -> Float:
+    """Return the quaternion of a rotation matrix."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, matrix.flatten())
+    return quaternion
 
-    Of a flat or tiny body they are those of a possible one: positive, and none as great as the sum of the others, so
-    that they can be written down with fewer digits.
+
+def principal_inertia(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
+    """Return the principal moments, shape (3,), and the quaternion of their axes.
+
+    The moments of a physical body are positive, and none exceeds the sum of the others. Those of flat and tiny bodies
+    are changed until this holds with a margin, because a model file has fewer digits.
     """
     moments, axes = np.linalg.eigh(np.array(inertia))
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
-    moments = np.maximum(moments, SMALLEST)
-    moments[2] = min(moments[2], (1.0 - THICK) * (moments[0] + moments[1]))
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, axes.flatten())
-    return moments, quaternion
+    moments = np.maximum(moments, MIN_INERTIA)
+    moments[2] = min(moments[2], (1.0 - INERTIA_MARGIN) * (moments[0] + moments[1]))
+    return moments, quaternion_of(axes)
+
+
+def add_obstacles(spec: mujoco.MjSpec, number: int) -> None:
+    """Add movable capsules `obstacle_0`, `obstacle_1`, ... that collide with geoms of contact type 1."""
+    for row in range(number):
+        name = f"obstacle_{row}"
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=(0.0, 0.0, -10.0))
+        body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(0.02, 0.02, 0.0), contype=0, conaffinity=1, condim=1,
+            rgba=(0.83, 0.52, 0.30, 1.0),
+        )  # fmt: skip
+
+
+def as_box(corners: Any) -> Box:
+    """Return two corners, shape (2, D), as tuples."""
+    low, high = np.asarray(corners, dtype=np.float64)
+    return tuple(map(float, low)), tuple(map(float, high))
+
+
+def grid(axes: Any) -> Float:
+    """Return all points of a rectilinear grid, shape (A, B, C, 3), from its coordinates along each axis."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], centre: Float) -> Float:
-    """Of bodies together about a point, in the world's axes."""
+    """Return the rotational inertia of bodies together about a point, in world axes (parallel axis theorem)."""
     total = np.zeros((3, 3))
     for body in bodies:
         axes, away = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
@@ -109,7 +138,7 @@ def _inertia(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], cent
 
 
 def _with_last_axis(turn: Float, axis: Float) -> Float:
-    """The axes of a body, in another order or turned a little, so that the last is `axis`."""
+    """Return the axes of a body, reordered and turned as little as possible, so that the last one is `axis`."""
     nearest = int(np.abs(axis @ turn).argmax())
     first = turn[:, (nearest + 1) % 3]
     first = first - axis * (axis @ first)
@@ -124,18 +153,3 @@ def _constants(values: Float) -> Constants:
 
 def _rows(matrix: Float) -> tuple[Constants, Constants, Constants]:
     return _constants(matrix[0]), _constants(matrix[1]), _constants(matrix[2])
-
-
-def add_obstacles(spec: mujoco.MjSpec, number: int) -> None:
-    """Add movable capsules `obstacle_0`, `obstacle_1`, ... that collide with geoms of contact type 1."""
-    for row in range(number):
-        body = spec.worldbody.add_body(name=f"obstacle_{row}", mocap=True, pos=(0.0, 0.0, -10.0))
-        body.add_geom(
-            name=f"obstacle_{row}",
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            size=(0.02, 0.02, 0.0),
-            contype=0,
-            conaffinity=1,
-            condim=1,
-            rgba=(0.83, 0.52, 0.30, 1.0),
-        )

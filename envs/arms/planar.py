@@ -1,56 +1,67 @@
-"""Two joints in the horizontal plane: shoulder and elbow."""
+"""Planar arm with two joints, shoulder and elbow, in the horizontal plane."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.mjcf import add_obstacles
-from viapoint.envs.common.arrays import clamp, last
+from viapoint.envs.arms.mjcf import add_obstacles, read_spec
+from viapoint.envs.common.arrays import clamp
+from viapoint.envs.common.types import Box
 from viapoint.primitives.array_api import Array, namespace_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarArm:
-    """An arm of two links, described by numbers; see :class:`~viapoint.envs.arms.base.Arm` for the functions.
+    """Arm of two links in the plane; see :class:`~viapoint.envs.arms.base.Arm` for its functions.
 
-    The elbow bends one way only, so a hand position has one posture.
-    Every number is read from the MJCF file, where its source stands.
+    The elbow bends one way only, so each hand position has one configuration. All numbers come from the MJCF file,
+    which names their sources.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs.arms import ADULT
+        >>> joints = ADULT.inverse_kinematics(np.array([0.1, 0.4]))
+        >>> np.degrees(joints).round(1).tolist()  # shoulder, elbow
+        [20.8, 104.9]
+        >>> ADULT.hand_position(joints).round(6).tolist()
+        [0.1, 0.4]
+        >>> ADULT.links(joints).round(2).tolist()  # both ends of upper arm and forearm
+        [[[0.0, 0.0], [0.3, 0.12]], [[0.3, 0.12], [0.1, 0.4]]]
     """
 
     name: str
     model_file: str
     lengths: tuple[float, float]
-    """Shoulder to elbow and elbow to handle, [m]."""
+    """Distances from shoulder to elbow and from elbow to hand, [m]."""
     masses: tuple[float, float]
-    """Of the two links, [kg]."""
+    """Masses of the two links, [kg]."""
     centres: tuple[float, float]
-    """From each link's proximal joint to its centre of mass, [m]."""
+    """Distances from each link's proximal joint to its centre of mass, [m]."""
     inertias: tuple[float, float]
-    """About each link's centre of mass, [kg m^2]."""
+    """Inertias about each link's centre of mass, [kg m^2]."""
     viscosity: tuple[float, float]
-    """Of the joints, [N m s/rad]."""
+    """Viscous friction of the joints, [N m s/rad]."""
     torque_limit: tuple[float, float]
-    """[N m]."""
+    """Greatest torques, [N m]."""
     joint_range: tuple[tuple[float, float], ...]
     hand_radius: float
     link_radii: tuple[float, ...]
-    workspace: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.45, 0.15), (0.35, 0.60))
+    workspace: Box = ((-0.45, 0.15), (0.35, 0.60))
     bandwidth: float = 40.0
-    """Natural frequency of the joints' servo, critically damped, [rad/s]."""
+    """Natural frequency of the critically damped joint servos, [rad/s]."""
     dimension: int = 2
     traced: tuple[str, ...] = ()
     velocity_limit: tuple[float, ...] = ()
 
     @classmethod
     def from_file(cls, model_file: str) -> PlanarArm:
-        """The record of the arm in an MJCF file of the package's `assets`."""
-        model = _read(model_file).compile()
+        """Return the arm of an MJCF file among the package's `assets`."""
+        model = read_spec(model_file).compile()
         joints = [model.joint(name) for name in ("shoulder", "elbow")]
         links = [model.body(name) for name in ("upper_arm", "forearm")]
         return cls(
@@ -69,20 +80,20 @@ class PlanarArm:
 
     @functools.cached_property
     def _inertia(self) -> tuple[float, float, float]:
-        """The constants A, B, C of the mass matrix [[A + 2 B cos, C + B cos], [C + B cos, C]], [kg m^2]."""
+        """Constants A, B, C of the mass matrix [[A + 2 B cos, C + B cos], [C + B cos, C]], [kg m^2]."""
         (m1, m2), (r1, r2), (i1, i2) = self.masses, self.centres, self.inertias
         elbow = i2 + m2 * r2**2
         return i1 + m1 * r1**2 + m2 * self.lengths[0] ** 2 + elbow, m2 * self.lengths[0] * r2, elbow
 
     @functools.cached_property
     def stiffness(self) -> tuple[float, float]:
-        """Of the joints' servo at the posture of greatest inertia, [N m/rad]."""
+        """Stiffness of the joint servos, [N m/rad], for the arm stretched out, where its inertia is greatest."""
         a, b, c = self._inertia
         return (a + 2.0 * b) * self.bandwidth**2, c * self.bandwidth**2
 
     @functools.cached_property
     def damping(self) -> tuple[float, float]:
-        """Of the joints' servo, critical together with the joints' viscosity, [N m s/rad]."""
+        """Damping of the joint servos, [N m s/rad]; with the joints' viscosity it is critical."""
         return _pair(
             2.0 * k / self.bandwidth - v for k, v in zip(self.stiffness, self.viscosity, strict=True)
         )
@@ -96,8 +107,8 @@ class PlanarArm:
         return float(near), float(far)
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
-        """See :meth:`viapoint.envs.arms.base.Arm.compile`."""
-        spec = _read(self.model_file)
+        """Return the MuJoCo model; see :meth:`viapoint.envs.arms.base.Arm.compile`."""
+        spec = read_spec(self.model_file)
         if whole_arm:
             _lower_into_plane(spec)
         for actuator, stiffness, damping in zip(spec.actuators, self.stiffness, self.damping, strict=True):
@@ -108,7 +119,7 @@ class PlanarArm:
         return spec.compile()
 
     def hand_position(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
+        """Return hand positions; see :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
         xp = namespace_of(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
@@ -117,36 +128,40 @@ class PlanarArm:
         )
 
     def links(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.links`."""
+        """Return link segments; see :meth:`viapoint.envs.arms.base.Arm.links`."""
         xp = namespace_of(joints)
         upper, hand = joints[..., 0], self.hand_position(joints)
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
         zero = xp.zeros_like(upper)
         ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
-        return last(xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
+        return _batch_first(xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
         """Return both ends of each link for the hand at `hand`, shape (..., 2), [m], without computing angles.
 
-        But for rounding they are those of :meth:`links`; out of reach, the forearm is drawn out to the hand.
+        Within reach the result equals that of :meth:`links` up to rounding. Out of reach, the forearm still ends at the
+        hand, longer or shorter than it is.
         """
         xp = namespace_of(hand)
         (c1, s1), _ = self._directions(hand)
         square = c1 * c1 + s1 * s1
-        # Over the shoulder any direction would do: the posture's is that of the first axis.
+        # With the hand at the shoulder every direction is a solution: take that of the inverse kinematics.
         c1, square = (xp.where(square > 0.0, each, xp.ones_like(each)) for each in (c1, square))
         upper = self.lengths[0] / xp.sqrt(square)
-        elbow = last(xp.stack((c1 * upper, s1 * upper)))
+        elbow = _batch_first(xp.stack((c1 * upper, s1 * upper)))
         return (xp.zeros_like(elbow), elbow), (elbow, hand)
 
     def inverse_kinematics(self, hand: Array) -> Array:
-        """Return joint angles, see :class:`Arm`; out of reach, the elbow is as straight or bent as it goes."""
-        return self._postures(hand)[0]
+        """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`.
+
+        Out of reach, the elbow is as straight or as bent as it can be.
+        """
+        return self._configurations(hand)[0]
 
     def reach_margin(self, hand: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.reach_margin`.
+        """Return the distance inside the reach; see :meth:`viapoint.envs.arms.base.Arm.reach_margin`.
 
-        The least of the distances to the inner and outer circle of the reach and, as arcs, to the shoulder's limits.
+        It is the least of the distances to the inner and the outer circle and, along arcs, to the shoulder's limits.
         """
         xp = namespace_of(hand)
         distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
@@ -158,27 +173,28 @@ class PlanarArm:
         return xp.minimum(xp.minimum(distance - near, far - distance), arc)
 
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.required_time_scale`: 1, as people's joints have no limits of speed.
+        """Return 1: human joints have no velocity limit; see :meth:`viapoint.envs.arms.base.Arm.required_time_scale`.
 
-        Those of torque act in the physics; random movements reach them twice in ten thousand.
+        The simulation enforces the torque limits, which random movements reach twice in ten thousand.
         """
         xp = namespace_of(position)
         return xp.ones_like(position[..., 0, 0])
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Computed torque: see :meth:`viapoint.envs.arms.base.Arm.controls`.
+        """Return computed-torque controls; see :meth:`viapoint.envs.arms.base.Arm.controls`.
 
-        The actuator's torque is control - stiffness x angle - damping x velocity, limited to `torque_limit`. So the
-        control carries the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
+        The actuator's torque is control - stiffness * angle - damping * velocity, limited to `torque_limit`. So the
+        control is the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
         """
         xp = namespace_of(position)
-        joints, upper_arm, forearm, sine = self._postures(position)
+        joints, upper_arm, forearm, sine = self._configurations(position)
         rates = self._rates(position, upper_arm, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
-        pull = tuple(
+        # Differentiating J q' = v gives J q'' = a - J' q', and -J' q' is the sum of centripetal terms along the links.
+        relative = tuple(
             acceleration[..., i] + centripetal[0] * upper_arm[i] + centripetal[1] * forearm[i] for i in (0, 1)
         )
-        accelerations = self._rates(position, upper_arm, forearm, sine, xp.stack(pull, axis=-1))
+        accelerations = self._rates(position, upper_arm, forearm, sine, xp.stack(relative, axis=-1))
         cosine = upper_arm[0] * forearm[0] + upper_arm[1] * forearm[1]
         torques = self._torques(cosine, sine, rates, accelerations)
         return xp.stack(
@@ -191,15 +207,18 @@ class PlanarArm:
             axis=-1,
         )
 
-    def _postures(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
-        """Joint angles, unit vectors along upper arm and forearm, and the sine of the elbow angle."""
+    def _configurations(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
+        """Return joint angles, unit vectors along upper arm and forearm, and the sine of the elbow's angle."""
         xp = namespace_of(hand)
         (c1, s1), (cosine, sine) = self._directions(hand)
-        joints = last(xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
+        joints = _batch_first(xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
         return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
 
     def _directions(self, hand: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Cosine and sine of the shoulder's angle, and of the elbow's."""
+        """Return cosine and sine of the shoulder's angle, and of the elbow's, by the law of cosines.
+
+        The hand is at `along`, `across` in the frame of the upper arm; the shoulder turns that point to (x, y).
+        """
         xp = namespace_of(hand)
         l1, l2 = self.lengths
         low, high = self.joint_range[1]
@@ -220,7 +239,7 @@ class PlanarArm:
         sine: Array,
         rate: Array,
     ) -> tuple[Array, Array]:
-        """Joint rates that give the hand `rate`: the inverse of the Jacobian, applied."""
+        """Return the joint rates that give the hand `rate`: the inverse Jacobian times `rate`."""
         l1, l2 = self.lengths
         scale = 1.0 / (l1 * sine)
         shoulder = (forearm[0] * rate[..., 0] + forearm[1] * rate[..., 1]) * scale
@@ -230,7 +249,7 @@ class PlanarArm:
     def _torques(
         self, cosine: Array, sine: Array, rates: tuple[Array, Array], accelerations: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Inverse dynamics of the two links without viscosity, [N m]."""
+        """Return the torques of the inverse dynamics of the two links without viscosity, [N m]."""
         a, b, c = self._inertia
         coupling = c + b * cosine
         coriolis = b * sine
@@ -248,18 +267,17 @@ def _pair(values: Any) -> tuple[float, float]:
     return float(first), float(second)
 
 
-def _read(model_file: str) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string(
-        (files("viapoint.envs") / "assets" / model_file).read_text(encoding="utf-8")
-    )
+def _batch_first(array: Array, axes: int = 1) -> Array:
+    """Return a view with the first `axes` axes moved behind the batch."""
+    return namespace_of(array).moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
 
 
 def _lower_into_plane(spec: mujoco.MjSpec) -> None:
-    """Put links and hand at the height of the obstacles, so that all of them collide."""
+    """Move links and hand to the height of the obstacles, so that all of them collide."""
     spec.body("upper_arm").pos[2] = 0.0
     for handle in (spec.geom("hand"), spec.site("hand")):
         handle.pos[2] = 0.0
 
 
 ADULT = PlanarArm.from_file("planar.xml")
-"""An adult's right arm, its shoulder at the origin, x to the right and y forwards."""
+"""Right arm of an adult, its shoulder at the origin, x to the right and y forwards."""

@@ -1,4 +1,4 @@
-"""Serial arms with hinge joints, and how they are built from MJCF files."""
+"""Serial arms with hinge joints, and their construction from MJCF files."""
 
 from __future__ import annotations
 
@@ -11,117 +11,121 @@ import numpy as np
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.mjcf import (
     add_obstacles,
-    at_zero,
-    chain_of,
+    bodies_moved_by,
     in_frame,
     joint_frames,
-    moving_with,
+    kinematic_chain,
     read_spec,
+    zero_configuration,
 )
-from viapoint.envs.common.types import Box
+from viapoint.envs.common.types import Box, Float
 from viapoint.primitives.array_api import Array, namespace_of
 
-STEP = 1e-3
-"""Over which differences of postures are taken for the joints' rates and accelerations, [s]."""
-EVERY = 8
-"""The joints' references are computed at every eighth physics step and run straight in between."""
-RESERVE = 0.97
-"""Share of the limits of rate and torque that plans may use: what is left corrects them on the way."""
-LEAST = 0.01
-"""Share of the limit of torque that a joint is taken to have left for moving, however heavy what it holds."""
+DIFFERENCE_STEP = 1e-3
+"""Step of the central differences that give joint rates and accelerations, [s]."""
+CONTROL_STRIDE = 8
+"""Physics steps between two computed joint references; those in between are interpolated linearly."""
+LIMIT_SHARE = 0.97
+"""Share of the velocity and torque limits that plans may use; feedback uses the rest."""
+LEAST_TORQUE_SHARE = 0.01
+"""Least share of a joint's torque limit that counts as available for motion, however heavy the arm is."""
+JOINT_BANDWIDTH = 20.0
+"""Natural frequency of the critically damped joint servos, [rad/s]: weak compared with the hand's servo."""
+HAND_BANDWIDTH, HAND_DAMPING_RATIO = 50.0, 0.75
+"""Natural frequency of the hand's servo, [rad/s], and its damping ratio."""
 ORIGIN = "origin"
-"""Site at the origin of the world, from which the hand's actuators measure."""
+"""Name of the site at the world's origin, from which the hand's actuators measure."""
+MARKER: dict[str, Any] = {"size": (0.001, 0.0, 0.0), "group": 5}
+"""Attributes of an invisible site that only marks a point."""
 
-UNSEEN: dict[str, Any] = {"size": (0.001, 0.0, 0.0), "group": 5}
-"""Looks of a site that is only there to be measured."""
 
-
-class Posture(Protocol):
-    """Which of an arm's postures belongs to a place of the hand."""
+class InverseKinematics(Protocol):
+    """Function that chooses one configuration for each position of the hand."""
 
     def __call__(self, hand: Array) -> Array:
-        """Joint angles, shape (..., J), [rad], for hand positions of shape (..., 3), [m]."""
+        """Return joint angles, shape (..., J), [rad], for hand positions of shape (..., 3), [m]."""
 
     def margin(self, hand: Array) -> Array:
-        """How far inside its reach the hand is, shape (...,), [m]; negative where no posture puts it there."""
+        """Return the distance of the hand inside the reach, shape (...,), [m]; negative out of reach."""
 
 
 class Link(NamedTuple):
-    """The shape of a link: a capsule that moves with a joint."""
+    """Collision capsule that moves with a joint."""
 
     name: str
-    """Of the geom."""
+    """Name of the geom."""
     body: str
-    """That has the geom."""
+    """Name of the body that has the geom."""
     joint: int
     """Index of the joint."""
     ends: tuple[Constants, Constants]
-    """Of its axis, in the joint's frame, [m]."""
+    """Ends of the capsule's axis in the joint's frame, [m]."""
     radius: float
-    """[m]."""
+    """Radius, [m]."""
 
 
-class Motion(NamedTuple):
-    """What the joints do while the hand moves as planned, shape (..., J) each."""
+class JointMotion(NamedTuple):
+    """Motion of the joints while the hand follows a trajectory, shape (..., J) each."""
 
     angle: Array
-    """[rad]."""
+    """Angles, [rad]."""
     rate: Array
-    """[rad/s]."""
+    """Angular velocities, [rad/s]."""
     torque: Array
-    """That the movement takes, [N m]."""
+    """Torques that the motion takes, [N m]."""
     weight: Array
-    """Torque that holds the arm against gravity, [N m]."""
+    """Torques that hold the arm against gravity, [N m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SerialArm:
-    """An arm of J hinges, described by numbers; see :class:`~viapoint.envs.arms.base.Arm` for the functions.
+    """Arm of J hinges that moves its hand in space; see :class:`~viapoint.envs.arms.base.Arm` for its functions.
 
-    The numbers are read from an MJCF file, see :mod:`viapoint.envs.arms.serial_arm`.
+    :func:`serial_arm` reads the numbers from an MJCF file of the package's form, and
+    :func:`~viapoint.envs.arm_import.loader.load_arm` from any MJCF file.
     """
 
     name: str
     model_file: str
-    """The MJCF file among the package's assets, or its text."""
+    """MJCF file among the package's assets, or the text of a file."""
     joint_names: tuple[str, ...]
     hand_site: str
     chain: Chain
-    place: Posture
-    """The posture for a place of the hand."""
+    ik: InverseKinematics
+    """Inverse kinematics."""
     shape: tuple[Link, ...]
-    """The links, from the base to the hand."""
-    hand_at: Constants
-    """The hand in the last joint's frame, [m]."""
+    """Links from the base to the hand."""
+    hand_offset: Constants
+    """Hand in the last joint's frame, [m]."""
     hand_radius: float
     joint_range: tuple[tuple[float, float], ...]
     velocity_limit: tuple[float, ...]
-    """[rad/s]."""
+    """Greatest angular velocities, [rad/s]."""
     torque_limit: tuple[float, ...]
-    """[N m]."""
-    workspace: tuple[tuple[float, ...], tuple[float, ...]]
+    """Greatest torques, [N m]."""
+    workspace: Box
     joint_stiffness: tuple[float, ...]
-    """Of the springs to the posture, [N m/rad]."""
+    """Stiffness of the joint servos, [N m/rad]."""
     joint_damping: tuple[float, ...]
-    """[N m s/rad]."""
+    """Damping of the joint servos, [N m s/rad]."""
     hand_stiffness: float
-    """[N/m]."""
+    """Stiffness of the hand's servo, [N/m]."""
     hand_damping: float
-    """[N s/m]."""
+    """Damping of the hand's servo, [N s/m]."""
     dimension: int = 3
 
     @property
     def link_radii(self) -> tuple[float, ...]:
-        """See :attr:`viapoint.envs.arms.base.Arm.link_radii`."""
+        """Radii of the link capsules, [m]."""
         return tuple(link.radius for link in self.shape)
 
     @property
     def traced(self) -> tuple[str, ...]:
-        """See :attr:`viapoint.envs.arms.base.Arm.traced`."""
+        """Names of the sites of the hand and of both ends of each link."""
         return (self.hand_site, *(f"{link.name}_{end}" for link in self.shape for end in (0, 1)))
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
-        """See :meth:`viapoint.envs.arms.base.Arm.compile`."""
+        """Return the MuJoCo model; see :meth:`viapoint.envs.arms.base.Arm.compile`."""
         spec = read_spec(self.model_file)
         self._add_links(spec, whole_arm)
         self._add_actuators(spec)
@@ -129,119 +133,90 @@ class SerialArm:
         return spec.compile()
 
     def hand_position(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
-        return self.chain.points(joints, ((len(self.joint_range) - 1, self.hand_at),))[..., 0, :]
+        """Return hand positions; see :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
+        return self.chain.points(joints, ((len(self.joint_range) - 1, self.hand_offset),))[..., 0, :]
 
     def links(self, joints: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.links`."""
+        """Return link segments; see :meth:`viapoint.envs.arms.base.Arm.links`."""
         xp = namespace_of(joints)
         places = tuple((link.joint, end) for link in self.shape for end in link.ends)
         points = self.chain.points(joints, places)
         return xp.reshape(points, (*joints.shape[:-1], len(self.shape), 2, 3))
 
     def inverse_kinematics(self, hand: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`."""
-        return self.place(hand)
+        """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`."""
+        return self.ik(hand)
 
     def reach_margin(self, hand: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.reach_margin`."""
-        return self.place.margin(hand)
+        """Return the distance inside the reach; see :meth:`viapoint.envs.arms.base.Arm.reach_margin`."""
+        return self.ik.margin(hand)
 
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.required_time_scale`.
+        """Return the time scale; see :meth:`viapoint.envs.arms.base.Arm.required_time_scale`.
 
-        Rates scale with the factor's inverse, torques of motion with its square's; those against gravity stay.
+        A movement that takes s times as long has 1/s of the rates, 1/s^2 of the torques of motion, and the same torques
+        against gravity (J. M. Hollerbach, Dynamic scaling of manipulator trajectories, 1984).
         """
         xp = namespace_of(position)
-        motion = self._motion(position, velocity, acceleration)
-        rates = RESERVE * _limits(self.velocity_limit, position)
+        motion = self._joint_motion(position, velocity, acceleration)
+        rates = LIMIT_SHARE * _limits(self.velocity_limit, position)
         torques = _limits(self.torque_limit, position)
-        left = xp.maximum(RESERVE * torques - xp.abs(motion.weight), LEAST * torques)
+        left = xp.maximum(LIMIT_SHARE * torques - xp.abs(motion.weight), LEAST_TORQUE_SHARE * torques)
         fastest = xp.max(xp.abs(motion.rate) / rates, axis=-1)
         strongest = xp.sqrt(xp.max(xp.abs(motion.torque) / left, axis=-1))
         factor = xp.max(xp.maximum(fastest, strongest), axis=-1)
         return xp.where(factor > 1.0, factor, xp.ones_like(factor))
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """See :meth:`viapoint.envs.arms.base.Arm.controls`.
+        """Return controls; see :meth:`viapoint.envs.arms.base.Arm.controls`.
 
-        An actuator's force is control - stiffness x place - damping x rate. So the control carries stiffness and
-        damping times the references, and a joint's the torque of the inverse dynamics as well.
+        An actuator's force is control - stiffness * position - damping * velocity. So its control is stiffness and
+        damping times the references, and for a joint also the torque of the inverse dynamics (feedforward).
         """
         xp = namespace_of(position)
-        looks = slice(None, None, EVERY)
-        motion = self._motion(position[..., looks, :], velocity[..., looks, :], acceleration[..., looks, :])
+        strided = (part[..., ::CONTROL_STRIDE, :] for part in (position, velocity, acceleration))
+        motion = self._joint_motion(*strided)
         stiffness, damping = (_limits(gain, position) for gain in (self.joint_stiffness, self.joint_damping))
         joints = motion.torque + stiffness * motion.angle + damping * motion.rate
         hand = self.hand_stiffness * position + self.hand_damping * velocity
-        return xp.concat((hand, _straight_between(joints, position.shape[-2])), axis=-1)
+        return xp.concat((hand, _interpolate(joints, position.shape[-2])), axis=-1)
 
-    def _motion(self, position: Array, velocity: Array, acceleration: Array) -> Motion:
-        """What the joints do: differences of the postures just before and after give rates and accelerations."""
+    def _joint_motion(self, position: Array, velocity: Array, acceleration: Array) -> JointMotion:
+        """Return the joints' motion by central differences of the inverse kinematics along the hand's parabola."""
         xp = namespace_of(position)
-        ahead, bow = velocity * STEP, acceleration * (0.5 * STEP * STEP)
-        before, now, after = self.place(
+        ahead, bow = velocity * DIFFERENCE_STEP, acceleration * (0.5 * DIFFERENCE_STEP * DIFFERENCE_STEP)
+        before, now, after = self.ik(
             xp.stack((position - ahead + bow, position, position + ahead + bow), axis=0)
         )
-        rate, gain = (after - before) * (0.5 / STEP), (after - 2.0 * now + before) * (1.0 / STEP**2)
-        return Motion(now, rate, *self.chain.torques(now, rate, gain))
+        rate = (after - before) * (0.5 / DIFFERENCE_STEP)
+        gain = (after - 2.0 * now + before) * (1.0 / DIFFERENCE_STEP**2)
+        return JointMotion(now, rate, *self.chain.torques(now, rate, gain))
 
     def _add_links(self, spec: mujoco.MjSpec, whole_arm: bool) -> None:
-        """Sites at the links' ends, to record where they are; links that are no obstacle's business touch nothing."""
-        data = at_zero(spec.copy().compile())
+        """Add sites at the links' ends, from which the simulation records them; let links collide or not."""
+        data = zero_configuration(spec.copy().compile())
         frames = self.chain.frames(np.zeros(len(self.joint_range)))
         for link in self.shape:
             body, geom = data.body(link.body), spec.geom(link.name)
             turn = body.xmat.reshape(3, 3)
             for end, point in enumerate(link.ends):
-                place = turn.T @ (np.array(frames[link.joint].place(point)) - body.xpos)
-                spec.body(link.body).add_site(name=f"{link.name}_{end}", pos=place, **UNSEEN)
+                place = turn.T @ (np.array(frames[link.joint].transform(point)) - body.xpos)
+                spec.body(link.body).add_site(name=f"{link.name}_{end}", pos=place, **MARKER)
             if not whole_arm:
                 geom.contype, geom.conaffinity = 0, 0
 
     def _add_actuators(self, spec: mujoco.MjSpec) -> None:
-        """The hand's servo along three axes, and one for each joint."""
-        spec.worldbody.add_site(name=ORIGIN, **UNSEEN)
+        """Add a servo of the hand along each axis, and one of each joint."""
+        spec.worldbody.add_site(name=ORIGIN, **MARKER)
         for gear, name in zip(np.eye(6), ("hand_x", "hand_y", "hand_z"), strict=False):
             while name in self.joint_names:
                 name += "_"
-            servo = _affine(spec, name, mujoco.mjtTrn.mjTRN_SITE, self.hand_stiffness, self.hand_damping)
+            servo = _add_servo(spec, name, mujoco.mjtTrn.mjTRN_SITE, self.hand_stiffness, self.hand_damping)
             servo.target, servo.refsite, servo.gear = self.hand_site, ORIGIN, gear
         for name, stiffness, damping in zip(
             self.joint_names, self.joint_stiffness, self.joint_damping, strict=True
         ):
-            _affine(spec, name, mujoco.mjtTrn.mjTRN_JOINT, stiffness, damping).target = name
-
-
-def _affine(
-    spec: mujoco.MjSpec, name: str, transmission: mujoco.mjtTrn, stiffness: float, damping: float
-) -> Any:
-    """An actuator whose force is control - stiffness x length - damping x velocity."""
-    actuator = spec.add_actuator(name=name, trntype=transmission, biastype=mujoco.mjtBias.mjBIAS_AFFINE)
-    actuator.gainprm[0], actuator.biasprm[1:3] = 1.0, (-stiffness, -damping)
-    return actuator
-
-
-def _limits(values: tuple[float, ...], like: Array) -> Array:
-    """Numbers as an array of the kind of `like`."""
-    xp = namespace_of(like)
-    return xp.asarray(values, dtype=like.dtype)
-
-
-def _straight_between(knots: Array, number: int) -> Array:
-    """Values at `number` steps from those at every :data:`EVERY`-th, shape (..., number, U); the last one is held."""
-    xp = namespace_of(knots)
-    following = xp.concat((knots[..., 1:, :], knots[..., -1:, :]), axis=-2)
-    share = xp.asarray(np.arange(EVERY)[:, None] / EVERY, dtype=knots.dtype)
-    between = knots[..., :, None, :] + share * (following - knots)[..., :, None, :]
-    flat = xp.reshape(between, (*knots.shape[:-2], -1, knots.shape[-1]))
-    return flat[..., :number, :]
-
-
-BANDWIDTH = 20.0
-"""Natural frequency of the joints' springs, critically damped, [rad/s]: weak beside the hand's."""
-HAND_BANDWIDTH, HAND_DAMPING = 50.0, 0.75
-"""Natural frequency of the hand's servo, [rad/s], and its damping relative to the critical."""
+            _add_servo(spec, name, mujoco.mjtTrn.mjTRN_JOINT, stiffness, damping).target = name
 
 
 def serial_arm(
@@ -250,80 +225,110 @@ def serial_arm(
     name: str,
     joint_names: tuple[str, ...],
     hand_site: str,
-    place: Posture,
+    ik: InverseKinematics,
     workspace: Box,
     hand_gains: tuple[float, float] | None = None,
 ) -> SerialArm:
-    """The record of an arm whose file has everything: capsules for links, a sphere `hand`, and limits.
+    """Return the arm of a complete MJCF file: capsules for links, a sphere `hand`, limits of joints and torques.
 
     Args:
-        model_file: Among the package's assets, or a path.
-        name: Of the arm.
+        model_file: File among the package's assets, a path, or the text of a file.
+        name: Name of the arm.
         joint_names: Hinges from the base to the hand.
-        hand_site: Where the hand is.
-        place: The posture for a place of the hand.
+        hand_site: Site at the hand's position.
+        ik: Inverse kinematics.
         workspace: Two opposite corners of the box in which movements start and end, [m].
-        hand_gains: Stiffness [N/m] and damping [N s/m] of the hand; by default for its inertia in the middle.
+        hand_gains: Stiffness [N/m] and damping [N s/m] of the hand's servo; by default those of its effective mass in
+            the middle of the workspace.
     """
     model = read_spec(model_file).compile()
-    data = at_zero(model)
     joints = [model.joint(joint) for joint in joint_names]
-    middle = np.asarray(place(np.array(workspace).mean(axis=0)))
-    moved, carried = _inertia_at(model, joint_names, hand_site, middle)
+    middle = np.asarray(ik(np.array(workspace).mean(axis=0)))
+    inertias, hand_mass = _effective_inertias(model, joint_names, hand_site, middle)
     if hand_gains is None:
-        hand_gains = carried * HAND_BANDWIDTH**2, 2.0 * HAND_DAMPING * carried * HAND_BANDWIDTH
+        hand_gains = hand_mass * HAND_BANDWIDTH**2, 2.0 * HAND_DAMPING_RATIO * hand_mass * HAND_BANDWIDTH
+    hand = zero_configuration(model).site(hand_site).xpos
     return SerialArm(
         name=name,
         model_file=model_file,
         joint_names=joint_names,
         hand_site=hand_site,
-        chain=chain_of(model, joint_names),
-        place=place,
-        shape=_capsules(model, data, joint_names),
-        hand_at=in_frame(joint_frames(model, joint_names)[-1], data.site(hand_site).xpos),
+        chain=kinematic_chain(model, joint_names),
+        ik=ik,
+        shape=_link_capsules(model, joint_names),
+        hand_offset=in_frame(joint_frames(model, joint_names)[-1], hand),
         hand_radius=float(model.geom("hand").size[0]),
         joint_range=tuple((float(joint.range[0]), float(joint.range[1])) for joint in joints),
         velocity_limit=tuple(float(v) for v in model.numeric("velocity_limit").data),
         torque_limit=tuple(float(model.jnt_actfrcrange[joint.id, 1]) for joint in joints),
         workspace=workspace,
-        joint_stiffness=tuple(float(m) * BANDWIDTH**2 for m in moved),
-        joint_damping=tuple(2.0 * float(m) * BANDWIDTH for m in moved),
+        joint_stiffness=tuple(float(m) * JOINT_BANDWIDTH**2 for m in inertias),
+        joint_damping=tuple(2.0 * float(m) * JOINT_BANDWIDTH for m in inertias),
         hand_stiffness=hand_gains[0],
         hand_damping=hand_gains[1],
     )
 
 
-def _capsules(model: mujoco.MjModel, data: mujoco.MjData, joint_names: tuple[str, ...]) -> tuple[Link, ...]:
-    """The capsules that move with the joints."""
-    links, frames = [], joint_frames(model, joint_names)
-    for index, joint in enumerate(joint_names):
-        for geom in np.flatnonzero(np.isin(model.geom_bodyid, moving_with(model, joint))):
+def _link_capsules(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[Link, ...]:
+    """Return the capsules that move with the joints."""
+    data, links = zero_configuration(model), []
+    for index, (joint, frame) in enumerate(zip(joint_names, joint_frames(model, joint_names), strict=True)):
+        for geom in np.flatnonzero(np.isin(model.geom_bodyid, bodies_moved_by(model, joint))):
             if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
                 continue
             radius, half = model.geom_size[geom, :2]
             axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
-            ends: Any = tuple(
-                in_frame(frames[index], data.geom_xpos[geom] + side * axis) for side in (1.0, -1.0)
-            )
+            first, second = (in_frame(frame, data.geom_xpos[geom] + side * axis) for side in (1.0, -1.0))
             body = model.body(model.geom_bodyid[geom]).name
-            links.append(
-                Link(name=model.geom(geom).name, body=body, joint=index, ends=ends, radius=float(radius))
-            )
+            links.append(Link(model.geom(geom).name, body, index, (first, second), float(radius)))
     return tuple(links)
 
 
-def _inertia_at(
-    model: mujoco.MjModel, joint_names: tuple[str, ...], hand_site: str, joints: Any
-) -> tuple[Any, float]:
-    """What each joint alone would have to turn, [kg m^2], and the hand's inertia, the mean of all directions, [kg]."""
+def _effective_inertias(
+    model: mujoco.MjModel, joint_names: tuple[str, ...], hand_site: str, joints: Float
+) -> tuple[Float, float]:
+    """Return the inertia about each joint, shape (J,), [kg m^2], and the hand's effective mass, [kg].
+
+    The mass is the harmonic mean over all directions, 3 / trace(J M^-1 J^T), with the mass matrix M and the Jacobian J
+    of the hand (O. Khatib, A unified approach for motion and force control of robot manipulators, 1987).
+    """
     data = mujoco.MjData(model)
     address = [int(model.joint(name).qposadr[0]) for name in joint_names]
     freedom = [int(model.joint(name).dofadr[0]) for name in joint_names]
     data.qpos[address] = joints
     mujoco.mj_fwdPosition(model, data)
-    full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, full)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, jacobian, None, model.site(hand_site).id)
-    mobility = jacobian @ np.linalg.solve(full, jacobian.T)
-    return np.diag(full)[freedom], float(3.0 / np.trace(mobility))
+    mobility = jacobian @ np.linalg.solve(mass, jacobian.T)
+    return np.diag(mass)[freedom], float(3.0 / np.trace(mobility))
+
+
+def _add_servo(
+    spec: mujoco.MjSpec, name: str, transmission: mujoco.mjtTrn, stiffness: float, damping: float
+) -> Any:
+    """Add an actuator whose force is control - stiffness * length - damping * velocity."""
+    actuator = spec.add_actuator(name=name, trntype=transmission, biastype=mujoco.mjtBias.mjBIAS_AFFINE)
+    actuator.gainprm[0], actuator.biasprm[1:3] = 1.0, (-stiffness, -damping)
+    return actuator
+
+
+def _limits(values: tuple[float, ...], like: Array) -> Array:
+    """Return numbers as an array of the library and dtype of another."""
+    return namespace_of(like).asarray(values, dtype=like.dtype)
+
+
+def _interpolate(knots: Array, number: int) -> Array:
+    """Return values at `number` steps, linear between every CONTROL_STRIDE-th of them; the last knot is held.
+
+    Args:
+        knots: Values at steps 0, CONTROL_STRIDE, ..., shape (..., K, U).
+        number: Number of steps.
+    """
+    xp = namespace_of(knots)
+    following = xp.concat((knots[..., 1:, :], knots[..., -1:, :]), axis=-2)
+    share = xp.asarray(np.arange(CONTROL_STRIDE)[:, None] / CONTROL_STRIDE, dtype=knots.dtype)
+    between = knots[..., :, None, :] + share * (following - knots)[..., :, None, :]
+    flat = xp.reshape(between, (*knots.shape[:-2], -1, knots.shape[-1]))
+    return flat[..., :number, :]

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Numbers
 from viapoint.primitives.array_api import Array, namespace_of
+
+N = TypeVar("N", bound=Numbers)
 
 
 def clamp(values: Array, low: float, high: float) -> Array:
@@ -30,17 +34,18 @@ def cosine_and_sine(angles: Array) -> tuple[Array, Array]:
     return (1.0 - square) * share, 2.0 * tangent * share
 
 
+def dot(first: Sequence[Array], second: Sequence[Array]) -> Array:
+    """Return the dot product of vectors that are given as sequences of their components."""
+    return functools.reduce(operator.add, map(operator.mul, first, second))
+
+
 def squared_length(vectors: Array) -> Array:
     """Return the sum of squares along the last axis, added component by component: `sum` is slow on short axes."""
     square = vectors * vectors
     return functools.reduce(operator.add, (square[..., i] for i in range(vectors.shape[-1])))
 
 
-def last(array: Array, axes: int = 1) -> Array:
-    """Return a view with the first `axes` axes moved behind the others."""
-    return namespace_of(array).moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
-
-
-def norm(vectors: Float) -> Float:
-    """Return the Euclidean length along the last axis."""
-    return np.asarray(np.sqrt(squared_length(vectors)))
+def norm(vectors: N) -> N:
+    """Return the Euclidean length along the last axis of NumPy vectors."""
+    length: N = np.asarray(np.sqrt(squared_length(vectors)))  # type: ignore[assignment]
+    return length

@@ -75,15 +75,21 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
     return np.flatnonzero(mask)
 
 
-def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """An action, or many, as an array; `shape` is the one that is wanted, and only said where these are no numbers."""
+def as_real_array(values: Any) -> NDArray[Any] | None:
+    """Return real numbers as an array, or None for anything else."""
     try:
-        given = np.asarray(actions)
-    except (TypeError, ValueError):  # rows of different lengths, say
-        raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}") from None
-    if given.dtype.kind not in "fiu":
-        raise ValueError(f"action must be real numbers of shape {shape}, got {given.dtype}: {actions!r}")
-    return given
+        array = np.asarray(values)
+    except (TypeError, ValueError):  # for example rows of different lengths
+        return None
+    return array if array.dtype.kind in "fiu" else None
+
+
+def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return actions as an array of real numbers; the error names their shape, which is not checked."""
+    array = as_real_array(actions)
+    if array is None:
+        raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}")
+    return array
 
 
 def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:

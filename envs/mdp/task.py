@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from viapoint.envs.actions.via_points import ActionLayout
-from viapoint.envs.arms import OF_ONES_OWN
+from viapoint.envs.arms import REGISTER_HINT
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import RewardWeights
@@ -62,7 +62,7 @@ class Task:
         """
         arm = arms.get(record["arm"])
         if arm is None:
-            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}; {OF_ONES_OWN}")
+            raise ValueError(f"arm must be one of {', '.join(arms)}, got {record['arm']!r}; {REGISTER_HINT}")
         return cls(
             arm=arm,
             whole_arm=bool(record["whole_arm"]),

@@ -8,7 +8,7 @@ import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan, timed
 from viapoint.envs.actions.velocity import Motion
-from viapoint.envs.arms.serial_arm import EVERY
+from viapoint.envs.arms.serial_arm import CONTROL_STRIDE
 from viapoint.envs.common.background_worker import BackgroundWorker
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
@@ -113,7 +113,7 @@ class OnlineExecutor:
         """Steps, positions, controls, places of obstacles, clearance and jerk cost of one group."""
         timestep, number = self.simulator.timestep, int(steps.max())
         # A few steps more than needed, so that the controls of the last ones do not depend on the group's longest.
-        index = np.arange(number + EVERY + 1)
+        index = np.arange(number + CONTROL_STRIDE + 1)
         position, velocity, acceleration = plan.trajectory().sample(timestep * (since[:, None] + index))
         controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])[:, :number]
         rows = scenes.places(np.asarray(timestep * (now[:, None] + np.arange(number + 1))))

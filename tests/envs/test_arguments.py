@@ -34,7 +34,7 @@ def test_actions_are_real_numbers(env_id, kind):
     single, batch = gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1)
     for env in (single, batch):
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, ?\d?\), got .*: "):
+        with pytest.raises(ValueError, match=r"action must be real numbers of shape \(\d, ?\d?\), got array"):
             env.step(kind(np.ones(env.action_space.shape)))
         env.step(np.zeros(env.action_space.shape, dtype=np.int8))  # nothing was done by it
         env.close()

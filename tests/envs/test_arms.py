@@ -1,7 +1,10 @@
 """Laws of the arms."""
 
 import copy
+import doctest
+import importlib
 import pickle
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -86,6 +89,16 @@ def test_links_are_known_with_the_hand_in_the_shoulder(library):
         strict=False,
     ):
         np.testing.assert_allclose(np.asarray(link[0]), exact, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "module", ["arms", "arms.base", "arms.planar", "arm_import.loader", "registration", "record_video"]
+)
+def test_examples_run(module, monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    results = doctest.testmod(importlib.import_module(f"viapoint.envs.{module}"))
+    assert results.attempted > 0
+    assert results.failed == 0
 
 
 def test_copies_of_an_arm_are_equal(arm):

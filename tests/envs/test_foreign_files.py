@@ -10,8 +10,8 @@ from foreign_arms import HOME, JOINTS, UR5E, ur5e, written
 
 import viapoint.envs
 from viapoint.envs.arm_import import reachability
-from viapoint.envs.arm_import.reachability import _bad
-from viapoint.envs.arms.mjcf import principal
+from viapoint.envs.arm_import.reachability import infeasible_positions
+from viapoint.envs.arms.mjcf import principal_inertia
 
 assert viapoint.envs, "importing it registers the environments"
 
@@ -52,9 +52,7 @@ def test_where_they_cannot_they_are_named(tmp_path):
         ('<joint name="wrist_1" class="wrist"/>', second),
         ("</worldbody>", KEYFRAME.format(qpos)),
     )
-    with pytest.raises(
-        ValueError, match=r"left out cannot be held where the file's keyframe has them.*wrist_1"
-    ):
+    with pytest.raises(ValueError, match=r"left out cannot be fixed as in the file's keyframe.*wrist_1"):
         ur5e(path=path)
 
 
@@ -92,7 +90,7 @@ def test_inertias_are_written_as_they_are():
     for _ in range(50):
         points = rng.normal(size=(5, 3))
         inertia = sum(p @ p * np.eye(3) - np.outer(p, p) for p in points)
-        moments, quaternion = principal(tuple(map(tuple, inertia)))
+        moments, quaternion = principal_inertia(tuple(map(tuple, inertia)))
         turn = np.empty(9)
         mujoco.mju_quat2Mat(turn, quaternion)
         turn = turn.reshape(3, 3)
@@ -146,7 +144,7 @@ def test_paths_that_are_none_are_refused(path, error, words):
         ({"home": (0.28, -1.55, -1.93, -1.232, 0.0, 0.28), "joint_range": [(-6, 6)] * 4 + [(0.0, 6), (-6, 6)]},
          r"wrist_2 comes to 0\.00 rad, less than 0\.05 rad inside its range"),
         ({"workspace": ((0.3, -0.4, 0.2), (0.55, 0.4, 0.2))}, "workspace must be a box that is 1 mm wide or more"),
-        ({"workspace": ((0.3, -0.4, 0.2), (0.9, 0.4, 0.4))}, "no posture near home gets nearer than"),
+        ({"workspace": ((0.3, -0.4, 0.2), (0.9, 0.4, 0.4))}, "no configuration near home gets nearer than"),
     ],
 )  # fmt: skip
 def test_why_the_hand_does_not_get_somewhere_is_said(changes, words):
@@ -158,7 +156,7 @@ def test_a_workspace_that_is_reached_is_taken_whatever_its_corners():
     box = ((0.24, -0.40, 0.09), (0.61, 0.41, 0.37))
     arm = ur5e(workspace=box)
     assert arm.workspace == box
-    low, high = np.array(arm.place.box)
+    low, high = np.array(arm.ik.box)
     assert (low <= box[0]).all()
     assert (high >= box[1]).all()
 
@@ -177,7 +175,7 @@ TWISTED = [0.42, -0.6, -0.53, -2.65, -0.2, 2.81, 0.2]
 )
 def test_postures_are_good_everywhere_in_the_reach_and_follow_the_hand(changes):
     arm = ur5e(**changes)
-    low, high = np.array(arm.place.box)
+    low, high = np.array(arm.ik.box)
     rng = np.random.default_rng(0)
     places = rng.uniform(low, high, (5000, 3))
     joints = arm.inverse_kinematics(places)
@@ -194,15 +192,15 @@ def test_maps_that_turn_the_hand_or_crowd_the_links_are_seen(monkeypatch):
     seen = []
     monkeypatch.setattr(
         reachability,
-        "_bad",
-        lambda place, reachable: seen.append((place, reachable)) or _bad(place, reachable),
+        "infeasible_positions",
+        lambda place, reachable: seen.append((place, reachable)) or infeasible_positions(place, reachable),
     )
     arm = ur5e()
     place, reachable = seen[-1]
-    assert place == arm.place
-    assert not len(_bad(place, reachable))
+    assert place == arm.ik
+    assert not len(infeasible_positions(place, reachable))
     for joint in range(3, 6):
         table = np.array(place.coefficients)
         table[0, joint] += 1.0  # everywhere, and the steps that follow put the hand where it belongs again
         moved = dataclasses.replace(place, coefficients=tuple(map(tuple, table)))
-        assert len(_bad(moved, reachable))
+        assert len(infeasible_positions(moved, reachable))

@@ -14,7 +14,7 @@ from foreign_arms import HOME, JOINTS, UR5E, ur5e
 from gymnasium.envs.registration import EnvSpec
 
 import viapoint.envs
-from viapoint.envs.arm_import.capsule_fit import around_points, surface
+from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
 from viapoint.envs.arm_import.loader import load_arm
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
 from viapoint.envs.registration import OWN_ARM_TASKS
@@ -42,7 +42,7 @@ def arm():
 
 
 def places(arm, number=300):
-    low, high = np.array(arm.place.box)
+    low, high = np.array(arm.ik.box)
     return np.random.default_rng(0).uniform(low, high, (number, 3))
 
 
@@ -78,7 +78,7 @@ def test_everywhere_in_its_reach_the_hand_gets_there_turned_as_at_home(arm):
     turned = np.arccos(np.clip((np.einsum("nij,ij->n", turns, turns[0]) - 1.0) / 2.0, -1.0, 1.0))
     assert turned.max() < 0.4
     assert (arm.reach_margin(hand) >= 0.0).all()
-    assert arm.reach_margin(np.array(arm.place.box[1]) + 0.01) < 0.0
+    assert arm.reach_margin(np.array(arm.ik.box[1]) + 0.01) < 0.0
 
 
 def test_capsules_contain_the_links():
@@ -86,8 +86,8 @@ def test_capsules_contain_the_links():
     data, rng = mujoco.MjData(model), np.random.default_rng(2)
     mujoco.mj_kinematics(model, data)
     for geom in range(model.ngeom):
-        points, around = surface(model, data, geom)
-        ends, radius = around_points(points, np.full(len(points), around), rng.normal(size=(3, 3)))
+        points, around = bounding_balls(model, data, geom)
+        ends, radius = fit_capsule(points, np.full(len(points), around), rng.normal(size=(3, 3)))
         along = np.clip((points - ends[0]) @ (ends[1] - ends[0]) / ((ends[1] - ends[0]) ** 2).sum(), 0.0, 1.0)
         away = np.linalg.norm(points - ends[0] - along[:, None] * (ends[1] - ends[0]), axis=-1)
         assert (away + around <= radius + 1e-9).all()
@@ -204,7 +204,7 @@ def test_joints_need_limits_and_torques(tmp_path):
         ),
         (
             lambda t: re.sub(r"<joint name=\"elbow\" range", '<joint name="elbow" type="slide" range', t),
-            "is no hinge",
+            "is not a hinge",
         ),
     ):
         path = tmp_path / "arm.xml"
@@ -227,10 +227,10 @@ def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
     [
         (
             lambda text: re.sub(r"<geom[^>]*/>", "", text),
-            "there are no geoms in .*: there is nothing to collide",
+            "there are no geoms in .*: nothing of the arm can collide",
         ),
-        (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo can make no model of .*arm.xml.*mass"),
-        (lambda text: text[:-20], "arm.xml' is no MJCF file that MuJoCo can read"),
+        (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo cannot compile .*arm.xml.*mass"),
+        (lambda text: text[:-20], "MuJoCo cannot read .*arm.xml' as an MJCF file"),
         (
             lambda text: text.replace('<joint name="wrist_1" class="wrist"/>', "").replace(
                 '<joint name="wrist_2"',
@@ -272,7 +272,7 @@ def test_joints_may_have_any_names(tmp_path):
 
 def test_a_record_that_json_took_apart_is_refused_in_few_words(arm):
     spec = EnvSpec.from_json(gym.make("viapoint/Obstacles-v0", arm=arm).spec.to_json())
-    with pytest.raises(TypeError, match=r"arm must be a record of .*register_arm") as refused:
+    with pytest.raises(TypeError, match=r"arm must be an arm of .*register_arm") as refused:
         gym.make(spec)
     assert len(str(refused.value).split(" was raised from")[0]) < 400
 
@@ -280,7 +280,7 @@ def test_a_record_that_json_took_apart_is_refused_in_few_words(arm):
 @pytest.mark.parametrize("thing", [3, None, "panda", Arm])
 def test_only_records_are_registered(thing):
     known = dict(ARMS)
-    with pytest.raises(TypeError, match=r"arm must be a record of viapoint\.envs\.arms, got"):
+    with pytest.raises(TypeError, match=r"arm must be an arm of viapoint\.envs\.arms, got"):
         register_arm(thing)
     assert known == ARMS
 
@@ -317,12 +317,12 @@ def test_the_fetch_of_gymnasium_robotics():
 
 def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):
     monkeypatch.delitem(ARMS, arm.name, raising=False)
-    with pytest.raises(ValueError, match=rf"got '{arm.name}'.*register_arm makes an arm of your own known"):
+    with pytest.raises(ValueError, match=rf"got '{arm.name}'.*register_arm registers an arm of your own"):
         gym.make("viapoint/Obstacles-v0", arm=arm.name)
     monkeypatch.setitem(ARMS, arm.name, arm)
     register_arm(arm)
     env = gym.make("viapoint/Obstacles-v0", arm=arm.name).unwrapped
     assert env.task.arm is arm
     env.close()
-    with pytest.raises(ValueError, match="another arm is known as"):
+    with pytest.raises(ValueError, match="another arm is registered as"):
         register_arm(ur5e(velocity_limit=1.0))

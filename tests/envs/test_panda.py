@@ -8,7 +8,7 @@ import torch
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.arms.serial_arm import RESERVE
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.envs.sim.simulator import Simulator
@@ -157,8 +157,8 @@ def test_a_movement_too_fast_is_slowed_down_just_enough():
         (joints[:, 2:] - 2 * joints[:, 1:-1] + joints[:, :-2]) / time**2,
     )
     used = (np.abs(moving) / (np.array(PANDA.torque_limit) - np.abs(holding))).max(axis=1)
-    assert (np.maximum(rates, used).max(axis=-1) <= 1.01 * RESERVE).all()
-    assert np.median(np.maximum(rates, np.sqrt(used)).max(axis=-1)) > 0.98 * RESERVE
+    assert (np.maximum(rates, used).max(axis=-1) <= 1.01 * LIMIT_SHARE).all()
+    assert np.median(np.maximum(rates, np.sqrt(used)).max(axis=-1)) > 0.98 * LIMIT_SHARE
 
 
 def test_torque_limits_act():

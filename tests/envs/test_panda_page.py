@@ -9,8 +9,8 @@ import pytest
 
 from viapoint.envs import TASKS
 from viapoint.envs.arms import PANDA
-from viapoint.envs.arms.panda import SHARE, TABLE
-from viapoint.envs.arms.serial_arm import RESERVE
+from viapoint.envs.arms.panda import MIN_HEIGHT, ROLL_SHARE
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE
 from viapoint.envs.scenes.config import FAMILIES, SpaceDistribution
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-panda.md").read_text(encoding="utf-8")
@@ -76,10 +76,10 @@ def test_starting_state():
 def test_numbers_of_the_description(env):
     text = " ".join(PAGE.split())
     assert f"{WORDS[len(PANDA.shape)].capitalize()} capsules stand for the links" in text
-    assert f"exceed {100 * RESERVE:g} % of its velocity limit" in text
+    assert f"exceed {100 * LIMIT_SHARE:g} % of its velocity limit" in text
     assert f"{round(1 / env.model.opt.timestep)} physics steps a second" in text
-    assert f"takes {SHARE} of the turn" in text
-    assert f"lower than {100 * TABLE:g} cm" in text
+    assert f"takes {ROLL_SHARE} of the turn" in text
+    assert f"lower than {100 * MIN_HEIGHT:g} cm" in text
     assert f"({PANDA.hand_stiffness / 1000:g} kN/m, {PANDA.hand_damping:g} N s/m)" in text
     assert "({:g} and {:g} rad/s)".format(*sorted(set(PANDA.velocity_limit))) in text
     assert "({:g} and {:g} N m,".format(*sorted(set(PANDA.torque_limit), reverse=True)) in text

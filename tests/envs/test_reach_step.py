@@ -130,7 +130,7 @@ def test_an_arm_by_name_is_its_record(record):
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
     assert (reward, info) == (paid, told)
-    with pytest.raises(ValueError, match=r"arm must be a record or one of planar, panda.*, got 'hand'"):
+    with pytest.raises(ValueError, match=r"arm must be an arm or one of planar, panda.*, got 'hand'"):
         gym.make(STEP, arm="hand")
 
 
