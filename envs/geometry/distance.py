@@ -1,8 +1,15 @@
 """Exact distances between the arm and the obstacles.
 
-Everything is a capsule: an obstacle is a row (centre D, half-axis vector D, radius 1) in [m], a link a segment with a
-radius, the hand a point with one. So clearance is the distance of two segments less two radii. The functions are
-batched over leading dimensions and accept NumPy arrays and torch tensors.
+All bodies are capsules: an obstacle is a row (centre D, half-axis vector D, radius 1) in [m], a link a segment with a
+radius, and the hand a point with one. The clearance of two capsules is the distance of their axes less both radii. The
+functions are batched over leading dimensions and accept NumPy arrays and torch tensors. They share these arguments:
+
+    obstacles   rows of n obstacles, shape (..., n, 2 D + 1), [m]
+    present     True for rows that are obstacles, shape (..., n)
+    drift       displacement of each obstacle at each time, shape (..., n, T, D), [m]; None if obstacles stand still
+    radius(es)  of the hand, or of the L links, [m]
+
+Clearance is negative for penetration and at most MAX_CLEARANCE.
 """
 
 from __future__ import annotations
@@ -10,49 +17,43 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 
-from viapoint.envs.common.arrays import clamp
+from viapoint.envs.common.arrays import clamp, dot
 from viapoint.primitives.array_api import Array, namespace_of
 
 MAX_CLEARANCE = 1.0
-"""Clearance is reported up to this distance, [m]: also where there is no obstacle."""
-_TINY = 1e-12
+"""Greatest clearance that is reported, also without obstacles, [m]."""
+TINY = 1e-12
+"""Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
 
 
 def hand_clearance(points: Array, radius: float, obstacles: Array, present: Array) -> Array:
-    """Least clearance of the hand over a movement, for each obstacle.
+    """Return the least clearance of the hand over a movement from each obstacle, shape (..., n), [m].
 
     Args:
-        points: Positions of the hand, shape (..., T, D), [m].
-        radius: Of the hand, [m].
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        present: Whether a row is an obstacle, shape (..., n), bool.
-
-    Returns:
-        Shape (..., n), [m]; negative is penetration, at most MAX_CLEARANCE.
+        points: Hand positions, shape (..., T, D), [m].
+        radius: Radius of the hand, [m].
+        obstacles: See the module.
+        present: See the module.
     """
-    xp = namespace_of(points)
-    nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
+    nearest = namespace_of(points).min(point_distance_squared(points, obstacles), axis=-1)
     return _clearance(nearest, obstacles[..., -1] + radius, present)
 
 
 def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, present: Array) -> Array:
-    """Least clearance of the links over a movement, for each obstacle.
+    """Return the least clearance of all links over a movement from each obstacle, shape (..., n), [m].
 
     Args:
-        links: End points of the links' axes, shape (..., T, L, 2, D), [m].
-        radii: Of the L links, [m].
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        present: Whether a row is an obstacle, shape (..., n), bool.
-
-    Returns:
-        Shape (..., n), [m]; negative is penetration, at most MAX_CLEARANCE.
+        links: Both ends of the links' axes, shape (..., T, L, 2, D), [m].
+        radii: Radii of the links, [m].
+        obstacles: See the module.
+        present: See the module.
     """
-    xp = namespace_of(links)
-    each = []
+    xp, each = namespace_of(links), []
     for i, radius in enumerate(radii):
+        # The least squared distance is found first, so that fewer square roots are taken than in the profile.
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
         each.append(_clearance(xp.min(squared, axis=-1), obstacles[..., -1] + radius, present))
-    return xp.min(xp.stack(each, axis=-1), axis=-1)
+    return functools.reduce(xp.minimum, each)
 
 
 def clearance_profile(
@@ -64,19 +65,16 @@ def clearance_profile(
     link_radii: tuple[float, ...] = (),
     drift: Array = None,
 ) -> Array:
-    """Clearance of the hand and, where given, the links from each obstacle at each time.
+    """Return the clearance of hand and, if given, links from each obstacle at each time, shape (..., n, T), [m].
 
     Args:
-        hand: Positions, shape (..., T, D), [m].
-        hand_radius: [m].
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        present: Whether a row is an obstacle, shape (..., n), bool.
-        links: End points of the links' axes, shape (..., T, L, 2, D), [m].
-        link_radii: Of the L links, [m].
-        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
-
-    Returns:
-        Shape (..., n, T), [m].
+        hand: Hand positions, shape (..., T, D), [m].
+        hand_radius: Radius of the hand, [m].
+        obstacles: See the module.
+        present: See the module.
+        links: Both ends of the links' axes, shape (..., T, L, 2, D), [m].
+        link_radii: Radii of the links, [m].
+        drift: See the module.
     """
     radii, shown = obstacles[..., :, None, -1], present[..., :, None]
     least = _clearance(point_distance_squared(hand, obstacles, drift), radii + hand_radius, shown)
@@ -93,17 +91,14 @@ def links_profile(
     present: Array,
     drift: Array = None,
 ) -> Array:
-    """Clearance of the links alone, as :func:`clearance_profile` has it.
+    """Return the clearance of the links alone from each obstacle at each time, shape (..., n, T), [m].
 
     Args:
         links: Both ends of the L links' axes, shape (..., T, D) each, [m].
-        radii: Of the links, [m].
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        present: Whether a row is an obstacle, shape (..., n), bool.
-        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
-
-    Returns:
-        Shape (..., n, T), [m].
+        radii: Radii of the links, [m].
+        obstacles: See the module.
+        present: See the module.
+        drift: See the module.
     """
     each = (
         _clearance(
@@ -117,42 +112,38 @@ def links_profile(
 
 
 def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:
-    """Squared distance of points from the obstacles' axes.
+    """Return the squared distance of points from the obstacles' axes, shape (..., n, T), [m^2].
+
+    The nearest point of the segment c + t a, -1 <= t <= 1, to p is at t = (p - c) . a / |a|^2, clamped.
 
     Args:
-        points: Shape (..., T, D), [m].
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
-
-    Returns:
-        Shape (..., n, T), [m^2].
+        points: Positions, shape (..., T, D), [m].
+        obstacles: See the module.
+        drift: See the module.
     """
     xp = namespace_of(points)
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
     offset = offset if drift is None else [o - drift[..., i] for i, o in enumerate(offset)]
     axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
-    square = sum(a * a for a in axis)
-    along = sum(o * a for o, a in zip(offset, axis, strict=True)) / xp.where(square > _TINY, square, 1.0)
-    along = clamp(along, -1.0, 1.0)
+    square = dot(axis, axis)
+    along = clamp(dot(offset, axis) / xp.where(square > TINY, square, 1.0), -1.0, 1.0)
     rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
-    return sum(r * r for r in rest)
+    return dot(rest, rest)
 
 
 def segment_distance_squared(first: Array, second: Array, obstacles: Array, drift: Array = None) -> Array:
-    """Squared distance of segments from the obstacles' axes, which are segments too.
+    """Return the squared distance of segments from the axes of obstacles, shape (..., n, T), [m^2].
 
     The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
-    Detection, 2005, section 5.1.9).
+    Detection, 2005, section 5.1.9, in its notation): the point of the link nearest to the obstacle's line, the point of
+    the obstacle's axis nearest to that, and the point of the link nearest to that.
 
     Args:
         first: One end of each segment, shape (..., T, D), [m].
-        second: The other end, likewise; the segment has a length.
-        obstacles: Shape (..., n, 2 D + 1), [m].
-        drift: How far each obstacle has moved at each time, shape (..., n, T, D), [m]; None where they stand.
-
-    Returns:
-        Shape (..., n, T), [m^2].
+        second: Other end of each segment, which must have a length, shape (..., T, D), [m].
+        obstacles: See the module.
+        drift: See the module.
     """
     xp = namespace_of(first)
     dimension = first.shape[-1]
@@ -163,27 +154,21 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array, drif
         for i in range(dimension)
     ]
     gap = gap if drift is None else [g - drift[..., i] for i, g in enumerate(gap)]
-    a, e, b = _dot(link, link), _dot(axis, axis), _dot(link, axis)
-    c, f = _dot(link, gap), _dot(axis, gap)
-    e = xp.maximum(e, _TINY)
+    a, e, b = dot(link, link), dot(axis, axis), dot(link, axis)
+    c, f = dot(link, gap), dot(axis, gap)
+    e = xp.maximum(e, TINY)
     determinant = a * e - b * b
-    crosses = determinant > _TINY * a * e
+    crosses = determinant > TINY * a * e  # else parallel: any point of the link will do to begin with
     crossing = (b * f - c * e) / xp.where(crosses, determinant, 1.0)
     on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
     on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
     on_link = clamp((b * on_axis - c) / a, 0.0, 1.0)
     rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
-    return _dot(rest, rest)
-
-
-def _dot(first: list[Array], second: list[Array]) -> Array:
-    total = first[0] * second[0]
-    for u, v in zip(first[1:], second[1:], strict=True):
-        total = total + u * v
-    return total
+    return dot(rest, rest)
 
 
 def _clearance(squared: Array, radii: Array, present: Array) -> Array:
+    """Return clearance from squared distances of axes; the small summand keeps gradients at distance 0 finite."""
     xp = namespace_of(squared)
     distance = xp.sqrt(squared + 1e-24) - radii
     return xp.where(present, xp.minimum(distance, MAX_CLEARANCE), xp.full_like(distance, MAX_CLEARANCE))

@@ -1,8 +1,8 @@
-"""The nearest approach of links to obstacles over a movement, without looking at every link, obstacle and time.
+"""Narrow phase: the exact least clearance of links from obstacles over a movement, without computing every distance.
 
-A movement is cut into short stretches. In each, a link stays inside the ball around it in the middle of the stretch,
-widened by how far its ends go from there; where even that ball is not the nearest of all, nothing is looked at. So the
-result is exact, over every time that is given.
+A movement is cut into short stretches. In each, a link stays inside a ball: the one around it in the middle of the
+stretch, enlarged by the excursions of its ends. Distances are computed only for balls that could contain the nearest
+point of all, so the result is exact over all given times.
 """
 
 from __future__ import annotations
@@ -12,29 +12,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, segment_distance_squared
 
 STRETCH = 8
-"""Times of a stretch."""
+"""Times per stretch."""
 SWEEP_ROUNDING = 1e-5
-"""More than what rounding adds to a distance, [m]."""
+"""Upper bound of the rounding error of a distance in single precision, [m]."""
 
 
 class LinkPositions(NamedTuple):
-    """Places on arms at T times of N movements."""
+    """Positions of points on an arm at T times of N movements."""
 
     places: Float
-    """Shape (N, T, P, 3), [m]."""
+    """Positions, shape (N, T, P, 3), [m]."""
     hand: int
-    """Int of the hand's."""
+    """Index of the hand among the points."""
     links: Int
-    """Indices of both ends of each link's axis, shape (L, 2)."""
+    """Indices of both ends of each link's axis among the points, shape (L, 2)."""
 
 
 def ends_of(links: Float) -> LinkPositions:
-    """Links alone, shape (N, T, L, 2, 3), [m], the last of which ends in the hand."""
+    """Return positions from link segments, shape (N, T, L, 2, 3), [m]; the last link ends in the hand."""
     number = links.shape[2]
     places = links.reshape(*links.shape[:2], 2 * number, 3)
     return LinkPositions(places, 2 * number - 1, np.arange(2 * number).reshape(number, 2))
@@ -47,14 +48,14 @@ def nearest_approach(
     present: NDArray[np.bool_],
     last: Int | None = None,
 ) -> Float:
-    """Least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.
+    """Return the least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.
 
     Args:
-        traced: Where the links are.
-        radii: Of the L links, [m].
-        obstacles: Shape (N, n, 7), [m].
-        present: Whether a row is an obstacle, shape (N, n), bool.
-        last: Int of each movement's last time, shape (N,); all by default.
+        traced: Positions of the links.
+        radii: Radii of the L links, [m].
+        obstacles: Rows of obstacles, shape (N, n, 7), [m].
+        present: True for rows that are obstacles, shape (N, n).
+        last: Index of each movement's last time, shape (N,); by default all times count.
     """
     least = np.full(len(obstacles), MAX_CLEARANCE)
     if not present.any():
@@ -62,58 +63,55 @@ def nearest_approach(
     places, links = traced.places, traced.links
     last = np.full(len(least), places.shape[1] - 1) if last is None else last
     starts = np.arange(0, places.shape[1], STRETCH)
-    looks = np.minimum(np.minimum(starts + STRETCH // 2, places.shape[1] - 1), last[:, None])
+    middles = np.minimum(np.minimum(starts + STRETCH // 2, places.shape[1] - 1), last[:, None])
     about = places.astype(np.float32, order="C")
-    seen = about[np.arange(len(least))[:, None], looks]
-    strayed = _strayed(about, seen)[:, :, links].max(axis=-1) + np.float32(SWEEP_ROUNDING)
+    seen = about[np.arange(len(least))[:, None], middles]
+    excursion = _excursions(about, seen)[:, :, links].max(axis=-1) + np.float32(SWEEP_ROUNDING)
     first, second = seen[:, :, links[:, 0]], seen[:, :, links[:, 1]]
-    around = np.float32(0.5) * _norm(second - first) + strayed + np.array(radii, np.float32)
+    around = np.float32(0.5) * norm(second - first) + excursion + np.array(radii, np.float32)
     centres = np.moveaxis(np.float32(0.5) * (first + second), -1, 1).reshape(len(least), 3, -1)
     shown = np.where(present[..., None], obstacles, 0.0)
     bounds = ball_bounds(lift_quadratic(centres), around.reshape(len(least), -1), shown)
     size = np.array(radii)
 
     def clearance(each: Int, row: Int, link: Int, times: Int) -> Float:
-        """Of links from obstacles, shape (M, .), one after the other, at times of that shape."""
-        first, second = (_picked(places, each[:, None], times, links[link, end, None]) for end in (0, 1))
+        """Return the clearance of M links, each from one obstacle at some times, shape (M, .), [m]."""
+        first, second = (_take(places, each[:, None], times, links[link, end, None]) for end in (0, 1))
         squared = segment_distance_squared(first, second, obstacles[each, row][:, None])[:, 0]
         return np.asarray(np.sqrt(squared) - (obstacles[each, row, -1] + size[link])[:, None])
 
+    # The ball with the least bound of each movement, looked at first, gives an upper bound for the others.
     flat, each = bounds.reshape(len(least), -1), np.arange(len(least))
     row, ball = np.divmod(flat.argmin(axis=-1), bounds.shape[-1])
     stretch, link = np.divmod(ball, len(size))
-    nearest = clearance(each, row, link, looks[each, stretch, None])[:, 0]
+    nearest = clearance(each, row, link, middles[each, stretch, None])[:, 0]
     np.minimum(least, np.where(present[each, row], nearest, MAX_CLEARANCE), out=least)
+    # In the middle of their stretches, all balls whose bounds are below that; then all times of those still near.
     each, row, ball = np.nonzero(bounds < least[:, None, None])
     stretch, link = np.divmod(ball, len(size))
-    nearest = clearance(each, row, link, looks[each, stretch, None])[:, 0]
+    nearest = clearance(each, row, link, middles[each, stretch, None])[:, 0]
     np.minimum.at(least, each, nearest)
-    nearer = nearest - strayed[each, stretch, link] < least[each]
+    nearer = nearest - excursion[each, stretch, link] < least[each]
     each, row, stretch, link = each[nearer], row[nearer], stretch[nearer], link[nearer]
     times = np.minimum(starts[stretch, None] + np.arange(STRETCH), last[each, None])
     np.minimum.at(least, each, clearance(each, row, link, times).min(axis=-1))
     return least
 
 
-def _picked(places: Float, each: Int, times: Int, place: Int) -> Float:
-    """The same as `places[each, times, place]`, several times as fast where these are one after the other in memory."""
-    if not places.flags.c_contiguous:
-        return np.asarray(places[each, times, place])
-    rows = (each * places.shape[1] + times) * places.shape[2] + place
-    return np.asarray(places.reshape(-1, 3).take(rows, axis=0))
+def _take(positions: Float, each: Int, times: Int, point: Int) -> Float:
+    """Return `positions[each, times, point]`; `take` on contiguous arrays is several times as fast as this."""
+    if not positions.flags.c_contiguous:
+        return np.asarray(positions[each, times, point])
+    rows = (each * positions.shape[1] + times) * positions.shape[2] + point
+    return np.asarray(positions.reshape(-1, 3).take(rows, axis=0))
 
 
-def _strayed(places: Single, seen: Single) -> Single:
-    """How far each place goes at most, in each stretch, from where it is seen, shape (N, K, P), [m]."""
-    most, least = places[:, ::STRETCH].copy(), places[:, ::STRETCH].copy()
-    for later in range(1, min(STRETCH, places.shape[1])):
-        here = places[:, later::STRETCH]
+def _excursions(positions: Single, seen: Single) -> Single:
+    """Return how far each point moves at most in each stretch from where it is seen, shape (N, K, P), [m]."""
+    most, least = positions[:, ::STRETCH].copy(), positions[:, ::STRETCH].copy()
+    for later in range(1, min(STRETCH, positions.shape[1])):
+        here = positions[:, later::STRETCH]
         some = slice(0, here.shape[1])
         np.maximum(most[:, some], here, out=most[:, some])
         np.minimum(least[:, some], here, out=least[:, some])
-    return _norm(np.maximum(most - seen, seen - least))
-
-
-def _norm(vectors: Single) -> Single:
-    x, y, z = (vectors[..., i] for i in range(3))
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
+    return norm(np.maximum(most - seen, seen - least))

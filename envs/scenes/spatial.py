@@ -230,7 +230,7 @@ class SpaceSampler:
         return good.sum(axis=-1) >= missing, chosen
 
     def _which(self, u: Float) -> NDArray[np.int64]:
-        """Int of the family that a uniform number stands for."""
+        """Index of the family that a uniform number stands for."""
         return np.minimum((u * len(self._families)).astype(np.int64), len(self._families) - 1)
 
     def _course(

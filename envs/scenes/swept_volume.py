@@ -136,7 +136,7 @@ class Swept(NamedTuple):
         """Height of what of the links near the hand stands above it, at K times of each movement.
 
         Args:
-            phase: Int of the times, shape (N, K).
+            phase: Index of the times, shape (N, K).
             place: The hand then, shape (N, K, 3), [m].
 
         Returns:
