@@ -19,7 +19,7 @@ from study.plan import short
 from study.work import ALONE, CHECKED, UNTRAINED, WAYS
 from viapoint.training.evaluation.statistics import interquartile_mean
 from viapoint.training.io.files import write_bytes
-from viapoint.training.plotting.plots import AXES
+from viapoint.training.plotting.plots import AXES, style_axes
 from viapoint.training.scene_sets.scene_set import BANDS
 
 Numbers = Mapping[str, Any]
@@ -135,9 +135,7 @@ def _in_short(value: float, _: Any) -> str:
 def _tidy(ax: Axes) -> None:
     ax.set_ylim(-3.0, 103.0)
     ax.tick_params(labelsize=7.5)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.grid(axis="y", color="0.9")
-    ax.set_axisbelow(True)
+    style_axes(ax)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -231,7 +231,7 @@ def _failures(env: str, name: str, study: Study) -> Numbers:
     return {
         way: {
             kind.name: {
-                "words": kind.words,
+                "words": kind.description,
                 "share": share(way, kind.name, "count"),
                 "another": share(way, kind.name, "another"),
             }

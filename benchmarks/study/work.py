@@ -19,7 +19,7 @@ from viapoint.training.evaluation.evaluator import MethodResult, evaluate_method
 from viapoint.training.io.config_json import as_json
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import SEARCHES, Method, agent_method, make_method
-from viapoint.training.plotting.failure_report import sort_out
+from viapoint.training.plotting.failure_report import classify_failures
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread, resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
@@ -152,7 +152,7 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
     results = _results(methods, frozen, cell.env, kwargs)
     with one_thread():
         failures = {
-            each.name: sort_out(each, frozen, model, cell.env, **kwargs).counts()
+            each.name: classify_failures(each, frozen, model, cell.env, **kwargs).counts()
             for each in results
             if each.name != UNTRAINED and hasattr(model.policy, "checks")
         }

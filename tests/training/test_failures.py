@@ -8,7 +8,14 @@ import pytest
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.plotting import failure_report as module
-from viapoint.training.plotting.failure_report import KINDS, kinds, markdown, proposals, sort_out, write
+from viapoint.training.plotting.failure_report import (
+    KINDS,
+    classify,
+    classify_failures,
+    markdown,
+    proposals,
+    write_failures,
+)
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.trainer import new_model, resolved
@@ -38,7 +45,7 @@ def outcomes(reachable=True, collision=True, planned_clearance=-0.02):
     ],
 )
 def test_each_kind_is_what_it_says(outcome, another, kind):
-    assert NAMES[kinds(outcome, np.array([another]))[0]] == kind
+    assert NAMES[classify(outcome, np.array([another]))[0]] == kind
 
 
 class Chosen:
@@ -65,7 +72,7 @@ def sorted_out(small_scenes):
     result = evaluate_methods(
         [Chosen(model, trial)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
     ).results[0]
-    return result, sort_out(result, small_scenes, model, ENV, threads=1)
+    return result, classify_failures(result, small_scenes, model, ENV, threads=1)
 
 
 def test_every_failure_is_counted_once(sorted_out):
@@ -85,13 +92,13 @@ def test_the_other_way_was_there(sorted_out, small_scenes):
     assert wrong.any()
     assert failures.another[wrong].all()
     assert not failures.another[failures.kind == NAMES.index("collision")].any()
-    assert (failures.depth[wrong] > module.GRAZE).all()
+    assert (failures.depth[wrong] > module.MAX_GRAZE).all()
 
 
 def test_tables_and_pictures_are_written(sorted_out, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "PICTURES", 2)
+    monkeypatch.setattr(module, "MAX_PICTURES", 2)
     _, failures = sorted_out
-    paths = write(failures, tmp_path / "new", ENV, threads=1)
+    paths = write_failures(failures, tmp_path / "new", ENV, threads=1)
     names = {path.name for path in paths}
     assert {"failures.md", "failures.json"} <= names
     counts = json.loads((tmp_path / "new" / "failures.json").read_text())["kinds"]

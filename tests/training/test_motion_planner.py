@@ -34,7 +34,7 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     assert summary["jerk_ratio"] < 50.0
     assert summary["collision"]["rate"] <= 0.1
     counts = result.actions[:, 0]
-    assert set(counts) <= set(ompl_planner.DENSE)
+    assert set(counts) <= set(ompl_planner.VIA_COUNTS)
     assert len(set(counts)) > 1
     np.testing.assert_allclose(result.outcomes["duration"], result.actions[:, 1])
 

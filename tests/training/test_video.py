@@ -13,7 +13,7 @@ from viapoint.envs.rendering import gl
 from viapoint.envs.rendering.renderer import GLUnavailableError
 from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.plotting.top_view import capsule, draw_movement
-from viapoint.training.plotting.video import film, verdict
+from viapoint.training.plotting.video import describe_outcome, record_video
 
 OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 
@@ -82,7 +82,7 @@ def check_film(made, env, number):
 
 
 def test_a_film_shows_every_movement(env, tmp_path):
-    made = film(tmp_path / "film.mp4", env, scenes_of(env, 2), straight, pause=0.2)
+    made = record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), straight, pause=0.2)
     check_film(made, env, 2)
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
@@ -90,7 +90,7 @@ def test_a_film_shows_every_movement(env, tmp_path):
 @pytest.mark.usefixtures("_no_opengl")
 def test_without_opengl_a_film_is_drawn_and_one_line_names_the_package(env, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
-        made = film(tmp_path / "film.mp4", env, scenes_of(env, 2), straight, pause=0.2)
+        made = record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), straight, pause=0.2)
     assert not made.rendered
     check_film(made, env, 2)
     assert len(caplog.records) == 1
@@ -100,11 +100,11 @@ def test_without_opengl_a_film_is_drawn_and_one_line_names_the_package(env, tmp_
 def test_a_film_needs_lists_of_frames_and_a_scene(env, tmp_path):
     for name in ("film.gif", "film.foo", "film"):
         with pytest.raises(ValueError, match=rf"must end in \.mp4, got .*{name}"):
-            film(tmp_path / name, env, scenes_of(env, 1), straight)
+            record_video(tmp_path / name, env, scenes_of(env, 1), straight)
     with pytest.raises(ValueError, match="rgb_array_list"):
-        film(tmp_path / "film.mp4", gym.make(OBSTACLES), scenes_of(env, 1), straight)
+        record_video(tmp_path / "film.mp4", gym.make(OBSTACLES), scenes_of(env, 1), straight)
     with pytest.raises(ValueError, match="at least one scene"):
-        film(tmp_path / "film.mp4", env, scenes_of(env, 1).take(slice(0, 0)), straight)
+        record_video(tmp_path / "film.mp4", env, scenes_of(env, 1).take(slice(0, 0)), straight)
 
 
 def test_a_film_that_fails_half_way_leaves_nothing(env, tmp_path):
@@ -116,7 +116,7 @@ def test_a_film_that_fails_half_way_leaves_nothing(env, tmp_path):
 
     broken.calls = 0
     with pytest.raises(KeyError):
-        film(tmp_path / "film.mp4", env, scenes_of(env, 2), broken)
+        record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), broken)
     assert not list(tmp_path.iterdir())
 
 
@@ -138,7 +138,7 @@ def test_the_verdict_says_what_came_of_a_movement(changes, said, colour):
         "min_clearance": 0.012,
         "goal_error": 0.04,
     }
-    assert verdict({**info, **changes}) == (said, colour)
+    assert describe_outcome({**info, **changes}) == (said, colour)
 
 
 def test_a_gallery_is_a_page_of_movements(env, tmp_path):

@@ -20,7 +20,7 @@ from viapoint.training.evaluation.evaluator import check_baselines, task_of
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import write_json
 from viapoint.training.planners.baselines import agent_method
-from viapoint.training.plotting.failure_report import sort_out, write
+from viapoint.training.plotting.failure_report import classify_failures, write_failures
 from viapoint.training.rollouts.step_rollout import whole_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
@@ -78,8 +78,10 @@ def evaluate(config: EvaluateConfig) -> None:
         raise EvaluationStoppedError("stopped: the results are partial")
     if config.failures is not None:
         last = [each for each in result.results if each.name.startswith("agent")][-1]
-        failures = sort_out(last, scenes.take(slice(0, len(last.success))), agent, env_id, **env_kwargs)
-        write(failures, config.failures, env_id, **env_kwargs)
+        failures = classify_failures(
+            last, scenes.take(slice(0, len(last.success))), agent, env_id, **env_kwargs
+        )
+        write_failures(failures, config.failures, env_id, **env_kwargs)
         print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
 
@@ -103,7 +105,7 @@ def _check_failures(agent: Agent | None) -> None:
 
 def play(config: PlayConfig) -> None:
     """Film an agent's movements."""
-    from viapoint.training.plotting.video import film
+    from viapoint.training.plotting.video import record_video
 
     agent = load_agent(config.agent)
     scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
@@ -113,7 +115,7 @@ def play(config: PlayConfig) -> None:
         f"agent, {config.checks} checks" if config.checks else "agent", agent, config.checks
     )
     config.video.parent.mkdir(parents=True, exist_ok=True)
-    film(config.video, env, scenes.take(rows), method.decide, name=method.name)
+    record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()
     print(f"{len(rows)} movements: {config.video}")
 

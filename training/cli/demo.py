@@ -23,7 +23,7 @@ from viapoint.training.io.files import BadFileError, read_json
 from viapoint.training.planners.baselines import Method, agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery
-from viapoint.training.plotting.video import film
+from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread, train
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
@@ -172,7 +172,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    film(
+    record_video(
         path,
         env,
         frozen.scenes.take(spread(len(frozen.share), MOVEMENTS)),

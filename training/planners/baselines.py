@@ -1,4 +1,4 @@
-"""What an agent is measured against, and the agent, all behind one method: observations and scenes in, actions out."""
+"""Baselines and agents behind one protocol: observations and scenes in, actions out."""
 
 from __future__ import annotations
 
@@ -12,35 +12,32 @@ from tqdm import tqdm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planners.cma_planner import Planner
 from viapoint.training.planners.ompl_planner import MotionPlannerMethod
 from viapoint.training.planners.replanning_baselines import OnlinePlanner, OpenLoopBaseline
-from viapoint.training.rollouts.rollout import Trial, Trials, new_trial
+from viapoint.training.rollouts.rollout import Trial, new_trial
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.search.geometry_search import GeometrySearch
 
 
 class Method(Protocol):
-    """Decides on a movement in each of N scenes."""
+    """Decision maker that chooses a movement in each of N scenes.
+
+    A method whose movements are no actions of the environment has `execute(scenes, decisions)` as well, which simulates
+    them and returns :class:`~viapoint.training.rollouts.rollout.Trials`.
+    """
 
     @property
     def name(self) -> str:
-        """As it stands in the table."""
+        """Name in tables of results."""
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Actions, shape (N, m), from the first observations and, for those that may search, the scenes."""
-
-
-class OwnMethod(Method, Protocol):
-    """Decides on movements that no action of the environment stands for, and carries them out itself."""
-
-    def execute(self, scenes: Scenes, decided: Float) -> Trials:
-        """What came of what was decided in N scenes, in the same simulation."""
+        """Return actions, shape (N, m), from first observations; planners that simulate use the scenes."""
 
 
 class Straight:
-    """The straight minimum-jerk movement: the zero action."""
+    """Straight minimum-jerk movement, the zero action."""
 
     name = "straight line"
 
@@ -48,12 +45,12 @@ class Straight:
         self._size = trial.task.action.size
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`Method`."""
+        """Return zero actions, see :class:`Method`."""
         return np.zeros((len(scenes.start), self._size))
 
 
 class Constant:
-    """The one action that succeeds in most scenes of the training distribution."""
+    """Action that succeeds in most scenes of the training distribution."""
 
     name = "best constant action"
 
@@ -61,17 +58,17 @@ class Constant:
         generator = np.random.default_rng(seed)
         scenes = trial.task.sampler()([generator] * number)
         actions = generator.uniform(-1.0, 1.0, (candidates, trial.task.action.size))
-        tried = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
-        solved = [trial(scenes, np.tile(action, (number, 1))).success.sum() for action in tried]
+        progress = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
+        solved = [trial(scenes, np.tile(action, (number, 1))).success.sum() for action in progress]
         self._action = actions[np.argmax(solved)]
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`Method`."""
+        """Return the same action for every scene, see :class:`Method`."""
         return np.tile(self._action, (len(scenes.start), 1))
 
 
 class RandomVias:
-    """The best of some random actions, checked in simulation where there is more than one."""
+    """Best of some random actions by simulated reward; a single one is not simulated."""
 
     def __init__(self, trial: Trial, count: int, *, seed: int = 0) -> None:
         self._trial, self._count = trial, count
@@ -79,7 +76,7 @@ class RandomVias:
         self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`Method`."""
+        """Return the best of the random actions, see :class:`Method`."""
         number, size = len(scenes.start), self._trial.task.action.size
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
@@ -89,34 +86,21 @@ class RandomVias:
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
-class PlannerMethod:
-    """The planner, see :mod:`viapoint.training.planners.cma_planner`."""
-
-    name = "planner"
-
-    def __init__(self, trial: Trial, *, seed: int = 0, budget: PlannerBudget | None = None) -> None:
-        self._planner = Planner(trial, seed=seed, budget=budget)
-
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`Method`."""
-        return self._planner(scenes).action
-
-
 class AgentMethod:
-    """A trained agent.
+    """Trained agent.
 
     Args:
-        name: As it stands in the table.
-        model: That decides.
-        checks: How many of its proposals are checked by exact geometry at each decision; None leaves the model's own
-            setting.
+        name: Name in tables of results.
+        model: Model with `predict`.
+        checks: Number of proposals that are checked with computed geometry in each decision; None for the model's own
+            number.
     """
 
     def __init__(self, name: str, model: Any, checks: int | None = None) -> None:
         self.name, self._model, self._checks = name, model, checks
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`Method`; the scenes are not looked at."""
+        """Return actions of the agent, see :class:`Method`; the scenes are unused."""
         policy = self._model.policy
         own = getattr(policy, "checks", None)
         if own is not None and self._checks is not None:
@@ -130,7 +114,7 @@ class AgentMethod:
 
 
 def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
-    """Return a trained agent as a method, whether an action of it is a whole movement or lasts a control step.
+    """Return a trained agent as a method, for whole movements or for actions in every control step.
 
     Raises:
         ValueError: The agent cannot check its proposals.
@@ -144,7 +128,7 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
 
 
 def _search(total: int) -> Callable[[Trial], Method]:
-    """Return what makes a search that spends half of its checks on refinement, which solves more scenes (measured)."""
+    """Return a factory of searches; half of the checks on refinement solve more scenes (docs/geometry-search.md)."""
     rounds = 2 if total < 256 else 4
     return lambda trial: GeometrySearch(
         trial.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
@@ -152,7 +136,7 @@ def _search(total: int) -> Callable[[Trial], Method]:
 
 
 SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
-"""Searches among computed plans by name, with the number of plans that each checks for a decision."""
+"""Factories of searches by name; the number is that of the plans checked in a decision."""
 
 METHODS: dict[str, Callable[[Trial], Method]] = {
     "straight": Straight,
@@ -160,11 +144,11 @@ METHODS: dict[str, Callable[[Trial], Method]] = {
     "random": lambda trial: RandomVias(trial, 1),
     "random16": lambda trial: RandomVias(trial, 16),
     "random80": lambda trial: RandomVias(trial, 80),
-    "planner": PlannerMethod,
+    "planner": Planner,
     "ompl": MotionPlannerMethod,
     **SEARCHES,
 }
-"""The baselines by the name the command line knows them by."""
+"""Factories of baselines by their names on the command line."""
 
 ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
     "straight": Straight,
@@ -173,14 +157,14 @@ ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
     "unrevised": lambda trial: OpenLoopBaseline(Straight(trial), trial),
     **SEARCHES,
 }
-"""Those where plans are revised on the way."""
+"""Factories of baselines for replanning tasks."""
 
 
 def check_method(name: str, env_id: str) -> None:
     """Check that a baseline of this name exists for an environment.
 
     Raises:
-        ValueError: There is none of that name.
+        ValueError: No baseline has that name.
     """
     known = _known(env_id)
     if name not in known:
@@ -193,7 +177,7 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """Return a baseline for an environment made with `kwargs`.
 
     Raises:
-        ValueError: There is none of that name.
+        ValueError: No baseline has that name.
     """
     check_method(name, env_id)
     return _known(env_id)[name](new_trial(env_id, **kwargs))

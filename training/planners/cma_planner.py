@@ -1,7 +1,7 @@
-"""The planner: search over the same actions in the same simulation. It is the ceiling of every table.
+"""Planner that searches the same actions in the same simulation; the upper reference of every table.
 
-Random actions first, so that every way round is tried, then the covariance matrix adaptation evolution strategy
-(Hansen 2016, arXiv 1604.00772; the library `cmaes`) from the best of them, for all scenes at once.
+The search begins with random actions, so that every side of the obstacles is tried. The covariance matrix adaptation
+evolution strategy (Hansen 2016, arXiv 1604.00772; library `cmaes`) then starts from the best of them.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ import numpy as np
 from cmaes import CMA
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.difficulty import screen
 from viapoint.training.rollouts.rollout import Trial
 
-HOPELESS = -3.0
-"""Reward put down for an action that fails for certain and is not simulated: by default weights, less than any."""
+FAILURE_REWARD = -3.0
+"""Reward of an action that certainly fails and is not simulated; with default weights less than any other."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerBudget:
-    """How long the planner searches in each scene."""
+    """Budget of the planner in each scene."""
 
     first: int = 64
-    """Random actions."""
+    """Number of random actions."""
     more: int = 4096
-    """Random actions at most, drawn where none has succeeded yet."""
+    """Greatest number of random actions, drawn where none has succeeded yet."""
     generations: int = 12
-    """Of the refinement."""
+    """Generations of the evolution strategy."""
     population: int = 8
     """Actions in each generation."""
 
 
-class Planned(NamedTuple):
-    """What the planner found in N scenes."""
+class PlannedActions(NamedTuple):
+    """Best actions that the planner found in N scenes."""
 
     action: Float
     """Shape (N, m)."""
@@ -45,21 +45,29 @@ class Planned(NamedTuple):
     """Shape (N,)."""
     success: NDArray[np.bool_]
     """Shape (N,)."""
-    tried: NDArray[np.int64]
-    """Actions looked at, shape (N,)."""
+    n_tried: NDArray[np.int64]
+    """Number of actions tried, shape (N,)."""
 
 
 class Planner:
-    """Searches for the action of the highest reward."""
+    """Search for the action of the highest simulated reward.
+
+    Args:
+        trial: Simulation of the environment.
+        seed: Seed of the random actions and of the evolution strategy.
+        budget: Budget of the search.
+    """
+
+    name = "planner"
 
     def __init__(self, trial: Trial, *, seed: int = 0, budget: PlannerBudget | None = None) -> None:
         self._trial, self._budget, self._seed = trial, budget or PlannerBudget(), seed
         self._size = trial.task.action.size
 
-    def __call__(self, scenes: Scenes) -> Planned:
-        """The best action found in each of N scenes; a scene's result depends on the scene and the seed alone."""
+    def __call__(self, scenes: Scenes) -> PlannedActions:
+        """Return the best action found in each of N scenes; each depends on its scene and the seed alone."""
         number = len(scenes.start)
-        found = Planned(
+        found = PlannedActions(
             np.zeros((number, self._size)),
             np.full(number, -np.inf),
             np.zeros(number, dtype=bool),
@@ -69,8 +77,11 @@ class Planner:
         self._try(scenes, np.arange(number), np.zeros((number, 1, self._size)), found)
         count = self._budget.first
         while True:
-            rows = np.flatnonzero(~found.success) if found.tried.max() > 1 else np.arange(number)
-            if not len(rows) or found.tried[rows].max() + count > self._budget.more + 1 + self._budget.first:
+            rows = np.flatnonzero(~found.success) if found.n_tried.max() > 1 else np.arange(number)
+            if (
+                not len(rows)
+                or found.n_tried[rows].max() + count > self._budget.more + 1 + self._budget.first
+            ):
                 break
             actions = generator.uniform(-1.0, 1.0, (count, self._size))
             self._try(scenes, rows, np.broadcast_to(actions, (len(rows), count, self._size)), found)
@@ -78,15 +89,15 @@ class Planner:
         self._refine(scenes, found)
         return found
 
-    def _try(self, scenes: Scenes, rows: NDArray[np.int64], actions: Float, found: Planned) -> Float:
-        """Simulate a few actions in each of some scenes and keep what is better than what was found."""
+    def _try(self, scenes: Scenes, rows: NDArray[np.int64], actions: Float, found: PlannedActions) -> Float:
+        """Simulate actions, shape (n, count, m), in some scenes, keep improvements, and return their rewards."""
         count = actions.shape[1]
         every, flat = scenes.take(np.repeat(rows, count)), actions.reshape(-1, self._size)
-        screened = screen(self._trial.task, every, flat)
-        rewards, success = HOPELESS + screened.merit, np.zeros(len(flat), dtype=bool)
-        if not screened.fails.all():
-            trials = self._trial(every.take(~screened.fails), flat[~screened.fails])
-            rewards[~screened.fails], success[~screened.fails] = trials.reward, trials.success
+        screening = screen(self._trial.task, every, flat)
+        rewards, success = FAILURE_REWARD + screening.margin, np.zeros(len(flat), dtype=bool)
+        if not screening.fails.all():
+            trials = self._trial(every.take(~screening.fails), flat[~screening.fails])
+            rewards[~screening.fails], success[~screening.fails] = trials.reward, trials.success
         rewards = rewards.reshape(-1, count)
         best = rewards.argmax(axis=-1)
         each = np.arange(len(rows))
@@ -94,10 +105,15 @@ class Planner:
         found.action[rows[better]] = actions[each, best][better]
         found.reward[rows[better]] = rewards[each, best][better]
         found.success[rows[better]] = success.reshape(-1, count)[each, best][better]
-        found.tried[rows] += count
+        found.n_tried[rows] += count
         return rewards
 
-    def _refine(self, scenes: Scenes, found: Planned) -> None:
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return the best actions, see :class:`~viapoint.training.planners.baselines.Method`."""
+        return self(scenes).action
+
+    def _refine(self, scenes: Scenes, found: PlannedActions) -> None:
+        """Improve the found actions by one evolution strategy for each scene."""
         bounds = np.tile([-1.0, 1.0], (self._size, 1))
         population = self._budget.population
         rows = np.arange(len(found.action))
@@ -108,5 +124,7 @@ class Planner:
         for _ in range(self._budget.generations):
             actions = np.array([[search.ask() for _ in range(population)] for search in searches])
             rewards = self._try(scenes, rows, actions, found)
-            for search, asked, told in zip(searches, actions, rewards, strict=True):
-                search.tell([(action, -float(reward)) for action, reward in zip(asked, told, strict=True)])
+            for search, candidates, values in zip(searches, actions, rewards, strict=True):
+                search.tell(
+                    [(action, -float(reward)) for action, reward in zip(candidates, values, strict=True)]
+                )

@@ -1,11 +1,10 @@
-"""A sampling-based motion planner from a library, OMPL: what a roboticist would use instead.
+"""Sampling-based motion planner of the library OMPL, the usual method of robotics, as a baseline.
 
-RRT-Connect (Kuffner & LaValle 2000) finds a path of straight pieces that is clear, OMPL's own shortcuts straighten it,
-and the least-jerk movement through as few of its points as stay clear makes it smooth. It knows the scene exactly and
-learns nothing.
+RRT-Connect (Kuffner & LaValle 2000) finds a clear path of straight pieces, and OMPL's shortcuts simplify it. The
+minimum-jerk movement through as few points of the path as stay clear makes it smooth. The planner has the exact scene.
 
-It plans where the hand goes. As every arm here takes one posture for each position of its hand, that is a chart of all
-its postures: nothing is lost by not planning in the joints.
+It plans positions of the hand. Every arm here has one posture for each position of its hand, so these positions are a
+chart of the configuration space, and planning in joint space would find nothing else.
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Trial, Trials
 
 Clear = Callable[[Float, Float], bool]
-"""Whether the straight line between two positions of the hand is clear."""
+"""Predicate for a straight line between two hand positions that is clear."""
 
 MARGINS = (0.010, 0.004, 0.001)
-"""Clearances that are asked of a path, one after the other until there is one, [m]."""
-AROUND = 0.30
-"""How far from start and goal the hand may go, [m]."""
-APART = 0.005
-"""Between points of a line that are looked at for the whole arm, [m]."""
-DENSE = (1, 2, 3, 4, 6, 8, 12)
-"""Via-points that are tried, the fewest first."""
-LOOKS = 150
-"""Times at which a smooth movement is looked at."""
+"""Required clearances of a path, tried in this order, [m]."""
+BOX_MARGIN = 0.30
+"""Margin of the planning box around start and goal, [m]."""
+CHECK_SPACING = 0.005
+"""Spacing of collision checks of the whole arm along a line, [m]."""
+VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)
+"""Numbers of via-points, tried in this order."""
+CHECK_INSTANTS = 150
+"""Number of instants at which a smooth movement is checked."""
 
 
-def library() -> Any:
-    """The library, `ompl`.
+def import_ompl() -> Any:
+    """Import the library `ompl`.
 
     Raises:
-        ValueError: It is not installed.
+        ValueError: The library is not installed.
     """
     try:
         import ompl.base
@@ -60,36 +59,36 @@ def library() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionPlannerBudget:
-    """How long the planner tries in each scene."""
+    """Budget of the planner in each scene."""
 
     attempts: int = 4
-    """Paths that are looked for until one can be made smooth."""
+    """Greatest number of paths, until one can be made smooth."""
     seconds: float = 0.25
-    """For each of them, at most."""
+    """Time limit for each path, [s]."""
 
 
 class MotionPlanner:
-    """Plans one movement in one scene at a time.
+    """Planner of one movement in one scene.
 
     Args:
-        task: The environment's.
-        seed: Of the library, which has one random generator for all its planners.
-        budget: How long it tries.
+        task: Task of the environment.
+        seed: Seed of the library, which has one random generator for all its planners.
+        budget: Budget in each scene.
     """
 
     def __init__(self, task: Task, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
-        self._task, self._budget, self._ompl = task, budget or MotionPlannerBudget(), library()
+        self._task, self._budget, self._ompl = task, budget or MotionPlannerBudget(), import_ompl()
         self._ompl.util.RNG.setSeed(max(seed, 1))
 
     def __call__(self, scene: Scenes) -> Plan:
-        """The movement in one scene: of the smooth ones that are clear the first, or else the clearest; one row."""
+        """Return the first smooth plan of one scene that is clear, or else the one with the most clearance; one row."""
         best, merit = self._straight(scene), -np.inf
         for attempt in range(self._budget.attempts):
             margin = MARGINS[min(attempt, len(MARGINS) - 1)]
             path = self._path(scene, margin)
             if path is None:
                 continue
-            for count in DENSE:
+            for count in VIA_COUNTS:
                 plan = self._smooth(points_on(path, count))
                 clearance = self._clearance(plan, scene)
                 if clearance > merit:
@@ -99,13 +98,13 @@ class MotionPlanner:
         return best
 
     def _path(self, scene: Scenes, margin: float) -> Float | None:
-        """Corners of a clear path, start and goal included, shape (P, D), [m]; None where none was found in time."""
+        """Return the corners of a clear path with start and goal, shape (P, D), [m]; None if none is found in time."""
         ends = np.concatenate((scene.start, scene.goal))
         corners = _search(self._ompl, ends, self._clear(scene, margin), self._budget.seconds)
         return corners if corners is None else np.concatenate((ends[:1], corners[1:-1], ends[1:]))
 
     def _smooth(self, waypoints: Float) -> Plan:
-        """The least-jerk movement through waypoints, of the centre duration."""
+        """Return the minimum-jerk movement through waypoints in the centre duration."""
         points = waypoints[None]
         duration = np.array([self._task.action.centre_duration])
         return Plan(points, np.asarray(primitives.passage_durations(points, duration)))
@@ -114,8 +113,8 @@ class MotionPlanner:
         return self._smooth(np.concatenate((scene.start, scene.goal)))
 
     def _clearance(self, plan: Plan, scene: Scenes) -> float:
-        """Least clearance of a plan, or reach margin where that is negative, [m]."""
-        time = np.linspace(0.0, self._task.action.centre_duration, LOOKS)
+        """Return the least clearance of a plan, less the distance by which it leaves the reach, [m]."""
+        time = np.linspace(0.0, self._task.action.centre_duration, CHECK_INSTANTS)
         hand = np.asarray(plan.trajectory()(time))
         margin = float(np.asarray(self._task.arm.reach_margin(hand)).min())
         clearance = self._task.collision_model.least_clearance(hand, scene.obstacles, scene.present)
@@ -131,7 +130,7 @@ class MotionPlanner:
             p, q = tuple(map(float, first)), tuple(map(float, second))
             if any(_nearer(p, q, centre, half, least) for centre, half, least in capsules):
                 return False
-            count = max(2, int(np.ceil(norm(second - first) / APART)) + 1) if whole_arm else 4
+            count = max(2, int(np.ceil(norm(second - first) / CHECK_SPACING)) + 1) if whole_arm else 4
             points = first + np.linspace(0.0, 1.0, count)[:, None] * (second - first)
             if (np.asarray(arm.reach_margin(points)) < 0.0).any():
                 return False
@@ -143,9 +142,9 @@ class MotionPlanner:
 
 
 class MotionPlannerMethod:
-    """The motion planner as a method of the table; its movements have as many via-points as they need.
+    """Motion planner as a method of the tables; its movements have as many via-points as they need.
 
-    What it decides in a scene is a row: number of via-points, total duration [s], and the via-points [m], then zeros.
+    A decision is a row: number of via-points, total duration [s], via-points [m], then zeros.
     """
 
     name = "motion planner (OMPL)"
@@ -155,9 +154,9 @@ class MotionPlannerMethod:
         self._planner = MotionPlanner(trial.task, seed=seed, budget=budget)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """See :class:`~viapoint.training.planners.baselines.Method`."""
+        """Return plans as rows, see :class:`~viapoint.training.planners.baselines.Method`."""
         d = scenes.start.shape[-1]
-        rows = np.zeros((len(scenes.start), 2 + DENSE[-1] * d))
+        rows = np.zeros((len(scenes.start), 2 + VIA_COUNTS[-1] * d))
         for i, row in enumerate(rows):
             plan = self._planner(scenes.take([i]))
             vias = plan.waypoints[0, 1:-1]
@@ -165,28 +164,28 @@ class MotionPlannerMethod:
             row[2 : 2 + vias.size] = vias.ravel()
         return rows
 
-    def execute(self, scenes: Scenes, decided: Float) -> Trials:
-        """Simulate them, those with equally many via-points together."""
-        d, counts = scenes.start.shape[-1], decided[:, 0].astype(np.int64)
-        reward, info = np.zeros(len(decided)), dict[str, NDArray[Any]]()
+    def execute(self, scenes: Scenes, decisions: Float) -> Trials:
+        """Simulate the plans; those with equally many via-points run together."""
+        d, counts = scenes.start.shape[-1], decisions[:, 0].astype(np.int64)
+        reward, info = np.zeros(len(decisions)), dict[str, NDArray[Any]]()
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
             some = scenes.take(rows)
-            vias = decided[rows, 2 : 2 + count * d].reshape(len(rows), count, d)
+            vias = decisions[rows, 2 : 2 + count * d].reshape(len(rows), count, d)
             waypoints = np.concatenate((some.start[:, None], vias, some.goal[:, None]), axis=1)
-            durations = np.asarray(primitives.passage_durations(waypoints, decided[rows, 1]))
-            done = self._trial.execute_plan(some, Plan(waypoints, durations))
-            reward[rows] = done.reward
-            for name, values in done.info.items():
-                info.setdefault(name, np.zeros(len(decided), dtype=values.dtype))[rows] = values
+            durations = np.asarray(primitives.passage_durations(waypoints, decisions[rows, 1]))
+            result = self._trial.execute_plan(some, Plan(waypoints, durations))
+            reward[rows] = result.reward
+            for name, values in result.info.items():
+                info.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
         return Trials(reward, info)
 
 
 def points_on(path: Float, count: int) -> Float:
-    """Start, `count` points and goal of a path of straight pieces.
+    """Return start, `count` points and goal of a path of straight pieces.
 
-    Its corners where there are as many; otherwise points evenly spaced along it, and, where there are more, the corners
-    instead of the nearest.
+    The points are the corners if there are as many, otherwise they are evenly spaced along the path. If there are more
+    points than corners, each corner replaces the nearest point.
     """
     if count == len(path) - 2:
         return path
@@ -200,7 +199,7 @@ def points_on(path: Float, count: int) -> Float:
 
 
 def _search(ompl: Any, ends: Float, clear: Clear, seconds: float) -> Float | None:
-    """RRT-Connect and shortcuts in the box around start and goal; corners, shape (P, D), or None."""
+    """Run RRT-Connect and shortcuts in the box around start and goal; return corners, shape (P, D), or None."""
     base, geometric, d = ompl.base, ompl.geometric, ends.shape[-1]
 
     def place(state: Any) -> Float:
@@ -212,25 +211,25 @@ def _search(ompl: Any, ends: Float, clear: Clear, seconds: float) -> Float | Non
 
     space, bounds = base.RealVectorStateSpace(d), base.RealVectorBounds(d)
     for i in range(d):
-        bounds.setLow(i, float(ends[:, i].min()) - AROUND)
-        bounds.setHigh(i, float(ends[:, i].max()) + AROUND)
+        bounds.setLow(i, float(ends[:, i].min()) - BOX_MARGIN)
+        bounds.setHigh(i, float(ends[:, i].max()) + BOX_MARGIN)
     space.setBounds(bounds)
-    about = base.SpaceInformation(space)
-    about.setStateValidityChecker(lambda state: True)  # lines are looked at from end to end
-    about.setMotionValidator(Lines(about))
-    about.setup()
-    problem = base.ProblemDefinition(about)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: True)  # the motion validator checks whole lines
+    information.setMotionValidator(Lines(information))
+    information.setup()
+    problem = base.ProblemDefinition(information)
     start, goal = space.allocState(), space.allocState()
     for i in range(d):
         start[i], goal[i] = float(ends[0, i]), float(ends[1, i])
     problem.setStartAndGoalStates(start, goal)
-    planner = geometric.RRTConnect(about)
+    planner = geometric.RRTConnect(information)
     planner.setProblemDefinition(problem)
     planner.setup()
     if not planner.solve(seconds) or not problem.hasExactSolution():
         return None
     path = problem.getSolutionPath()
-    geometric.PathSimplifier(about).simplify(path, seconds)
+    geometric.PathSimplifier(information).simplify(path, seconds)
     return np.stack([place(path.getState(i)) for i in range(path.getStateCount())])
 
 
@@ -246,10 +245,14 @@ def _nearer(
     half: tuple[float, ...],
     least: float,
 ) -> bool:
-    """Whether the segments from p to q and from centre - half to centre + half are nearer than `least`.
+    """Return whether the segments from p to q and from centre - half to centre + half are nearer than `least`.
 
-    In plain numbers, as for a few of them NumPy takes ten times as long (C. Ericson, Real-Time Collision Detection,
-    2005, 5.1.9).
+    The closest points of two segments are those of C. Ericson, Real-Time Collision Detection, 2005, 5.1.9:
+
+        minimise |p + s a - centre - t h|^2 over s in [0, 1], t in [-1, 1],  a = q - p, h = half
+
+    This is a second copy of :mod:`viapoint.envs.geometry.distance` in plain numbers: OMPL asks for one line at a time,
+    and for a few numbers NumPy takes ten times as long.
     """
     along = [b - a for a, b in zip(p, q, strict=True)]
     apart = [a - c for a, c in zip(p, centre, strict=True)]

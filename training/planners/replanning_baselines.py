@@ -1,4 +1,4 @@
-"""What an agent that revises its plans is measured against."""
+"""Baselines for replanning tasks."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from viapoint.training.rollouts.rollout import OnlineTrial, Trials
 from viapoint.training.search.candidates import sobol_actions
 from viapoint.training.search.planned_movements import plan_movements
 
-ENOUGH = 0.004
-"""Clearance from which on more of it is worth nothing to the planner, [m]."""
+SUFFICIENT_CLEARANCE = 0.004
+"""Clearance beyond which more of it has no merit, [m]."""
 FIRST, LATER, ROUNDS = 128, 24, 4
-"""Actions that the planner tries first, actions that it tries around the best so far, and how often it does so."""
+"""Number of first actions, of actions in each round around the best one, and of rounds."""
 SPREAD = 0.4
-"""Of the first of those rounds."""
+"""Standard deviation of the steps in the first round; each further round halves it."""
 GROUP = 25
-"""Scenes that it looks at together."""
+"""Scenes that are searched together."""
 INSTANTS = np.arange(1, 49, dtype=np.float32) / 48
-"""Shares of a plan's duration at which its clearance is computed."""
+"""Fractions of a plan's duration at which its clearance is computed."""
 
 
 class OpenLoopBaseline:
-    """The first decision of a method, never revised, whatever happens.
+    """First decision of a method, which is never revised.
 
     Args:
-        method: Whose.
-        trial: Of the environment.
+        method: Method that decides.
+        trial: Simulation of the environment.
     """
 
     def __init__(self, method: Any, trial: OnlineTrial) -> None:
@@ -37,23 +37,23 @@ class OpenLoopBaseline:
         self._trial = OnlineTrial(trial.env_id, 250, **{**trial.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
-        """See :class:`viapoint.training.planners.baselines.Method`."""
-        decided: Float = self._method.decide(observation, scenes)
-        return decided
+        """Return the decision of the method, see :class:`viapoint.training.planners.baselines.Method`."""
+        decisions: Float = self._method.decide(observation, scenes)
+        return decisions
 
-    def execute(self, scenes: Any, decided: Float) -> Trials:
-        """One movement; where the target is another one by then, it has failed."""
-        return self._trial.first(scenes, decided)
+    def execute(self, scenes: Any, decisions: Float) -> Trials:
+        """Simulate one movement in each scene; it fails where the target has changed by its end."""
+        return self._trial.first(scenes, decisions)
 
 
 class OnlinePlanner:
-    """Searches at every decision for the smoothest clear plan, and knows what will become of the obstacles.
+    """Planner that searches the smoothest clear plan in every decision, with the future motion of the obstacles known.
 
-    The search is among the same actions; what they would lead to is computed, not simulated.
+    The search is among the same actions; plans are computed, not simulated.
 
     Args:
-        trial: Of the environment.
-        seed: Of the search.
+        trial: Simulation of the environment.
+        seed: Seed of the search.
     """
 
     name = "planner, knows all courses"
@@ -63,7 +63,7 @@ class OnlinePlanner:
         self._generator = np.random.default_rng(seed)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
-        """See :class:`viapoint.training.planners.baselines.Method`."""
+        """Return the best actions, see :class:`viapoint.training.planners.baselines.Method`."""
         number = len(scenes.start)
         rows = [slice(first, first + GROUP) for first in range(0, number, GROUP)]
         return np.concatenate(
@@ -71,35 +71,36 @@ class OnlinePlanner:
         )
 
     def _search(self, observation: Observation, scenes: Any) -> Float:
+        """Return the best action of each scene, shape (N, m): Sobol points first, then rounds around the best one."""
         number, size = len(scenes.start), self._task.action.size
         actions = np.broadcast_to(sobol_actions(FIRST, size), (number, FIRST, size))
         merit = self._merit(observation, actions, scenes)
         best, rows = merit.argmax(axis=1), np.arange(number)
-        chosen, worth = actions[rows, best], merit[rows, best]
+        chosen, highest = actions[rows, best], merit[rows, best]
         for each in range(ROUNDS):
             steps = self._generator.normal(size=(number, LATER, size)) * SPREAD * 0.5**each
             near = np.clip(chosen[:, None] + steps, -1.0, 1.0).astype(np.float32)
             merit = self._merit(observation, near, scenes)
             best = merit.argmax(axis=1)
-            better = merit[rows, best] > worth
+            better = merit[rows, best] > highest
             chosen = np.where(better[:, None], near[rows, best], chosen)
-            worth = np.where(better, merit[rows, best], worth)
+            highest = np.where(better, merit[rows, best], highest)
         return np.asarray(chosen, dtype=np.float64)
 
     def _merit(self, observation: Observation, actions: NDArray[np.float32], scenes: Any) -> Float:
-        """Clearance as far as it is wanting, then effort and time, shape (N, H)."""
+        """Return the merit of plans, shape (N, H): penalties for missing clearance and reach, then effort and time."""
         task, moves = self._task, plan_movements(observation, actions, self._task, INSTANTS)
-        number, tried = actions.shape[:2]
+        number, plans = actions.shape[:2]
         reach = np.asarray(task.arm.reach_margin(moves.path)).min(axis=-1)
         effort = task.weights.smoothness * moves.effort
         time = task.weights.duration * moves.duration / task.action.centre_duration
         merit = -effort - time + 100.0 * np.minimum(reach, 0.0)
         if not scenes.present.shape[1]:
             return np.asarray(merit)
-        many = scenes.take(np.repeat(np.arange(number), tried))
-        now = np.repeat(self._limit - observation["time_left"][:, 0], tried)
+        many = scenes.take(np.repeat(np.arange(number), plans))
+        now = np.repeat(self._limit - observation["time_left"][:, 0], plans)
         times = now[:, None] + moves.duration.reshape(-1, 1) * INSTANTS
-        path = moves.path.reshape(number * tried, *moves.path.shape[2:])
+        path = moves.path.reshape(number * plans, *moves.path.shape[2:])
         clearance = task.collision_model.clearance_profile(path, many.places(times), many.present)
-        least = clearance.min(axis=(1, 2)).reshape(number, tried)
-        return np.asarray(merit + 200.0 * np.minimum(least - ENOUGH, 0.0))
+        least = clearance.min(axis=(1, 2)).reshape(number, plans)
+        return np.asarray(merit + 200.0 * np.minimum(least - SUFFICIENT_CLEARANCE, 0.0))

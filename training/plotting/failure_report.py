@@ -1,4 +1,4 @@
-"""Failures sorted by kind: how many there are of each, and what they look like."""
+"""Failures of an agent by kind: counts, a table and pictures."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 
-GRAZE = 0.005
-"""A plan that enters an obstacle by no more than this grazes it, [m]."""
-PICTURES = 8
-"""Of each kind, at most."""
+MAX_GRAZE = 0.005
+"""Greatest depth at which a plan grazes an obstacle, [m]."""
+MAX_PICTURES = 8
+"""Greatest number of pictures of each kind."""
 PROPOSALS = 16
-"""Most promising candidates of an agent that count as its proposals."""
+"""Number of best candidates of an agent that count as its proposals."""
 
 
 class Kind(NamedTuple):
-    """One way to fail."""
+    """Kind of failure."""
 
     name: str
-    """As a file is called."""
-    words: str
-    """As a person says it."""
+    """Name in files."""
+    description: str
+    """Description in tables and headings."""
 
 
 KINDS = (
@@ -43,29 +43,29 @@ KINDS = (
     Kind("wrong_way", "a clear collision the wrong way round: another of its proposals would have succeeded"),
     Kind("collision", "a clear collision, and no other proposal would have succeeded"),
 )
-"""In the order in which they are asked: each failure is of the first kind that fits."""
+"""Kinds in order of precedence: each failure is of the first kind that fits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Failures:
-    """The n failures of a method among the scenes of a set."""
+    """Failures of a method among the scenes of a set."""
 
     method: str
     frozen: FrozenScenes
-    """All scenes that it met."""
+    """All scenes of the evaluation."""
     rows: NDArray[np.int64]
-    """In which of them it failed, shape (n,)."""
+    """Rows of the scenes of the n failures, shape (n,)."""
     kind: NDArray[np.int64]
     """Index into KINDS, shape (n,)."""
     another: NDArray[np.bool_] | None
-    """Whether another proposal of the agent would have succeeded, shape (n,); None for agents without proposals."""
+    """Mask of failures where another proposal succeeds, shape (n,); None for agents without proposals."""
     depth: NDArray[np.float64]
-    """How far the plan enters an obstacle, less than 0 where it is clear, shape (n,), [m]."""
+    """Depth of the plan in an obstacle, negative where it is clear, shape (n,), [m]."""
     actions: NDArray[np.float64]
-    """Shape (n, m)."""
+    """Actions of the agent, shape (n, m)."""
 
     def counts(self) -> dict[str, Any]:
-        """For each kind, how many there are, in which bands, and in how many another proposal would have succeeded."""
+        """Return counts of each kind: all, by band, and those in which another proposal succeeds."""
         band = self.frozen.band[self.rows]
         return {
             each.name: {
@@ -79,30 +79,30 @@ class Failures:
         }
 
 
-def kinds(outcomes: Mapping[str, NDArray[Any]], another: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Index into KINDS of each of n failed movements.
+def classify(outcomes: Mapping[str, NDArray[Any]], another: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the index into KINDS of each of n failed movements.
 
     Args:
-        outcomes: Of the movements, by the names of the environment's info, shape (n,) each.
-        another: Whether another proposal would have succeeded, shape (n,).
+        outcomes: Outcomes of the movements, by the names of the environment's info, shape (n,) each.
+        another: Mask of failures where another proposal succeeds, shape (n,).
     """
     reachable, collision = (np.asarray(outcomes[name], dtype=bool) for name in ("reachable", "collision"))
     clearance = np.asarray(outcomes["planned_clearance"], dtype=np.float64)
-    fits = (~reachable, ~collision, clearance > 0.0, clearance >= -GRAZE, another, np.ones_like(another))
+    fits = (~reachable, ~collision, clearance > 0.0, clearance >= -MAX_GRAZE, another, np.ones_like(another))
     return np.asarray(np.argmax(np.stack(fits), axis=0))
 
 
-def sort_out(
+def classify_failures(
     result: MethodResult, frozen: FrozenScenes, agent: Any, env_id: str, **env_kwargs: Any
 ) -> Failures:
-    """The failures of an agent's evaluation.
+    """Return the classified failures of an agent's evaluation.
 
     Args:
-        result: Of the agent.
-        frozen: The scenes it met, in order.
-        agent: The model; of one that ranks candidates the PROPOSALS best ones are tried, too.
-        env_id: Of its environment.
-        **env_kwargs: Of its environment.
+        result: Result of the agent.
+        frozen: Scenes of the evaluation, in order.
+        agent: Model; if it ranks candidates, the PROPOSALS best ones are simulated, too.
+        env_id: Id of its environment.
+        **env_kwargs: Arguments of its environment.
     """
     rows = np.flatnonzero(~result.success)
     outcomes = {name: np.asarray(values)[rows] for name, values in result.outcomes.items()}
@@ -111,7 +111,7 @@ def sort_out(
         method=result.name,
         frozen=frozen,
         rows=rows,
-        kind=kinds(outcomes, np.zeros(len(rows), dtype=bool) if another is None else another),
+        kind=classify(outcomes, np.zeros(len(rows), dtype=bool) if another is None else another),
         another=another,
         depth=-np.asarray(outcomes["planned_clearance"], dtype=np.float64),
         actions=result.actions[rows],
@@ -121,7 +121,7 @@ def sort_out(
 def _another_succeeds(
     agent: Any, scenes: Scenes, env_id: str, env_kwargs: Mapping[str, Any]
 ) -> NDArray[np.bool_] | None:
-    """Whether any of the agent's proposals succeeds in each of n scenes; None where it has none."""
+    """Return in which of n scenes any proposal of the agent succeeds, shape (n,); None if it has no proposals."""
     number = len(scenes.start)
     if not hasattr(agent.policy, "propose"):
         return None
@@ -142,10 +142,10 @@ def proposals(policy: Any, observation: Mapping[str, NDArray[Any]]) -> NDArray[n
     return np.take_along_axis(actions, best[..., None], axis=1).astype(np.float64)
 
 
-def write(failures: Failures, folder: Path, env_id: str, **env_kwargs: Any) -> list[Path]:
+def write_failures(failures: Failures, folder: Path, env_id: str, **env_kwargs: Any) -> list[Path]:
     """Write the table of counts as Markdown and JSON, and a page of pictures for each kind that occurs.
 
-    The pictures of a kind are spread from its deepest collision to its mildest.
+    The pictures of a kind range from its deepest collision to its shallowest.
     """
     folder.mkdir(parents=True, exist_ok=True)
     table = markdown(failures.counts(), len(failures.rows), len(failures.frozen.share))
@@ -158,16 +158,16 @@ def write(failures: Failures, folder: Path, env_id: str, **env_kwargs: Any) -> l
         if len(mine):
             ordered = mine[np.argsort(-failures.depth[mine], kind="stable")]
             chosen = ordered[
-                np.unique(np.linspace(0, len(mine) - 1, min(PICTURES, len(mine))).round().astype(int))
+                np.unique(np.linspace(0, len(mine) - 1, min(MAX_PICTURES, len(mine))).round().astype(int))
             ]
             entries = _entries(failures, chosen, env_id, env_kwargs)
-            heading = f"{kind.words}: {len(mine)} of {len(failures.rows)} failures"
+            heading = f"{kind.description}: {len(mine)} of {len(failures.rows)} failures"
             written.append(gallery(folder / f"{kind.name}.png", entries, heading=heading))
     return written
 
 
 def markdown(counts: Mapping[str, Any], failures: int, scenes: int) -> str:
-    """The table of counts."""
+    """Return the table of counts as Markdown."""
     lines = [
         ["kind", "failures", "of all scenes", *(f"share {band}" for band in BANDS), "another succeeds"],
         ["---", *["---:"] * (3 + len(BANDS))],
@@ -177,7 +177,7 @@ def markdown(counts: Mapping[str, Any], failures: int, scenes: int) -> str:
         another = "-" if each["another"] is None else str(each["another"])
         numbers = [str(each["by_band"][band]) for band in BANDS]
         part = f"{100.0 * each['count'] / scenes:.1f} %" if scenes else "-"
-        lines.append([kind.words, str(each["count"]), part, *numbers, another])
+        lines.append([kind.description, str(each["count"]), part, *numbers, another])
     lines.append(
         ["all", str(failures), f"{100.0 * failures / scenes:.1f} %" if scenes else "-", *_sums(counts)]
     )
@@ -185,7 +185,7 @@ def markdown(counts: Mapping[str, Any], failures: int, scenes: int) -> str:
 
 
 def _sums(counts: Mapping[str, Any]) -> Sequence[str]:
-    """The last columns of all kinds together."""
+    """Return the last columns of all kinds together."""
     every = list(counts.values())
     bands = [str(sum(each["by_band"][band] for each in every)) for band in BANDS]
     return [
@@ -197,7 +197,7 @@ def _sums(counts: Mapping[str, Any]) -> Sequence[str]:
 def _entries(
     failures: Failures, chosen: NDArray[np.int64], env_id: str, env_kwargs: Mapping[str, Any]
 ) -> list[Entry]:
-    """Some of the failures, made again to be drawn."""
+    """Simulate some of the failures again and return them as entries of a gallery."""
     env = gym.make(env_id, **env_kwargs)
     inner: Any = env.unwrapped
     entries = []

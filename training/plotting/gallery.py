@@ -1,4 +1,4 @@
-"""Many movements on one page."""
+"""Gallery of movements on one page."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from viapoint.envs.sim.executor import Rollout
 from viapoint.training.plotting.top_view import draw_movement
 
 TILE = 2.6
-"""Width of one picture, [inches]."""
+"""Width of one picture, [inch]."""
 RESOLUTION = 110
-"""[dots per inch]"""
+"""Resolution, [dots per inch]."""
 VIEW = ((-0.53, 0.45), (-0.09, 0.75))
-"""[m]"""
+"""Limits of x and y, [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One movement of a gallery."""
+    """Movement of a gallery."""
 
     arm: Arm
     scene: Scenes
@@ -36,14 +36,14 @@ class Entry:
     """One row."""
     rollout: Rollout
     title: str
-    """What is said about it besides its outcome, such as the difficulty of the scene."""
+    """Text beside the outcome, such as the difficulty of the scene."""
     success: bool
     whole_arm: bool = False
-    """Whether the links can touch obstacles, too."""
+    """True where the links can touch obstacles, too."""
 
     @property
     def outcome(self) -> str:
-        """In a word."""
+        """Outcome in one word."""
         if self.success:
             return "success"
         return "collision" if self.rollout.contact.any() else "missed"
@@ -53,13 +53,13 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
     """Draw movements in a grid, each titled with its outcome, and save the page as a PNG.
 
     Args:
-        path: Of the picture; its folder must exist.
+        path: PNG file; its folder must exist.
         entries: One or more movements.
         columns: Pictures in a row.
-        heading: Above all of them.
+        heading: Heading of the page.
 
     Raises:
-        ValueError: There is nothing to draw, or no column to draw it in.
+        ValueError: There is no entry or no column.
     """
     if not entries:
         raise ValueError("entries must hold at least one movement")
@@ -90,14 +90,19 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
 
 
 def _legend(figure: Figure, columns: int) -> None:
-    """What the colours mean, once for all."""
-    kinds = {
+    """Add the legend of the page."""
+    styles = {
         "planned": Line2D([], [], color=PALETTE.plan, linewidth=4),
         "executed": Line2D([], [], color=PALETTE.executed, linewidth=1.6),
         "via-point": Line2D([], [], color=PALETTE.via, marker="o", linestyle="none", markersize=5),
         "goal": Line2D([], [], color=PALETTE.goal, marker="o", linestyle="none", markersize=5),
         "contact": Line2D([], [], color=PALETTE.contact, marker="x", linestyle="none", markersize=5),
     }
-    handles, labels = list(kinds.values()), list(kinds)
-    across = 5 if columns > 1 else 3
-    figure.legend(handles, labels, loc="outside lower center", ncols=across, fontsize=8, frameon=False)
+    figure.legend(
+        list(styles.values()),
+        list(styles),
+        loc="outside lower center",
+        ncols=5 if columns > 1 else 3,
+        fontsize=8,
+        frameon=False,
+    )

@@ -19,7 +19,7 @@ AXES = (
     ("simulated_seconds", "simulated minutes", 1 / 60),
     ("seconds", "minutes of training", 1 / 60),
 )
-"""What the learning curve is drawn against: key of the record, label, scale; a key that a record lacks is left out."""
+"""Axes of the learning curve: key of the record, label, scale; keys that a record lacks are left out."""
 
 
 def learning_curve(
@@ -28,12 +28,12 @@ def learning_curve(
     """Draw success on the validation scenes against decisions, simulated and training time, with its Wilson band.
 
     Args:
-        path: Of the picture, PNG.
-        curves: Records of a run's learning curve, by the label of the run.
-        ceiling: Success of the planner, drawn as a dashed line.
+        path: PNG file.
+        curves: Records of the learning curve of each run, by its label.
+        ceiling: Success rate of the planner, drawn as a dashed line.
 
     Raises:
-        ValueError: There is no record to draw.
+        ValueError: There is no record.
     """
     if not any(curves.values()):
         raise ValueError("there is no learning curve to draw: the run was never evaluated")
@@ -57,7 +57,7 @@ def learning_curve(
         ax.set_xlabel(label)
         ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 102.0)
-        _tidy(ax)
+        style_axes(ax)
     axes[0].set_ylabel("success on validation scenes [%]\nband: 95 % Wilson interval")
     axes[-1].legend(frameon=False, loc="lower right")
     return _save(figure, path)
@@ -67,15 +67,16 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
     """Draw each method's success by the difficulty of the scenes, with Wilson intervals.
 
     Args:
-        path: Of the picture, PNG.
-        record: Of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json`.
+        path: PNG file.
+        record: Record of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json`.
     """
     summaries = record["methods"]
     figure = Figure(figsize=(8.0, 3.8), layout="constrained")
     ax = figure.subplots()
     width = 0.8 / len(summaries)
     for i, (name, summary) in enumerate(summaries.items()):
-        shown = [(j, summary["success_by_band"][band]) for j, band in enumerate(BANDS) if _has(summary, band)]
+        bands = summary["success_by_band"]
+        shown = [(j, bands[band]) for j, band in enumerate(BANDS) if band in bands]
         x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
         rate, low, high = (
             100.0 * np.array([each[part] for _, each in shown]) for part in ("rate", "low", "high")
@@ -87,15 +88,12 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
     ax.set_ylabel("success [%]")
     ax.set_ylim(0.0, 102.0)
     ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    _tidy(ax)
+    style_axes(ax)
     return _save(figure, path)
 
 
-def _has(summary: Mapping[str, Any], band: str) -> bool:
-    return band in summary["success_by_band"]
-
-
-def _tidy(ax: Any) -> None:
+def style_axes(ax: Any) -> None:
+    """Remove the upper and right spines and draw horizontal grid lines."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(axis="y", color="0.9")
     ax.set_axisbelow(True)

@@ -1,4 +1,4 @@
-"""Scenes and movements seen from above, drawn with Matplotlib: for figures, and where there is no OpenGL."""
+"""Top view of scenes and movements with Matplotlib, for figures and for machines without OpenGL."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
 
 VIEW = ((-0.56, 0.48), (-0.14, 0.90))
-"""What is seen of the plane, (x, y), [m]."""
+"""Limits of x and y, [m]."""
 GOAL_RADIUS, START_RADIUS = 0.026, 0.018
-"""[m]"""
+"""Radii of the drawn circles, [m]."""
 
 
 def draw_movement(
@@ -35,19 +35,19 @@ def draw_movement(
     view: tuple[tuple[float, float], tuple[float, float]] = VIEW,
     scale: float = 1.0,
 ) -> None:
-    """Draw a scene and, where given, what was planned and what was done in it.
+    """Draw a scene and, if given, a plan and its execution.
 
     Args:
-        axes: What to draw on; its frame and ticks are taken away.
-        arm: The arm.
-        scene: One row.
-        plan: One row: the planned path and its via-points.
-        rollout: The executed path, the first contact, and the posture there or at the end.
-        whole_arm: Whether the links can touch obstacles, too.
-        step: Draw the movement up to this state only, 0 being the start; None is all of it.
-        arm_shown: Whether to draw the arm.
+        axes: Axes to draw on; their frame and ticks are removed.
+        arm: Arm of the task.
+        scene: One scene.
+        plan: One plan, drawn as its path and via-points.
+        rollout: Its execution, drawn as the path, the first contact, and the posture there or at the end.
+        whole_arm: True where the links can touch obstacles, too.
+        step: Last state that is drawn, 0 for the start; None for the whole movement.
+        arm_shown: False to leave out the arm.
         view: Limits of x and y, [m].
-        scale: Factor on the widths of lines.
+        scale: Factor on line widths.
     """
     _prepare(axes, view)
     _draw_ends(axes, scene, scale)
@@ -57,7 +57,7 @@ def draw_movement(
     if plan is not None and rollout is not None:
         movement = Movement.of(CollisionModel(arm, whole_arm), scene, plan, rollout)
         last = len(movement.hand) - 1 if step is None else step
-        _draw_done(axes, movement, last, scale)
+        _draw_execution(axes, movement, last, scale)
         touch = movement.touch if movement.touch is not None and last >= movement.touch.step else None
         pose = touch.step if touch is not None and step is None else last
         joints, hand = movement.joints[pose], movement.hand[pose]
@@ -71,7 +71,7 @@ def draw_movement(
 
 
 def capsule(first: Float, second: Float, radius: float) -> Float:
-    """Outline of a capsule in the plane, shape (66, 2), [m]."""
+    """Return the outline of a capsule in the plane, shape (66, 2), [m]."""
     along = np.arctan2(*(second - first)[1::-1]) if np.any(first != second) else 0.0
     angle = along + np.linspace(-np.pi / 2, np.pi / 2, 33)
     arc = radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
@@ -89,7 +89,7 @@ def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) 
 
 
 def _draw_obstacles(axes: Axes, arm: Arm, scene: Scenes, touched: int | None) -> None:
-    """The footprints, with a rim as wide as the hand's radius: where the hand's centre must not go."""
+    """Draw footprints with a rim of the hand's radius, which the centre of the hand must not enter."""
     for row in np.flatnonzero(scene.present[0]):
         numbers = scene.obstacles[0, row]
         centre, half_axis = numbers[: arm.dimension], numbers[arm.dimension : 2 * arm.dimension]
@@ -110,7 +110,7 @@ def _draw_ends(axes: Axes, scene: Scenes, scale: float) -> None:
 
 
 def _draw_plan(axes: Axes, plan: Plan, scale: float) -> None:
-    """The planned path with its via-points, wide enough to show as a rim of the executed one."""
+    """Draw the planned path and its via-points, wide enough to show as a rim of the executed path."""
     single = Plan(np.asarray(plan.waypoints).reshape(-1, plan.waypoints.shape[-1]), np.ravel(plan.durations))
     path = np.asarray(single.trajectory()(np.linspace(0.0, float(single.durations.sum()), 121)))
     axes.plot(*path[:, :2].T, color=PALETTE.plan, linewidth=4.6 * scale, solid_capstyle="round", zorder=4)
@@ -120,16 +120,16 @@ def _draw_plan(axes: Axes, plan: Plan, scale: float) -> None:
     )  # fmt: skip
 
 
-def _draw_done(axes: Axes, movement: Movement, step: int, scale: float) -> None:
-    """The executed path up to a step, red from contact on."""
+def _draw_execution(axes: Axes, movement: Movement, step: int, scale: float) -> None:
+    """Draw the executed path up to a step, red after contact."""
     free = step if movement.touch is None else min(step, movement.touch.step)
     for first, last, colour in ((0, free, PALETTE.executed), (free, step, PALETTE.contact)):
-        done = movement.hand[first : last + 1, :2]
-        axes.plot(*done.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
+        executed = movement.hand[first : last + 1, :2]
+        axes.plot(*executed.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
 
 
 def _draw_arm(axes: Axes, arm: Arm, joints: Float, *, above: bool) -> None:
-    """The links, see-through where they pass above everything else."""
+    """Draw the links, transparent where they pass above the obstacles."""
     for (first, second), radius in zip(np.asarray(arm.links(joints)), arm.link_radii, strict=True):
         outline = capsule(first[:2], second[:2], radius)
         alpha = 0.38 if above else 0.75
@@ -139,7 +139,7 @@ def _draw_arm(axes: Axes, arm: Arm, joints: Float, *, above: bool) -> None:
 
 
 def _draw_contact(axes: Axes, touch: Touch, scale: float) -> None:
-    """A cross where the arm first touched an obstacle."""
+    """Draw a cross at the first contact."""
     for colour, size, width in (("white", 10.5, 4.4), (PALETTE.contact, 9.5, 2.4)):
         (cross,) = axes.plot(*_xy(touch.place), "x", color=colour, zorder=8)
         cross.set(markersize=size * scale, markeredgewidth=width * scale)

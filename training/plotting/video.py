@@ -1,4 +1,4 @@
-"""Films of several movements, each with a line that says what came of it."""
+"""Videos of several movements with captions of their outcomes."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from viapoint.training.plotting.top_view import draw_movement
 Decide = Callable[[Observation, Scenes], Any]
 
 CAPTION = 48
-"""Height of the line below the picture, [pixels]."""
+"""Height of the caption below the picture, [pixels]."""
 BLOCK = 16
-"""Encoders want sides that are multiples of this, [pixels]."""
+"""Encoders need sides that are multiples of this, [pixels]."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film:
-    """What was filmed."""
+class Video:
+    """Video file with its properties."""
 
     path: Path
     frames: int
-    """How many there are."""
+    """Number of frames."""
     rendered: bool
-    """Whether by OpenGL; if not, it is drawn."""
+    """True if rendered with OpenGL, False if drawn from above."""
 
     def __str__(self) -> str:
-        """Where it is, and what it lacks."""
-        return f"{self.path}" if self.rendered else f"{self.path} (drawn from above, for want of OpenGL)"
+        """Return the path, with a note if OpenGL is missing."""
+        return f"{self.path}" if self.rendered else f"{self.path} (drawn from above: OpenGL is not available)"
 
 
-def film(
+def record_video(
     path: str | Path,
     env: gym.Env[Any, Any],
     scenes: Scenes,
@@ -58,23 +58,22 @@ def film(
     name: str = "agent",
     speed: float = 0.5,
     pause: float = 0.8,
-) -> Film:
-    """Film one movement in each scene and save it as an MP4.
+) -> Video:
+    """Record one movement in each scene as an MP4.
 
-    Without an OpenGL library the movements are drawn as seen from above, and one line is logged that says so
-    and names the package to install.
+    Without an OpenGL library the movements are drawn from above, and one warning names the package to install.
 
     Args:
-        path: Of the film; its folder must exist.
-        env: An environment made with `render_mode="rgb_array_list"`.
-        scenes: N of them, of no more obstacles than the environment has rows.
-        decide: Observation and scene, of one row each, to actions, shape (1, m): a method of the table.
-        name: Who decides, for the line below the picture.
-        speed: Of the film relative to real time.
-        pause: How long each result stays, [s].
+        path: MP4 file; its folder must exist.
+        env: Environment made with `render_mode="rgb_array_list"`.
+        scenes: Scenes with no more obstacles than the environment has rows.
+        decide: Function from observation and scene, of one row each, to actions, shape (1, m).
+        name: Name of the method, for the caption.
+        speed: Speed of the video relative to real time.
+        pause: Time for which each result stays, [s].
 
     Raises:
-        ValueError: The path is of another kind, the environment renders otherwise, or there is nothing to film.
+        ValueError: The path has another suffix, the environment has another render mode, or there is no scene.
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
@@ -90,11 +89,11 @@ def film(
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
-    return Film(path=path, frames=count, rendered=camera.rendered)
+    return Video(path=path, frames=count, rendered=camera.rendered)
 
 
 def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: float) -> Iterator[Frame]:
-    """The frames of a movement in each scene, and at its end of a pause [s of the movement's time]."""
+    """Yield the frames of a movement in each scene and of a pause after it, [s] of the movement's time."""
     number = len(scenes.start)
     for i in range(number):
         scene = scenes.take([i])
@@ -105,11 +104,13 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: fl
             observation, _, terminated, truncated, info = camera.env.step(action.astype(np.float32))
             over = terminated or truncated
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        yield from _with_captions(camera.frames(scene), left, *verdict(info), hold=round(pause * camera.fps))
+        yield from _with_captions(
+            camera.frames(scene), left, *describe_outcome(info), hold=round(pause * camera.fps)
+        )
 
 
 def _write(path: Path, frames: Iterator[Frame], fps: float) -> int:
-    """Encode frames of equal size; how many there were."""
+    """Encode frames of equal size and return their number."""
     first = next(frames)
     height, width = first.shape[:2]
     writer = imageio_ffmpeg.write_frames(
@@ -127,8 +128,8 @@ def _write(path: Path, frames: Iterator[Frame], fps: float) -> int:
     return count
 
 
-def verdict(info: dict[str, Any]) -> tuple[str, Colour]:
-    """What came of a movement in a few words, and their colour."""
+def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:
+    """Return the outcome of a movement in a few words, and their colour."""
     if info["is_success"]:
         return f"success   clearance {1e3 * info['min_clearance']:.0f} mm", PALETTE.goal
     if not info["reachable"]:
@@ -139,23 +140,23 @@ def verdict(info: dict[str, Any]) -> tuple[str, Colour]:
 
 
 class Camera:
-    """Takes the frames of an environment's last movement, by OpenGL where there is one."""
+    """Source of the frames of an environment's last movement, rendered with OpenGL if available."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self.env = env
         self.fps = float(env.metadata["render_fps"])
         self.rendered = True
-        """Whether OpenGL has worked so far."""
+        """False once OpenGL has failed."""
 
     def frames(self, scene: Scenes) -> Iterator[Frame]:
-        """The frames of the last movement, which took place in `scene`, each of shape (height, width, 3)."""
+        """Yield the frames of the last movement, which took place in `scene`, each of shape (height, width, 3)."""
         if self.rendered:
             try:
                 yield from self.env.render()  # type: ignore[misc]
                 return
             except GLUnavailableError as error:
                 self.rendered = False
-                log.warning("the film shows a drawn view from above: %s", error)
+                log.warning("the video shows a drawn view from above: %s", error)
         yield from self._drawn(scene)
 
     def _drawn(self, scene: Scenes) -> Iterator[Frame]:
@@ -176,7 +177,7 @@ class Camera:
 def _with_captions(
     frames: Iterator[Frame], left: str, right: str, colour: Colour, *, hold: int
 ) -> Iterator[Frame]:
-    """Frames with a line below, which says the result once the movement is over, and the last one held."""
+    """Yield frames with a caption, which shows the result after the movement, and hold the last one."""
     before = after = frame = None
     for frame in frames:
         before = _caption(frame.shape[1], left, "", colour) if before is None else before
@@ -188,7 +189,7 @@ def _with_captions(
 
 
 def _caption(width: int, left: str, right: str, colour: Colour) -> Frame:
-    """The line below a picture, shape (CAPTION, width, 3)."""
+    """Return the caption of a picture, shape (CAPTION, width, 3)."""
     image = Image.new("RGB", (width, CAPTION), "white")
     pen = ImageDraw.Draw(image)
     size = max(10, min(16, width // 30))
@@ -200,7 +201,7 @@ def _caption(width: int, left: str, right: str, colour: Colour) -> Frame:
 
 
 def _stacked(frame: Frame, caption: Frame) -> Frame:
-    """Picture over caption, cut to what encoders accept."""
+    """Stack a picture on its caption, cut to the sizes that encoders accept."""
     whole = np.concatenate((frame, caption))
     height, width = (side - side % BLOCK if side >= BLOCK else side for side in whole.shape[:2])
     return whole[whole.shape[0] - height :, :width]

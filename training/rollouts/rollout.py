@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -18,24 +18,30 @@ from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
 class Trials(NamedTuple):
-    """What came of N actions, shape (N,) each."""
+    """Results of N simulated actions or episodes, shape (N,) each."""
 
     reward: Float
     info: dict[str, NDArray[Any]]
 
     @property
     def success(self) -> NDArray[np.bool_]:
-        """Which of them succeeded."""
+        """Mask of the successful ones."""
         return np.asarray(self.info["is_success"], dtype=bool)
+
+    @classmethod
+    def concatenate(cls, pieces: Sequence[Trials]) -> Trials:
+        """Join the results of several batches."""
+        info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
+        return cls(np.concatenate([piece.reward for piece in pieces]), info)
 
 
 class Trial:
-    """Simulates actions in given scenes, `num_envs` at a time.
+    """Simulation of actions in given scenes, `num_envs` at a time.
 
     Args:
-        env_id: Of a registered environment.
-        num_envs: Simulated together at most.
-        **kwargs: Of the environment.
+        env_id: Id of a registered environment.
+        num_envs: Greatest number of scenes that are simulated together.
+        **kwargs: Arguments of the environment.
     """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
@@ -50,69 +56,69 @@ class Trial:
         self._capacity = num_envs
 
     def draw(self, number: int, seed: int) -> Any:
-        """As many scenes as wanted; the same for the same seed."""
+        """Sample scenes of the task, the same ones for the same seed."""
         return self.task.sampler()([np.random.default_rng(seed)] * number)
 
-    def observe(self, scenes: Scenes) -> dict[str, NDArray[np.float32]]:
-        """First observations in N scenes, without a simulation."""
+    def observe(self, scenes: Scenes) -> Observation:
+        """Return first observations in N scenes, without a simulation."""
         joints = np.asarray(self.task.arm.inverse_kinematics(scenes.start))
         return self.task.observation.observe(joints, scenes.start, scenes)
 
     def __call__(self, scenes: Scenes, actions: Float) -> Trials:
-        """Simulate one action in each of N scenes, one or more."""
-        return self._try(scenes, (actions,), lambda env, some: env.execute_actions(some))
+        """Simulate one action in each of N scenes, N at least 1."""
+        return self._simulate(scenes, (actions,), lambda env, some: env.execute_actions(some))
 
-    def play(self, method: Any, scenes: Scenes, decided: Float) -> Trials:
-        """Simulate what a method has decided in N scenes, or let it do so itself where it can."""
-        trials: Trials = getattr(method, "execute", self)(scenes, decided)
+    def play(self, method: Any, scenes: Scenes, decisions: Float) -> Trials:
+        """Simulate the decisions of a method in N scenes, by its own `execute` if it has one."""
+        trials: Trials = getattr(method, "execute", self)(scenes, decisions)
         return trials
 
     def execute_plan(self, scenes: Scenes, plan: Plan) -> Trials:
-        """Simulate one plan in each of N scenes, one or more; plans may have any number of via-points."""
-        return self._try(scenes, plan, lambda env, *some: env.execute_plan(Plan(*some)))
+        """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
+        return self._simulate(scenes, plan, lambda env, *some: env.execute_plan(Plan(*some)))
 
-    def _try(self, scenes: Scenes, what: tuple[Float, ...], act: Callable[..., Decision]) -> Trials:
-        """As many at a time as there are environments; those left over repeat the first."""
+    def _simulate(self, scenes: Scenes, arrays: tuple[Float, ...], act: Callable[..., Decision]) -> Trials:
         pieces = []
-        for i in range(0, len(what[0]), self._capacity):
-            some = slice(i, i + self._capacity)
-            number = len(what[0][some])
-            size = next(size for size in self._envs if size >= number)
-            env = self._envs[size]
-            filled = Scenes(*(repeated(field, size) for field in scenes.take(some)))
-            env.reset(options=filled.as_options())
-            _, reward, info = act(env, *(repeated(part[some], size) for part in what))
+        for rows, env in self._groups(len(arrays[0])):
+            env.reset(options=_filled(scenes.take(rows), env.num_envs).as_options())
+            _, reward, info = act(env, *(repeated(each[rows], env.num_envs) for each in arrays))
+            number = rows.stop - rows.start
             pieces.append(Trials(reward[:number], {name: value[:number] for name, value in info.items()}))
-        info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
-        return Trials(np.concatenate([piece.reward for piece in pieces]), info)
+        return Trials.concatenate(pieces)
+
+    def _groups(self, number: int) -> Iterator[tuple[slice, Any]]:
+        """Yield rows of scenes with the smallest vector environment that takes them."""
+        for first in range(0, number, self._capacity):
+            rows = slice(first, min(first + self._capacity, number))
+            yield rows, self._envs[next(size for size in self._envs if size >= rows.stop - rows.start)]
 
     def close(self) -> None:
-        """Let the environments go."""
+        """Close the environments."""
         for env in self._envs.values():
             env.close()
 
 
 def repeated(values: Float, number: int) -> Float:
-    """The first repeated at the end until there are `number`."""
+    """Return values padded with copies of the first row to `number` rows."""
     return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))
 
 
 class OnlineTrial(Trial):
-    """Plays whole episodes in given scenes, `num_envs` at a time.
+    """Simulation of whole episodes in given scenes, `num_envs` at a time.
 
     Args:
-        env_id: Of a registered environment whose plans are revised.
-        num_envs: Simulated together at most.
-        **kwargs: Of the environment.
+        env_id: Id of a registered environment with replanning.
+        num_envs: Greatest number of scenes that are simulated together.
+        **kwargs: Arguments of the environment.
     """
 
     @property
     def time_limit(self) -> float:
-        """Of an episode, [s]."""
+        """Time limit of an episode, [s]."""
         return float(self._envs[self._capacity].time_limit)  # type: ignore[attr-defined]
 
     def draw(self, number: int, seed: int) -> ChangingScenes:
-        """As many scenes as wanted; the same for the same seed."""
+        """Sample scenes of the task, the same ones for the same seed."""
         env: Any = self._envs[min(self._envs)]
         pieces = []
         for first in range(0, number, env.num_envs):
@@ -122,57 +128,47 @@ class OnlineTrial(Trial):
         return together.take(slice(0, number))
 
     def observe(self, scenes: Any) -> Observation:
-        """First observations in N scenes."""
+        """Return first observations in N scenes."""
         pieces: list[Observation] = []
-        for some, env in self._groups(scenes):
-            observation, _ = env.reset(options=_filled(some, env.num_envs).as_options())
-            pieces.append({name: part[: len(some.start)] for name, part in observation.items()})
+        for rows, env in self._groups(len(scenes.start)):
+            observation, _ = env.reset(options=_filled(scenes.take(rows), env.num_envs).as_options())
+            pieces.append({name: part[: rows.stop - rows.start] for name, part in observation.items()})
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def __call__(self, scenes: Any, actions: Float) -> Trials:
-        """Begin with one action in each of N scenes; the zero action follows at every later decision."""
-        return self._played(scenes, actions, None)
+        """Play episodes that begin with one action in each of N scenes; all later actions are zero."""
+        return self._play(scenes, actions, None)
 
     def first(self, scenes: Any, actions: Float) -> Trials:
-        """One decision in each of N scenes, and none that follows."""
-        return self._played(scenes, actions, None, once=True)
+        """Simulate one decision in each of N scenes."""
+        return self._play(scenes, actions, None, single_decision=True)
 
-    def play(self, method: Any, scenes: Any, decided: Float) -> Trials:
-        """Begin with what a method has decided in N scenes, and ask it again at every later decision."""
+    def play(self, method: Any, scenes: Any, decisions: Float) -> Trials:
+        """Play episodes that begin with the decisions of a method; it makes every later decision, too."""
         if hasattr(method, "execute"):
-            own: Trials = method.execute(scenes, decided)
-            return own
-        return self._played(scenes, decided, method)
+            return super().play(method, scenes, decisions)
+        return self._play(scenes, decisions, method)
 
-    def _played(self, scenes: Any, decided: Float, method: Any, *, once: bool = False) -> Trials:
-        pieces, done = [], 0
-        for some, env in self._groups(scenes):
-            number = len(some.start)
-            pieces.append(_episodes(env, some, decided[done : done + number], method, once=once))
-            done += number
-        info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
-        return Trials(np.concatenate([piece.reward for piece in pieces]), info)
-
-    def _groups(self, scenes: Any) -> list[tuple[Any, Any]]:
-        """Scenes, as many at a time as there are environments, with those that take them."""
-        groups = []
-        for first in range(0, len(scenes.start), self._capacity):
-            some = scenes.take(slice(first, first + self._capacity))
-            groups.append((some, self._envs[next(size for size in self._envs if size >= len(some.start))]))
-        return groups
+    def _play(self, scenes: Any, actions: Float, method: Any, *, single_decision: bool = False) -> Trials:
+        return Trials.concatenate(
+            [
+                _episodes(env, scenes.take(rows), actions[rows], method, single_decision)
+                for rows, env in self._groups(len(scenes.start))
+            ]
+        )
 
 
 def new_trial(env_id: str, num_envs: int = 512, **kwargs: Any) -> Trial:
-    """A trial of the kind that an environment needs."""
+    """Return the simulation that an environment needs: of actions, or of whole episodes with replanning."""
     return (OnlineTrial if env_id in ONLINE_TASKS else Trial)(env_id, num_envs, **kwargs)
 
 
-def _episodes(env: Any, scenes: Any, decided: Float, method: Any, *, once: bool) -> Trials:
-    """Play one episode in each scene to its end; environments that are done go on with others, which do not count."""
-    number, size = len(decided), env.num_envs
+def _episodes(env: Any, scenes: Any, first_actions: Float, method: Any, single_decision: bool) -> Trials:
+    """Play one episode in each scene; environments that have ended go on with others, which do not count."""
+    number, size = len(first_actions), env.num_envs
     env.reset(options=_filled(scenes, size).as_options())
-    actions, running, reward = repeated(decided, size), np.arange(size) < number, np.zeros(number)
-    kept: dict[str, NDArray[Any]] = {}
+    actions, running, reward = repeated(first_actions, size), np.arange(size) < number, np.zeros(number)
+    last: dict[str, NDArray[Any]] = {}
     decisions = np.zeros(number)
     while running.any():
         now = running[:number].copy()
@@ -180,15 +176,16 @@ def _episodes(env: Any, scenes: Any, decided: Float, method: Any, *, once: bool)
         reward += np.where(now, earned[:number], 0.0)
         decisions += now
         for name in (name for name in info if not name.startswith(("_", "final_"))):
-            kept[name] = np.where(now, info[name][:number], kept.get(name, info[name][:number]))
-        running &= ~(terminated | truncated | once)
+            last[name] = np.where(now, info[name][:number], last.get(name, info[name][:number]))
+        running &= ~(terminated | truncated | single_decision)
         actions, rows = np.zeros_like(actions), np.flatnonzero(running)
         if method is not None and rows.size:
             seen = {name: part[rows] for name, part in observation.items()}
             actions[rows] = method.decide(seen, scenes.take(rows))
-    kept["decisions"], kept["duration"] = decisions, kept["time"]
-    return Trials(reward, kept)
+    last["decisions"], last["duration"] = decisions, last["time"]
+    return Trials(reward, last)
 
 
 def _filled(scenes: Any, number: int) -> Any:
+    """Return scenes padded with copies of the first one to `number`."""
     return type(scenes)(*(repeated(field, number) for field in scenes))

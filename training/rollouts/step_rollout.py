@@ -1,4 +1,4 @@
-"""Agents that act in every control step, measured beside those that decide once."""
+"""Rollouts of agents that act in every control step."""
 
 from __future__ import annotations
 
@@ -18,26 +18,32 @@ from viapoint.training.rollouts.rollout import Trials
 
 
 def is_step_wise(env_id: str) -> bool:
-    """Whether an action lasts one control step only."""
+    """Return whether an action of an environment lasts one control step only."""
     return env_id in STEP_TASKS
 
 
 def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Id and keyword arguments of the task in which one action is a whole movement; of most, themselves."""
+    """Return id and arguments of the equivalent task with whole movements as actions; of most tasks, their own."""
     if not is_step_wise(env_id):
         return env_id, dict(kwargs)
-    known = {name: value for name, value in kwargs.items() if name != "control_step"}
-    if isinstance(known.get("reward_weights"), Mapping):
-        weights = known["reward_weights"]
-        known["reward_weights"] = {name: value for name, value in weights.items() if name != "progress"}
-    return twin_of(env_id), known
+    shared = {name: value for name, value in kwargs.items() if name != "control_step"}
+    if isinstance(shared.get("reward_weights"), Mapping):
+        weights = shared["reward_weights"]
+        shared["reward_weights"] = {name: value for name, value in weights.items() if name != "progress"}
+    return twin_of(env_id), shared
 
 
 class StepAgentMethod:
-    """A trained agent that acts in every control step, in environments of its own.
+    """Trained agent that acts in every control step, in environments of its own.
 
-    What it decides is the first action; the rest follows while it is carried out. A decision time is that of one
-    control step, of which a movement has some twenty.
+    A decision is the first action; the others follow during the simulation. The decision time is that of one control
+    step, of which a movement has about twenty.
+
+    Args:
+        name: Name in tables of results.
+        model: Model with `predict`.
+        env_id: Id of a step-wise environment.
+        env_kwargs: Arguments of the environment.
     """
 
     def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
@@ -45,7 +51,7 @@ class StepAgentMethod:
         self._envs: dict[int, StepReachVectorEnv] = {}
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Actions for the next control step, shape (N, D), from observations of the step-wise task or its twin."""
+        """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
         if "time_left" not in observation:
             env: Any = self._env(len(scenes.start))
             rest, time = Motion.at_rest(scenes.start), np.zeros(len(scenes.start))
@@ -53,19 +59,19 @@ class StepAgentMethod:
         actions, _ = self._model.predict(observation, deterministic=True)
         return np.asarray(actions, dtype=np.float64)
 
-    def execute(self, scenes: Scenes, decided: Float) -> Trials:
-        """Begin with the actions that were decided and play every episode to its end."""
-        env = self._env(len(decided))
+    def execute(self, scenes: Scenes, decisions: Float) -> Trials:
+        """Play every episode to its end, beginning with the given actions."""
+        env = self._env(len(decisions))
         env.reset(options=scenes.as_options())
-        running, reward = np.ones(len(decided), dtype=bool), np.zeros(len(decided))
-        kept: dict[str, NDArray[Any]] = {}
+        running, reward = np.ones(len(decisions), dtype=bool), np.zeros(len(decisions))
+        last: dict[str, NDArray[Any]] = {}
         while running.any():
-            observation, earned, info = env.execute_actions(decided)
+            observation, earned, info = env.execute_actions(decisions)
             reward += np.where(running, earned, 0.0)
-            kept = {name: np.where(running, now, kept.get(name, now)) for name, now in info.items()}
+            last = {name: np.where(running, now, last.get(name, now)) for name, now in info.items()}
             running &= ~(env.terminated | env.truncated)
-            decided = self.decide(observation, scenes)
-        return Trials(reward, kept)
+            decisions = self.decide(observation, scenes)
+        return Trials(reward, last)
 
     def _env(self, number: int) -> StepReachVectorEnv:
         if number not in self._envs:

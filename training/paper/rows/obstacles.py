@@ -21,8 +21,8 @@ from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
 from viapoint.training.paper.reference_movements import construction, passage_share, smoothest
 from viapoint.training.paper.rows.timing import FAST, SLOW
 from viapoint.training.paper.simulated import Performed, perform
-from viapoint.training.planners.baselines import Method, PlannerMethod, agent_method
-from viapoint.training.planners.cma_planner import PlannerBudget
+from viapoint.training.planners.baselines import Method, agent_method
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.rollouts.rollout import Trial
 
 LENGTHS = (0.15, 0.2, 0.25)
@@ -103,7 +103,7 @@ def _method(agent: Path | None) -> tuple[Method, Trial]:
         found = load_agent(agent or DEFAULT_ENV)
         return agent_method("agent", found, 0), Trial(found.env_id, 256, **found.env_kwargs)
     trial = Trial(DEFAULT_ENV, 256)
-    return PlannerMethod(trial, budget=BUDGET), trial
+    return Planner(trial, budget=BUDGET), trial
 
 
 def _is_shipped() -> bool:
