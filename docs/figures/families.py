@@ -11,10 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.scenes.planar_hard import FAMILIES
+from viapoint.envs.scenes.families import scene_families
 from viapoint.training.plotting.top_view import draw_movement
 from viapoint.training.scene_sets.scene_set import load
 
+FAMILIES = [name for name, family in scene_families(2).items() if family.hard]
 TASKS = {"PlanarObstacles": "the hand must clear", "PlanarWholeArm": "every link must clear"}
 VIEW = ((-0.55, 0.45), (-0.10, 0.78))
 """[m]"""

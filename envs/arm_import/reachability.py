@@ -17,7 +17,7 @@ from viapoint.envs.arms.serial_arm import LIMIT_SHARE, SerialArm
 from viapoint.envs.common.types import Bool, Box, Float
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.scenes.config import SpaceDistribution
-from viapoint.envs.scenes.spatial import SpaceSampler
+from viapoint.envs.scenes.sampler import SceneSampler
 
 SPACING, SEARCH_RADIUS = 0.05, 0.45
 """Distance of the positions that are tried, and how far from home they lie, [m]."""
@@ -255,7 +255,7 @@ def check_room(arm: SerialArm, reach: Box) -> None:
         ValueError: The workspace is too small; the message has the workspace, the reach and the size of movements.
     """
     wanted = SpaceDistribution(n_obstacles=(0, 0))
-    sampler = SpaceSampler(CollisionModel(arm, whole_arm=True), wanted)
+    sampler = SceneSampler(CollisionModel(arm, whole_arm=True), wanted)
     try:
         sampler([np.random.default_rng(seed) for seed in range(ROOM_SCENES)])
     except RuntimeError:

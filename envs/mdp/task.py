@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +13,8 @@ from viapoint.envs.arms import REGISTER_HINT
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import RewardWeights
-from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.planar_hard import ATTEMPTS, FAMILIES, ROWS, FamilyObstacles
-from viapoint.envs.scenes.sampler import Sampler, SceneSampler
-from viapoint.envs.scenes.spatial import SpaceSampler
+from viapoint.envs.scenes.sampler import SceneSampler, sampler_of_family
 
 AnyDistribution = SceneDistribution | SpaceDistribution
 
@@ -42,10 +39,8 @@ class Task:
         """The layout of the observation."""
         return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
 
-    def sampler(self) -> Sampler:
-        """Draws scenes of the task."""
-        if isinstance(self.scenes, SpaceDistribution):
-            return SpaceSampler(self.collision_model, self.scenes)
+    def sampler(self) -> SceneSampler:
+        """Return a sampler of scenes of the task."""
         return SceneSampler(self.collision_model, self.scenes)
 
     def as_dict(self) -> dict[str, Any]:
@@ -82,24 +77,10 @@ def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 
-def family_sampler(task: Task, family: str) -> Sampler:
-    """Return a sampler of one family of scenes, planar or spatial as the task.
+def family_sampler(task: Task, family: str) -> SceneSampler:
+    """Return a sampler of one family of scenes for a task.
 
     Raises:
-        ValueError: There is no such family, or it takes more obstacles than the task has.
+        ValueError: There is no such family, or it needs more obstacles than the task has.
     """
-    scenes = task.scenes
-    in_plane = isinstance(scenes, SceneDistribution)
-    names: Iterable[str] = FAMILIES if in_plane else SPACE_FAMILIES
-    if family not in names:
-        raise ValueError(f"family must be one of {', '.join(names)}, got {family!r}")
-    needed = ROWS if in_plane else SPACE_FAMILIES[family]
-    if scenes.n_obstacles[1] < needed:
-        raise ValueError(
-            f"{family} needs a task with up to {needed} obstacles, this one has {scenes.n_obstacles[1]} at most"
-        )
-    if not isinstance(scenes, SceneDistribution):
-        return dataclasses.replace(task, scenes=dataclasses.replace(scenes, families=(family,))).sampler()
-    placer = FamilyObstacles(task.collision_model, scenes, FAMILIES[family])
-    distribution = dataclasses.replace(scenes, n_obstacles=(1, ROWS))
-    return SceneSampler(task.collision_model, distribution, placer=placer, attempts=ATTEMPTS)
+    return sampler_of_family(task.collision_model, task.scenes, family)

@@ -10,8 +10,8 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.scenes.draws import Uniforms, between
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
-from viapoint.envs.scenes.planar_draws import Uniforms, between
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, Scenes, rest_clearance
 
 CANDIDATES, ATTEMPTS = 8, 40

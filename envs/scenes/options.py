@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
-from viapoint.envs.scenes.sampler import Sampler
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
 
 GIVEN = ("start", "goal", "obstacles")
@@ -21,7 +21,7 @@ ATTEMPTS = 50
 
 
 def draw_given(
-    options: Mapping[str, Any], sampler: Sampler, generators: Sequence[np.random.Generator], n_rows: int
+    options: Mapping[str, Any], sampler: SceneSampler, generators: Sequence[np.random.Generator], n_rows: int
 ) -> Scenes:
     """N scenes with what `options` gives, and the rest drawn to fit.
 
@@ -64,7 +64,7 @@ def draw_given(
 
 def _drawn(
     options: Mapping[str, Any],
-    sampler: Sampler,
+    sampler: SceneSampler,
     generators: Sequence[np.random.Generator],
     given: Scenes,
 ) -> Scenes:

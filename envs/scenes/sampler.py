@@ -1,112 +1,253 @@
-"""Samplers of scenes."""
+"""Rejection sampling of scenes, in the plane and in space.
+
+In a scene, the straight movement hits an obstacle and the feasible path does not. Each scene has a random generator of
+its own and is a function of its numbers alone; attempts at all scenes are computed together.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.config import SceneDistribution
-from viapoint.envs.scenes.planar_arm import WholeArmObstacles
-from viapoint.envs.scenes.planar_draws import ENDS, WITNESSES, Uniforms, draw_ends, draw_witness
-from viapoint.envs.scenes.planar_hand import HandObstacles, ObstacleSampler
+from viapoint.envs.common.types import Float, Index, Int
+from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
+from viapoint.envs.scenes.draws import ObstacleSampler, Uniforms
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.feasible_path import DRAW_ORDER, DrawOrder, Ends, sample_ends, sample_paths
+from viapoint.envs.scenes.planar_families import FAMILY_ROWS
+from viapoint.envs.scenes.planar_obstacles import FamilyObstacles, HandObstacles, WholeArmObstacles
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.scenes.spatial_obstacles import SpatialObstacles
 
+Distribution = SceneDistribution | SpaceDistribution
 
-class Sampler(Protocol):
-    """Draws scenes for an arm, each from a generator of its own."""
-
-    collision_model: CollisionModel
-
-    def __call__(
-        self, generators: Sequence[np.random.Generator], ends: tuple[Float, Float] | None = None
-    ) -> Scenes:
-        """One scene from each generator.
-
-        Args:
-            generators: N random generators.
-            ends: Given starts and goals, shape (N, D) each, NaN where they are to be drawn, [m].
-
-        Raises:
-            RuntimeError: No scene was found in many attempts.
-        """
-
-
-ATTEMPTS = 200
+FAMILY_ATTEMPTS = 2000
+"""Attempts at a scene of a family in the plane; few of them succeed."""
+TOGETHER = 640
+"""Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
+SHARED_GROUPS = 8
+"""Groups of attempts at a scene that share the number :attr:`ObstacleSampler.fixed`."""
 
 
 class SceneSampler:
-    """Draws scenes for an arm, each from a generator of its own.
+    """Rejection sampler of scenes for an arm.
 
     Args:
-        collision_model: Arm that moves, and which of its bodies must clear.
-        distribution: What scenes are like.
-        placer: Puts the obstacles; by default as the distribution says.
-        attempts: After how many nothing is found.
+        collision_model: Arm that moves, and the bodies that must clear the obstacles.
+        distribution: Distribution of scenes, of the same dimension.
+        obstacles: Sampler of obstacles; by default that of the distribution.
+        order: Amounts of random numbers; by default those of the dimension.
     """
 
     def __init__(
         self,
         collision_model: CollisionModel,
-        distribution: SceneDistribution,
+        distribution: Distribution,
         *,
-        placer: ObstacleSampler | None = None,
-        attempts: int = ATTEMPTS,
+        obstacles: ObstacleSampler | None = None,
+        order: DrawOrder | None = None,
     ) -> None:
-        self.collision_model, self.distribution = collision_model, distribution
-        kind = WholeArmObstacles if collision_model.whole_arm else HandObstacles
-        self._placer = placer or kind(collision_model.arm, distribution)
-        self._attempts = attempts
+        self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
+        self._obstacles = obstacles or _obstacle_sampler(collision_model, distribution)
+        self._order = order or DRAW_ORDER[self.arm.dimension]
 
-    def __call__(
-        self, generators: Sequence[np.random.Generator], ends: tuple[Float, Float] | None = None
-    ) -> Scenes:
-        """One scene from each generator.
+    def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
+        """Sample one scene from each generator.
 
         Args:
             generators: N random generators.
-            ends: Given starts and goals, shape (N, D) each, NaN where they are to be drawn, [m].
+            ends: Given starts and goals, shape (N, D) each, NaN where they are sampled, [m].
 
         Raises:
-            RuntimeError: No scene was found in many attempts, as with given ends in a corner of the reach.
+            RuntimeError: No scene was found in many attempts, for example with given ends at the border of the reach.
         """
-        number, dimension = len(generators), self.collision_model.arm.dimension
+        number, dimension, fixed = len(generators), self.arm.dimension, self._obstacles.fixed
         scenes = Scenes(
             np.zeros((number, dimension)),
             np.zeros((number, dimension)),
-            np.zeros((number, self._placer.rows, 2 * dimension + 1)),
+            np.zeros((number, self._obstacles.rows, 2 * dimension + 1)),
         )
-        pending = np.arange(number)
-        for _ in range(self._attempts):
-            if not len(pending):
-                return scenes
-            drawn = Uniforms(np.stack([generators[int(i)].random(self._size) for i in pending]))
-            given = None if ends is None else (ends[0][pending], ends[1][pending])
-            found, attempt = self._attempt(drawn, given)
-            scenes.put(pending[found], attempt.take(found))
-            pending = pending[~found]
-        if not len(pending):
-            return scenes
-        raise RuntimeError(
-            f"no scene with {self.distribution.n_obstacles} obstacles was found in {self._attempts} attempts"
-            + ("" if ends is None else f" between start {ends[0][pending[0]]} and goal {ends[1][pending[0]]}")
+        pending, shared = np.arange(number), np.zeros(number)
+        if fixed is not None:
+            shared = np.array([each.random() for each in generators])
+        numbers = AttemptNumbers(generators, self._size, self._order)
+        while len(pending) and not numbers.exhausted:
+            made = numbers.made
+            u = numbers.draw(pending)
+            if fixed is not None:
+                sharing = max(sum(self._order.groups[:SHARED_GROUPS]) - made, 0)
+                u[:, :sharing, self._size - self._obstacles.size + fixed] = shared[pending, None]
+            first = self._attempts(u, pending, ends, scenes)
+            numbers.put_back(pending, first)
+            pending = pending[first < 0]
+        if len(pending):
+            raise RuntimeError(self._not_found(numbers.made, pending[0], ends))
+        return scenes
+
+    def _not_found(self, attempts: int, scene: int, ends: Ends) -> str:
+        where = (
+            f"between start {ends[0][scene]} and goal {ends[1][scene]}"
+            if ends is not None
+            else f"in the workspace {self.arm.workspace} m of {self.arm.name}; an arm of your own may need a larger "
+            "one, or fewer obstacles (n_obstacles)"
         )
+        n_obstacles = self.distribution.n_obstacles
+        return f"no scene with {n_obstacles} obstacles was found in {attempts} attempts {where}"
 
     @property
     def _size(self) -> int:
         """Uniform numbers of one attempt."""
-        return 4 * ENDS + 3 * WITNESSES + self._placer.size
+        ends = 2 * self.arm.dimension * self._order.n_ends
+        return ends + 3 * self._order.n_paths + self._obstacles.size
 
-    def _attempt(
-        self, uniforms: Uniforms, ends: tuple[Float, Float] | None
-    ) -> tuple[NDArray[np.bool_], Scenes]:
-        """Scenes, and which of them are good."""
-        d, arm = self.distribution, self.collision_model.arm
-        start, goal, good = draw_ends(uniforms, arm, d.distance, d.reach_margin, ends)
-        witness, reached = draw_witness(uniforms, self.collision_model, (start, goal), d.reach_margin)
-        obstacles, placed = self._placer(uniforms, witness)
-        return good & reached & placed, Scenes(start, goal, obstacles)
+    def _attempts(self, u: Float, pending: Int, ends: Ends, scenes: Scenes) -> Int:
+        """Store the scene of the first good attempt at each, and return which it was, shape (P,), -1 for none.
+
+        Args:
+            u: Uniform numbers, shape (P, attempts, .).
+            pending: Indices of the scenes, shape (P,).
+            ends: See :meth:`__call__`.
+            scenes: Array to store the scenes in.
+        """
+        rest, begin, good = np.arange(len(pending)), 0, np.full(len(pending), -1)
+        while begin < u.shape[1] and len(rest):
+            several = max(TOGETHER // len(rest), 1)
+            some = u[rest, begin : begin + several]
+            each = np.repeat(rest, some.shape[1])
+            where = pending[each]
+            given = None if ends is None else (ends[0][where], ends[1][where])
+            found, attempt = self._attempt(Uniforms(some.reshape(-1, self._size)), given)
+            solved, first = np.unique(each[found], return_index=True)
+            scenes.put(pending[solved], attempt.take(first))
+            good[solved] = begin + found[first] % some.shape[1]
+            rest, begin = np.flatnonzero(good < 0), begin + several
+        return good
+
+    def _attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
+        """Return the indices of good attempts and their scenes; each stage looks at the rows that are left."""
+        d, order, arm = self.distribution, self._order, self.arm
+        u = uniforms.take_table(order.n_ends, 2 * arm.dimension, by_column=order.by_column)
+        start, goal, good = sample_ends(u, arm, d.distance, d.steepness, d.reach_margin, ends)
+        rows = np.flatnonzero(good)
+        uniforms = uniforms.at(rows)
+        u = uniforms.take_table(order.n_paths, self._obstacles.path_numbers, by_column=order.by_column)
+        steered = self._obstacles.steered(uniforms, len(rows))
+        feasible, good = sample_paths(u, arm, start[rows], goal[rows], d.reach_margin, steered)
+        some = np.flatnonzero(good)
+        rows, feasible = rows[some], feasible.take(some)
+        obstacles = np.zeros((0, self._obstacles.rows, 2 * arm.dimension + 1))
+        if len(rows):
+            obstacles, good = self._obstacles(uniforms.at(some), feasible)
+            some = np.flatnonzero(good)
+            rows, feasible, obstacles = rows[some], feasible.take(some), obstacles[some]
+        return rows, Scenes(feasible.start, feasible.goal, obstacles)
+
+
+class AttemptNumbers:
+    """Uniform numbers for attempts at N scenes.
+
+    While few scenes are left, several groups of attempts are drawn at once, as computing them together is faster. The
+    generators are then put back to where the group of the first good attempt ended, so results do not depend on it.
+
+    Args:
+        generators: N generators; if several scenes share one, only one group is drawn at once.
+        size: Numbers of one attempt.
+        order: Groups of attempts.
+    """
+
+    def __init__(self, generators: Sequence[np.random.Generator], size: int, order: DrawOrder) -> None:
+        self._generators, self._size, self._order = generators, size, order
+        self._apart = len({id(each.bit_generator) for each in generators}) == len(generators)
+        self._group = 0
+        self._groups: tuple[int, ...] = ()
+        self._states: list[list[Any]] = []
+
+    @property
+    def made(self) -> int:
+        """Attempts at each scene so far."""
+        return sum(self._order.groups[: self._group])
+
+    @property
+    def exhausted(self) -> bool:
+        """Flag: there are no further attempts."""
+        return self._group >= len(self._order.groups)
+
+    def draw(self, scenes: Int) -> Float:
+        """Return numbers of the next attempts at P scenes, shape (P, attempts, size)."""
+        groups = self._order.groups[self._group :]
+        self._groups = groups[:1]
+        for attempts in groups[1:] if self._apart else ():
+            if len(scenes) * (sum(self._groups) + attempts) > self._order.ahead:
+                break
+            self._groups += (attempts,)
+        self._group += len(self._groups)
+        drawn = np.empty((len(scenes), sum(self._groups), self._size))
+        self._states = [
+            self._fill(self._generators[int(i)], each) for i, each in zip(scenes, drawn, strict=True)
+        ]
+        return drawn
+
+    def put_back(self, scenes: Int, first: Int) -> None:
+        """Put the generators of P scenes back to the end of the group of the first good attempt.
+
+        Args:
+            scenes: Indices of the scenes, shape (P,).
+            first: Index of the first good attempt, shape (P,); -1 for none.
+        """
+        ends = np.cumsum(self._groups)
+        for i, states, attempt in zip(scenes, self._states, first, strict=True):
+            if 0 <= attempt < ends[-1] - self._groups[-1]:
+                self._generators[int(i)].bit_generator.state = states[int((attempt >= ends).sum())]
+
+    def _fill(self, generator: np.random.Generator, drawn: Float) -> list[Any]:
+        """Fill the rows of each group; return the states of the generator after all but the last."""
+        states, begin = [], 0
+        for attempts in self._groups:
+            if begin:
+                states.append(generator.bit_generator.state)
+            generator.random(out=drawn[begin : begin + attempts])
+            begin += attempts
+        return states
+
+
+def _obstacle_sampler(collision_model: CollisionModel, distribution: Distribution) -> ObstacleSampler:
+    """Return the sampler of obstacles of a distribution."""
+    if isinstance(distribution, SpaceDistribution):
+        return SpatialObstacles(collision_model, distribution)
+    return (WholeArmObstacles if collision_model.whole_arm else HandObstacles)(collision_model, distribution)
+
+
+def sampler_of_family(
+    collision_model: CollisionModel, distribution: Distribution, family: str
+) -> SceneSampler:
+    """Return a sampler of one family of scenes.
+
+    Args:
+        collision_model: Arm that moves, and the bodies that must clear the obstacles.
+        distribution: Distribution of the scenes of a task.
+        family: Name of a built-in or registered family.
+
+    Raises:
+        ValueError: There is no such family, or it needs more obstacles than the task has.
+    """
+    families, most = scene_families(distribution.dimension), distribution.n_obstacles[1]
+    if family not in families:
+        raise ValueError(f"family must be one of {', '.join(families)}, got {family!r}")
+    record = families[family]
+    if most < record.n_obstacles:
+        raise ValueError(
+            f"{family} needs a task with up to {record.n_obstacles} obstacles, this one has {most} at most"
+        )
+    if isinstance(distribution, SpaceDistribution):
+        return SceneSampler(collision_model, dataclasses.replace(distribution, families=(family,)))
+    planar = dataclasses.replace(distribution, n_obstacles=(1, min(FAMILY_ROWS, most)))
+    return SceneSampler(
+        collision_model,
+        planar,
+        obstacles=FamilyObstacles(collision_model, planar, record.build),
+        order=DRAW_ORDER[2]._replace(groups=(1,) * FAMILY_ATTEMPTS),
+    )

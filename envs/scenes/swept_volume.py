@@ -23,7 +23,7 @@ SIZE_ROUNDING = 1e-4
 """More than what rounding adds to a distance, [m]."""
 
 
-class Bodies(NamedTuple):
+class LinkBodies(NamedTuple):
     """Some links of an arm at T times of N movements."""
 
     ends: Single
@@ -36,7 +36,7 @@ class Bodies(NamedTuple):
     """Of the links, shape (B,), [m]."""
 
     @classmethod
-    def of(cls, ends: Single, radii: tuple[float, ...]) -> Bodies:
+    def of(cls, ends: Single, radii: tuple[float, ...]) -> LinkBodies:
         """Links whose axes end there, shape (2, 3, N, B, T), [m], and their radii, [m]."""
         links, size = np.ascontiguousarray(ends), np.array(radii, np.float32)
         balls = lift_quadratic(np.moveaxis(np.float32(0.5) * (links[0] + links[1]), 0, 1))
@@ -91,11 +91,11 @@ class Bodies(NamedTuple):
             look(one[which], ball)
         return least.reshape(shape)
 
-    def every_other(self) -> Bodies:
+    def every_other(self) -> LinkBodies:
         """The same at every other time."""
         return self._replace(ends=self.ends[..., ::2], balls=self.balls[..., ::2])
 
-    def take(self, movements: Int) -> Bodies:
+    def take(self, movements: Int) -> LinkBodies:
         """Some of the movements."""
         return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
 
@@ -111,14 +111,14 @@ class Bodies(NamedTuple):
         return np.asarray(distance.astype(np.float64) - obstacles[:, -1])
 
 
-class Swept(NamedTuple):
+class SweptVolume(NamedTuple):
     """Where an arm is on N movements, the links near its hand and the others."""
 
-    outer: Bodies
-    inner: Bodies
+    outer: LinkBodies
+    inner: LinkBodies
 
     @classmethod
-    def of(cls, collision_model: CollisionModel, hand: Float) -> Swept:
+    def of(cls, collision_model: CollisionModel, hand: Float) -> SweptVolume:
         """Of an arm, or its hand alone, whose hand takes paths of shape (N, T, 3), [m]."""
         arm = collision_model.arm
         if collision_model.whole_arm:
@@ -129,7 +129,7 @@ class Swept(NamedTuple):
         ends = links.astype(np.float32).transpose(3, 4, 0, 2, 1)
         first = max(len(radii) - OUTER, 0)
         return cls(
-            *(Bodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
+            *(LinkBodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
         )
 
     def top(self, phase: NDArray[np.int64], place: Float) -> Float:
@@ -148,6 +148,6 @@ class Swept(NamedTuple):
         high = there[..., 2, :] + self.outer.radii
         return np.asarray(np.where(apart < ABOVE, high, z).max(axis=(-2, -1)))
 
-    def take(self, movements: Int) -> Swept:
+    def take(self, movements: Int) -> SweptVolume:
         """Some of the movements."""
-        return Swept(*(bodies.take(movements) for bodies in self))
+        return SweptVolume(*(bodies.take(movements) for bodies in self))

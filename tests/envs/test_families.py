@@ -1,5 +1,8 @@
 """Laws of the families of hard scenes: each is what its name says."""
 
+import copy
+import doctest
+import pickle
 import re
 from pathlib import Path
 
@@ -7,17 +10,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.arms import ADULT
+from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.mdp.task import family_sampler
-from viapoint.envs.scenes.config import FAMILIES as SPACE_FAMILIES
-from viapoint.envs.scenes.planar_hard import FAMILIES, ROWS
+from viapoint.envs.scenes import families
+from viapoint.envs.scenes.config import SpaceDistribution
+from viapoint.envs.scenes.families import register_scene_family, scene_families
+from viapoint.envs.scenes.planar_families import FAMILY_ROWS
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import check_scenes
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
 SPACE = "viapoint/PandaObstacles-v0"
+FAMILIES = tuple(scene_families(2))
+SPACE_FAMILIES = {name: family.n_obstacles for name, family in scene_families(3).items()}
 NUMBER = {HAND: 40, WHOLE_ARM: 4}
 
 
@@ -56,7 +64,7 @@ def test_scenes_of_a_family_can_begin_and_end_and_something_is_in_the_way(name, 
     sampler = family_sampler(tasks[env_id], name)
     scenes = sampler([np.random.default_rng(seed) for seed in range(NUMBER[env_id])])
     check_scenes(scenes, tasks[env_id].collision_model)
-    assert scenes.obstacles.shape[1] == ROWS
+    assert scenes.obstacles.shape[1] == FAMILY_ROWS
     squared = segment_distance_squared(scenes.start[:, None], scenes.goal[:, None], scenes.obstacles)[..., 0]
     clearance = np.sqrt(squared) - scenes.obstacles[..., -1] - ADULT.hand_radius
     assert (np.where(scenes.present, clearance, 1.0).min(axis=-1) < -0.003).all()
@@ -170,8 +178,13 @@ def test_each_family_of_space_is_drawn_by_its_name(name):
     assert (standing.sum(axis=-1) >= posts).all()
 
 
-def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(monkeypatch):
-    monkeypatch.setitem(FAMILIES, "pair", None)  # taken out again afterwards
+@pytest.fixture
+def registry(monkeypatch):
+    """Families that a test registers are gone afterwards."""
+    monkeypatch.setattr(families, "_FAMILIES", {d: dict(names) for d, names in families._FAMILIES.items()})
+
+
+def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(registry):
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names = {}
     exec(example, names)
@@ -180,3 +193,110 @@ def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(monk
     np.testing.assert_allclose(start, scenes.start[0], atol=1e-6)
     assert (scenes.present.sum(axis=1) == 2).all()
     names["env"].close()
+
+
+def test_the_example_of_the_function_works(registry):
+    runner = doctest.DocTestRunner()
+    for test in doctest.DocTestFinder().find(register_scene_family, "register_scene_family", globs={}):
+        runner.run(test)
+    assert runner.summarize() == (0, 9)
+
+
+def ball(uniforms, site):
+    """A post in the plane, a sphere in space, in the middle of the line."""
+    centre = site.start + (0.4 + 0.2 * uniforms.take(1)) * (site.goal - site.start)
+    assert site.path.shape[::2] == centre.shape
+    return np.concatenate((centre, np.zeros_like(centre), 0.02 + 0.02 * uniforms.take(1)), axis=-1)[:, None]
+
+
+@pytest.mark.parametrize("env_id", [HAND, WHOLE_ARM, SPACE])
+def test_one_function_makes_scenes_in_the_plane_and_in_space(env_id, registry):
+    task = task_of(env_id)
+    register_scene_family("ball", ball, dimension=task.arm.dimension, n_obstacles=1)
+    sampler = family_sampler(task, "ball")
+    scenes = sampler([np.random.default_rng(seed) for seed in range(12)])
+    check_scenes(scenes, task.collision_model)
+    line = (scenes.goal - scenes.start)[:, None]
+    offset = scenes.obstacles[..., : task.arm.dimension] - scenes.start[:, None]
+    along = (offset * line).sum(axis=-1, keepdims=True) / (line**2).sum(axis=-1, keepdims=True)
+    apart = np.linalg.norm(offset - along * line, axis=-1)
+    if env_id == SPACE:
+        round_ones = scenes.present & (scenes.obstacles[..., 3:6] == 0.0).all(axis=-1)
+        assert (np.where(round_ones, apart, 1.0).min(axis=-1) < 0.1).all()  # it may have given way
+    else:
+        assert (np.where(scenes.present, apart, 1.0).min(axis=-1) < 1e-9).all()
+    alone = sampler([np.random.default_rng(3)])
+    for one, all_ in zip(alone, scenes, strict=True):
+        np.testing.assert_array_equal(one[0], all_[3])
+
+
+def test_registered_families_are_named_in_distributions_that_are_copied_and_pickled(registry):
+    register_scene_family("ball", ball, dimension=3, n_obstacles=1)
+    mixed = SpaceDistribution(families=("ball", "gate"))
+    for again in (copy.deepcopy(mixed), pickle.loads(pickle.dumps(mixed))):
+        assert again == mixed
+    scenes = SceneSampler(CollisionModel(PANDA, True), mixed)(
+        [np.random.default_rng(seed) for seed in range(8)]
+    )
+    check_scenes(scenes, CollisionModel(PANDA, True))
+    assert "ball" not in scene_families(2)
+
+
+def test_a_family_that_needs_few_obstacles_fits_into_tasks_with_few(registry):
+    register_scene_family("ball", ball, n_obstacles=1)
+    scenes = family_sampler(task_of(HAND, n_obstacles=1), "ball")([np.random.default_rng(0)])
+    assert scenes.obstacles.shape == (1, 1, 5)
+
+
+def test_frozen_families_are_not_those_that_are_registered(registry):
+    before = {dimension: list(scene_families(dimension)) for dimension in (2, 3)}
+    for dimension in (2, 3):
+        register_scene_family("ball", ball, dimension=dimension, n_obstacles=1)
+        added = set(scene_families(dimension)) - set(before[dimension])
+        assert added == {"ball"}
+        assert not scene_families(dimension)["ball"].hard
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (("gate", ball), ValueError, "name must not be empty or one of gate, corridor, .* got 'gate'"),
+        (("", ball), ValueError, "must not be empty"),
+        ((3, ball), TypeError, "name must be a string, got 3"),
+        (("ball", lambda site: None), TypeError, r"a function build\(uniforms, site\)"),
+        (("ball", 3), TypeError, "3 is not a callable"),
+    ],
+)
+def test_a_family_that_cannot_be_registered_is_refused(arguments, error, message, registry):
+    with pytest.raises(error, match=message):
+        register_scene_family(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dimension": 4}, "dimension must be one of 2, 3, got 4"),
+        ({"n_obstacles": 0}, "n_obstacles must be a whole number from 1 to 5, got 0"),
+        ({"n_obstacles": 9, "dimension": 3}, "from 1 to 8, got 9"),
+        ({"n_obstacles": 1.5}, "got 1.5"),
+    ],
+)
+def test_numbers_of_a_family_are_checked(changes, message, registry):
+    with pytest.raises(ValueError, match=message):
+        register_scene_family("ball", ball, **changes)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda uniforms, site: np.zeros((3, 1, 5)), r"\(3, 1, 5\)"),
+        (lambda uniforms, site: np.repeat(ball(uniforms, site), 2, axis=1), "with n at most 1"),
+        (lambda uniforms, site: np.nan * ball(uniforms, site), "finite numbers, got nan"),
+        (lambda uniforms, site: None, "got object of shape"),
+    ],
+)
+def test_what_a_family_returns_is_checked(build, message, registry):
+    register_scene_family("wrong", build, n_obstacles=1)
+    sampler = family_sampler(task_of(HAND), "wrong")
+    with pytest.raises(ValueError, match=f"family 'wrong' must return .*{message}"):
+        sampler([np.random.default_rng(seed) for seed in range(8)])

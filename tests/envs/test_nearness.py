@@ -7,10 +7,11 @@ from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
-from viapoint.envs.scenes import spatial, spatial_draws
+from viapoint.envs.scenes import sampler as sampling
 from viapoint.envs.scenes.config import SpaceDistribution
-from viapoint.envs.scenes.spatial import SpaceSampler
-from viapoint.envs.scenes.swept_volume import Swept
+from viapoint.envs.scenes.feasible_path import DRAW_ORDER
+from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.swept_volume import SweptVolume
 
 N, TIMES, ROWS = 40, 16, 12
 
@@ -42,7 +43,7 @@ def bodies(generator):
     low, high = (np.array(corner) for corner in PANDA.workspace)
     start, goal = (low + (high - low) * generator.random((N, 1, 3)) for _ in range(2))
     path = start + (goal - start) * np.linspace(0.0, 1.0, TIMES)[:, None]
-    return Swept.of(CollisionModel(PANDA, True), path).outer
+    return SweptVolume.of(CollisionModel(PANDA, True), path).outer
 
 
 def everything(bodies, rows):
@@ -93,19 +94,20 @@ def test_rows_that_belong_together_have_one_clearance(generator, bodies):
 
 
 def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
-    sampler, found = SpaceSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
+    sampler, found = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
     for together in (1, 30, 10_000):
-        monkeypatch.setattr(spatial, "TOGETHER", together)
+        monkeypatch.setattr(sampling, "TOGETHER", together)
         found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
     for other in found[1:]:
         assert all((mine == theirs).all() for mine, theirs in zip(found[0], other, strict=True))
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(monkeypatch, shared):
-    sampler, found = SpaceSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
+def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(shared):
+    found = []
     for ahead in (0, 30, 1_000):
-        monkeypatch.setattr(spatial_draws, "AHEAD", ahead)
+        order = DRAW_ORDER[3]._replace(ahead=ahead)
+        sampler = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution(), order=order)
         generators = [np.random.default_rng(0 if shared else seed) for seed in range(8)]
         generators = generators[:1] * 8 if shared else generators
         for _ in range(2):

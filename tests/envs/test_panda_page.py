@@ -11,7 +11,8 @@ from viapoint.envs import TASKS
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.panda import MIN_HEIGHT, ROLL_SHARE
 from viapoint.envs.arms.serial_arm import LIMIT_SHARE
-from viapoint.envs.scenes.config import FAMILIES, SpaceDistribution
+from viapoint.envs.scenes.config import SpaceDistribution
+from viapoint.envs.scenes.families import scene_families
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-panda.md").read_text(encoding="utf-8")
 WORDS = {1: "one", 2: "two", 6: "six", 8: "eight"}
@@ -66,7 +67,9 @@ def test_observation_space(env):
 
 
 def test_starting_state():
-    assert {row[0]: int(row[1]) for row in table("## Starting State")} == FAMILIES
+    assert {row[0]: int(row[1]) for row in table("## Starting State")} == {
+        name: family.n_obstacles for name, family in scene_families(3).items()
+    }
     distribution, (low, high) = SpaceDistribution(), PANDA.workspace
     assert "{:g} to {:g} m apart".format(*distribution.distance) in PAGE
     assert f"from {low} to {high} m".replace("0.50", "0.5") in " ".join(PAGE.split())
@@ -89,5 +92,5 @@ def test_the_example_puts_a_scene_of_a_family_into_the_environment():
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names = {}
     exec(example, names)
-    assert names["scenes"].present.sum(axis=-1).min() >= FAMILIES["tunnel"]
+    assert names["scenes"].present.sum(axis=-1).min() >= scene_families(3)["tunnel"].n_obstacles
     assert names["observation"]["hand"] == pytest.approx(names["scenes"].start[0], abs=1e-6)

@@ -7,16 +7,19 @@ import pytest
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.mdp.task import Task
-from viapoint.envs.scenes.config import BEAMS, FAMILIES, SpaceDistribution
+from viapoint.envs.scenes.config import SpaceDistribution
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import check_scenes
-from viapoint.envs.scenes.spatial import SpaceSampler
 from viapoint.envs.single_env import ReachVectorEnv
 
 NUMBER, WHOLE_PANDA = 60, CollisionModel(PANDA, whole_arm=True)
+FAMILIES = {name: family.n_obstacles for name, family in scene_families(3).items()}
+BEAMS = ("slot", "window", "tunnel")
 
 
 def drawn(number=NUMBER, **distribution):
-    sampler = SpaceSampler(WHOLE_PANDA, SpaceDistribution(**distribution))
+    sampler = SceneSampler(WHOLE_PANDA, SpaceDistribution(**distribution))
     return sampler([np.random.default_rng(seed) for seed in range(number)])
 
 
@@ -65,7 +68,7 @@ def test_start_and_goal_are_as_far_apart_and_as_level_as_stated(scenes):
 
 def test_a_scene_depends_on_its_own_generator_alone(scenes):
     for seed in (0, 7, 39):
-        alone = SpaceSampler(WHOLE_PANDA, SpaceDistribution())([np.random.default_rng(seed)])
+        alone = SceneSampler(WHOLE_PANDA, SpaceDistribution())([np.random.default_rng(seed)])
         for one, together in zip(alone, scenes, strict=True):
             np.testing.assert_array_equal(one[0], together[seed])
 

@@ -14,7 +14,7 @@ import pytest
 from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.actions.via_points import MOST_VIAS
-from viapoint.envs.scenes.config import MOST_OBSTACLES
+from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.training.algorithms.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.envs.scenes.planar_hard import FAMILIES
+from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planners.baselines import METHODS, make_method
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
@@ -131,7 +131,7 @@ def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, tr
 
 
 def test_the_families_are_documented():
-    assert all(f"`{name}` (" in PAGE.replace("\n", " ") for name in FAMILIES)
+    assert all(f"`{name}` (" in PAGE.replace("\n", " ") for name in scene_families(2))
 
 
 def test_the_stated_share_is_what_one_measures(frozen, trial):

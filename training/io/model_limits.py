@@ -11,7 +11,7 @@ import torch
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from viapoint.envs.actions.via_points import MOST_VIAS
-from viapoint.envs.scenes.config import MOST_OBSTACLES
+from viapoint.envs.scenes.families import MOST_OBSTACLES
 
 LARGEST_MODEL_JSON = 1 << 20
 """Size of `model.json` at most, [bytes]."""

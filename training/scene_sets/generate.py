@@ -22,9 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.mdp.task import Task, family_sampler
-from viapoint.envs.scenes.config import NARROW, SpaceDistribution
-from viapoint.envs.scenes.planar_hard import FAMILIES
-from viapoint.envs.scenes.sampler import Sampler
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.scene_sets.scene_search import Kinds, Source, measured, redrawn, search
@@ -88,10 +87,10 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
     return [Lot(DRAWN, source, Kinds(of_share=bands, names=BANDS, quota=size // len(BANDS)), seed)]
 
 
-def hard_families(task: Task) -> dict[str, Sampler]:
+def hard_families(task: Task) -> dict[str, SceneSampler]:
     """The families of hard scenes of a task, by name."""
-    names = NARROW if isinstance(task.scenes, SpaceDistribution) else FAMILIES
-    return {name: family_sampler(task, name) for name in names}
+    families = scene_families(task.arm.dimension)
+    return {name: family_sampler(task, name) for name, family in families.items() if family.hard}
 
 
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:

@@ -1,0 +1,186 @@
+"""Random numbers, feasible paths and vectors that all samplers of obstacles share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float, Index
+
+
+class Uniforms:
+    """Rows of uniform numbers in [0, 1), taken from the front.
+
+    Args:
+        values: Shape (..., n).
+        taken: Count of numbers in each row that are taken already.
+    """
+
+    def __init__(self, values: Float, taken: int = 0) -> None:
+        self._values, self._taken = values, taken
+
+    def take(self, count: int) -> Float:
+        """Return the next `count` numbers of each row, shape (..., count).
+
+        Raises:
+            ValueError: The rows hold fewer numbers.
+        """
+        self._taken += count
+        if self._taken > self._values.shape[-1]:
+            raise ValueError(f"{self._taken} uniform numbers were taken of {self._values.shape[-1]}")
+        return self._values[..., self._taken - count : self._taken]
+
+    def peek(self, count: int) -> Float:
+        """Return the next `count` numbers of each row, shape (..., count), without taking them."""
+        return self._values[..., self._taken : self._taken + count]
+
+    def take_table(self, rows: int, columns: int, *, by_column: bool = False) -> Float:
+        """Return the next numbers as tables, shape (N, rows, columns), stored row by row or column by column."""
+        numbers = self.take(rows * columns)
+        if by_column:
+            return numbers.reshape(-1, columns, rows).swapaxes(1, 2)
+        return numbers.reshape(-1, rows, columns)
+
+    def at(self, rows: Index) -> Uniforms:
+        """Return the rest of some rows, at the same position."""
+        return Uniforms(self._values[rows], self._taken)
+
+    def flat(self) -> Uniforms:
+        """Return the rows in one dimension."""
+        return Uniforms(self._values.reshape(-1, self._values.shape[-1]), self._taken)
+
+
+class FeasiblePath(NamedTuple):
+    """Paths of the hand that solve N scenes: obstacles are placed clear of them."""
+
+    start: Float
+    """Shape (N, D), [m]."""
+    goal: Float
+    """Shape (N, D), [m]."""
+    path: Float
+    """Positions of the hand at T times, shape (N, T, D), [m]."""
+
+    @property
+    def ends(self) -> Float:
+        """Start and goal, shape (N, 2, D), [m]."""
+        return np.stack((self.start, self.goal), axis=1)
+
+    def take(self, rows: Index) -> FeasiblePath:
+        """Return the paths at `rows`."""
+        return FeasiblePath(*(part[rows] for part in self))
+
+    def near(self, fraction: Float, margin: float) -> tuple[Index, Float, Float]:
+        """Return points on the middle part of the paths.
+
+        Args:
+            fraction: Position along the middle part, from 0 to 1, shape (N, C).
+            margin: Share of the path before the middle part, and after it.
+
+        Returns:
+            Indices of the times, shape (N, C), positions and central differences there, shape (N, C, D), [m].
+        """
+        number, times = self.path.shape[:2]
+        time = (margin * times + (1.0 - 2.0 * margin) * times * fraction).astype(np.int64)
+        each = np.arange(number)[:, None]
+        return time, self.path[each, time], self.path[each, time + 1] - self.path[each, time - 1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """Feasible paths of N scenes, beside which the obstacles of a family are placed."""
+
+    feasible: FeasiblePath
+    room: float
+    """Radius of the part that must pass: the hand, or the last link of a planar arm whose links count, [m]."""
+    whole_arm: bool
+    """Flag: every link must clear the obstacles, not the hand alone."""
+
+    @property
+    def start(self) -> Float:
+        """Shape (N, D), [m]."""
+        return self.feasible.start
+
+    @property
+    def goal(self) -> Float:
+        """Shape (N, D), [m]."""
+        return self.feasible.goal
+
+    @property
+    def path(self) -> Float:
+        """Positions of the hand at T times, from start to goal, shape (N, T, D), [m]."""
+        return self.feasible.path
+
+
+class ObstacleSampler(Protocol):
+    """Sampler of obstacles clear of feasible paths."""
+
+    path_numbers: int
+    """Uniform numbers that make one candidate path."""
+    fixed: int | None
+    """Index of the number, among those of the obstacles, that early attempts at a scene share; None for none."""
+
+    @property
+    def rows(self) -> int:
+        """Greatest number of obstacles in a scene."""
+
+    @property
+    def size(self) -> int:
+        """Uniform numbers of one attempt."""
+
+    def steered(self, uniforms: Uniforms, number: int) -> Bool:
+        """Return which paths must leave room on one side (above; in the plane towards the base), shape (N,).
+
+        Args:
+            uniforms: Numbers of the obstacles; none are taken.
+            number: Count of scenes, N.
+        """
+
+    def __call__(self, uniforms: Uniforms, feasible: FeasiblePath) -> tuple[Float, Bool]:
+        """Return obstacles, shape (N, rows, 2 D + 1), [m], and which scenes are good, shape (N,)."""
+
+
+def directions(angle: Float, rise: Float, dimension: int) -> Float:
+    """Return unit vectors, shape (..., D), of their horizontal angle [rad] and their third component, the rise."""
+    level = np.sqrt(1.0 - rise**2)
+    return np.stack((level * np.cos(angle), level * np.sin(angle), rise), axis=-1)[..., :dimension]
+
+
+def unit(vectors: Float) -> Float:
+    """Return vectors scaled to length one; zero vectors stay zero."""
+    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=-1, keepdims=True)), 1e-9))
+
+
+def left(vectors: Float) -> Float:
+    """Return the horizontal parts of vectors, turned to the left by a quarter turn."""
+    turned = np.zeros_like(vectors)
+    turned[..., 0], turned[..., 1] = -vectors[..., 1], vectors[..., 0]
+    return turned
+
+
+def rotate(vectors: Float, angle: Float) -> Float:
+    """Return horizontal vectors turned to the left by angles, [rad]."""
+    return np.asarray(np.cos(angle)[..., None] * vectors + np.sin(angle)[..., None] * left(vectors))
+
+
+def between(bounds: tuple[float, float], u: Any) -> Any:
+    """Return uniform numbers between bounds."""
+    return bounds[0] + (bounds[1] - bounds[0]) * u
+
+
+def whole_between(bounds: tuple[int, int], u: Float) -> Float:
+    """Return uniform whole numbers between bounds, both included."""
+    return bounds[0] + np.floor((bounds[1] - bounds[0] + 1) * u)
+
+
+def shuffle_rows(rows: Float, chance: Float) -> Float:
+    """Return the first K obstacles of each scene, shape (N, K, 2 D + 1), in random order.
+
+    Args:
+        rows: Obstacles, shape (N, n, 2 D + 1); absent ones, without a radius, come last.
+        chance: Uniform numbers, shape (N, K).
+    """
+    present_first = np.argsort(rows[..., -1] <= 0.0, axis=-1, kind="stable")[:, : chance.shape[1]]
+    order = np.take_along_axis(present_first, np.argsort(chance, axis=-1, kind="stable"), axis=1)
+    return np.take_along_axis(rows, order[..., None], axis=1)

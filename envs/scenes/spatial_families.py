@@ -1,0 +1,234 @@
+"""Families of scenes in space: spheres, posts, bars and structures of these.
+
+A family is built at K candidate places of N scenes at once. Each part has a direction of retreat: the sampler moves a
+part that is too close to the arm on the feasible path along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.draws import Site, Uniforms, between, left, rotate
+
+BUILDER_NUMBERS = 6
+"""Uniform numbers that make one structure or one obstacle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpatialSizes:
+    """Sizes of obstacles in space."""
+
+    sphere_radius: tuple[float, float] = (0.02, 0.05)
+    """[m]"""
+    post_radius: tuple[float, float] = (0.012, 0.03)
+    """[m]"""
+    pillar_radius: tuple[float, float] = (0.025, 0.05)
+    """[m]"""
+    bar_radius: tuple[float, float] = (0.008, 0.015)
+    """[m]"""
+    bar_half_length: tuple[float, float] = (0.06, 0.18)
+    """[m]"""
+    board_half_length: tuple[float, float] = (0.10, 0.25)
+    """Half length of a shelf's bars, [m]."""
+    board_spacing: float = 0.04
+    """Distance between a shelf's bars, [m]: no part of the arm fits in between."""
+    beam_half_length: tuple[float, float] = (0.08, 0.15)
+    """[m]"""
+    beam_overlap: float = 0.08
+    """Length by which a beam reaches from above the hand towards the arm's base, [m]."""
+    gate_half_width: tuple[float, float] = (0.06, 0.14)
+    """Distance between the middle of a gate and each post before it retreats, [m]; the gripper is 0.21 m wide."""
+    tunnel_length: float = 0.1
+    """Distance between the gates of a tunnel, [m]."""
+    link_margin: float = 0.006
+    """Least clearance of the arm on the feasible path, at the times at which it is computed, [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpatialSite(Site):
+    """Places on the feasible paths of N scenes, K of each scene."""
+
+    sizes: SpatialSizes
+    place: Float
+    """Places on the paths, shape (N, K, 3), [m]."""
+    heading: Float
+    """Horizontal direction of the path there, unit vectors, shape (N, K, 3)."""
+    top: Float
+    """Height of the links above the hand there, shape (N, K), [m]."""
+    hardness: Float
+    """From 0 to 1, shape (N, 1)."""
+
+    def on_line(self, fraction: Float) -> Float:
+        """Return points on the straight line, shape (N, K, 3), [m]."""
+        start, goal = self.start[:, None], self.goal[:, None]
+        return np.asarray(start + (goal - start) * fraction[..., None])
+
+    def take(self, rows: Any) -> SpatialSite:
+        """Return the scenes at `rows`, an index, slice or mask."""
+        parts = {name: getattr(self, name)[rows] for name in ("place", "heading", "top", "hardness")}
+        feasible = self.feasible.take(rows)
+        return SpatialSite(
+            feasible=feasible, room=self.room, whole_arm=self.whole_arm, sizes=self.sizes, **parts
+        )
+
+
+class Structures(NamedTuple):
+    """Structures at K places of N scenes."""
+
+    rows: Float
+    """Shape (N, K, n, 7), [m]."""
+    retreat: Float
+    """Unit vectors along which parts retreat from the arm, shape (N, K, n, 3)."""
+
+
+Builder = Callable[[Uniforms, SpatialSite], Structures]
+
+
+def clutter(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a sphere, a post or a bar near the straight line."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    rows = draw_obstacles(site.sizes, site.on_line(0.25 + 0.5 * u[..., 0]) + 0.06 * (u[..., 3:6] - 0.5), u)
+    return from_path(rows[:, :, None], site)
+
+
+def pillar(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a thick post on the table."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    foot = site.on_line(0.3 + 0.4 * u[..., 0])
+    side = 0.06 * (u[..., 2] - 0.5)
+    top = foot[..., 2] + 0.15 * u[..., 3]
+    rows = _post(
+        foot + left(site.heading) * side[..., None], top, between(site.sizes.pillar_radius, u[..., 1])
+    )
+    return from_path(rows[:, :, None], site)
+
+
+def shelf(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a board of three bars side by side under the path, roughly across it."""
+    return _together(_board(uniforms.take(BUILDER_NUMBERS), site))
+
+
+def gate(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return two posts, on either side of the path, and a sill under it."""
+    return _together(_posts_and_sill(uniforms.take(BUILDER_NUMBERS), site))
+
+
+def slot(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a shelf with a beam over the arm."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    return _together(_board(u, site), _beam(u, site))
+
+
+def window(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a gate with a beam over the arm."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    return _together(_posts_and_sill(u, site), _beam(u, site))
+
+
+def tunnel(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return two windows, one behind the other, with one sill and one beam."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    front = _posts_and_sill(u, site)
+    rows, retreat = (part[:, :, :2].copy() for part in front)
+    rows[..., :3] += site.sizes.tunnel_length * site.heading[:, :, None]
+    return _together(front, _beam(u, site), Structures(rows, retreat))
+
+
+def from_path(rows: Float, site: SpatialSite) -> Structures:
+    """Return obstacles, shape (N, K, n, 7), whose upper ends retreat from the place on the path."""
+    away = rows[..., :3] + rows[..., 3:6] - site.place[:, :, None]
+    return Structures(rows, away / np.maximum(np.sqrt((away**2).sum(axis=-1, keepdims=True)), 1e-6))
+
+
+def draw_obstacles(sizes: SpatialSizes, centre: Float, u: Float) -> Float:
+    """Return a sphere, a post or a bar at each centre.
+
+    Args:
+        sizes: Of the obstacles.
+        centre: Shape (N, K, 3), [m].
+        u: Uniform numbers, shape (N, K, 6).
+
+    Returns:
+        Shape (N, K, 7), [m].
+    """
+    # The kind is a hash of the first number, which also places the obstacle along the line.
+    kind, size, turn, tilt = u[..., 0] * 97.0 % 1.0, u[..., 1], 2.0 * np.pi * u[..., 2], u[..., 3] - 0.5
+    half = between(sizes.bar_half_length, u[..., 4])
+    level = np.stack((np.cos(turn), np.sin(turn), 2.0 * tilt), axis=-1)
+    axis = half[..., None] * level / np.sqrt((level**2).sum(axis=-1, keepdims=True))
+    bar = _row(centre, axis, between(sizes.bar_radius, size))
+    sphere = _row(centre, np.zeros_like(centre), between(sizes.sphere_radius, size))
+    post = _post(centre, centre[..., 2] + 0.1 * u[..., 5], between(sizes.post_radius, size))
+    return np.where((kind < 0.35)[..., None], sphere, np.where((kind < 0.65)[..., None], post, bar))
+
+
+def _board(u: Float, site: SpatialSite) -> Structures:
+    """Return three bars side by side under the path, roughly across it; they retreat downwards."""
+    radius = between(site.sizes.bar_radius, u[..., 1])
+    half = between(site.sizes.board_half_length, u[..., 2])
+    across = rotate(left(site.heading), 1.2 * (0.5 - u[..., 3]))
+    middle = site.place + 0.04 * (u[..., 4:5] - 0.5) * site.heading
+    middle = _at_height(middle, middle[..., 2] - _depth(u, site) - radius)
+    bars = [
+        _row(middle - side * site.sizes.board_spacing * left(across), half[..., None] * across, radius)
+        for side in (-1.0, 0.0, 1.0)
+    ]
+    rows = np.stack(bars, axis=-2)
+    return Structures(rows, np.broadcast_to((0.0, 0.0, -1.0), rows[..., :3].shape))
+
+
+def _posts_and_sill(u: Float, site: SpatialSite) -> Structures:
+    """Return two posts, which retreat sideways, and a sill under the path, which retreats downwards."""
+    d, across = site.sizes, left(site.heading)
+    radius, sill = between(d.post_radius, u[..., 1]), between(d.bar_radius, u[..., 2])
+    width = between(d.gate_half_width, u[..., 3] * (1.0 - site.hardness))
+    middle = site.place + (0.04 * (u[..., 4] - 0.5))[..., None] * across
+    top = site.place[..., 2] + 0.12 * u[..., 5]
+    posts = [_post(middle + (side * width)[..., None] * across, top, radius) for side in (-1.0, 1.0)]
+    low = _at_height(middle, site.place[..., 2] - _depth(u, site) - sill)
+    rows = np.stack((*posts, _row(low, width[..., None] * across, sill)), axis=-2)
+    down = np.broadcast_to((0.0, 0.0, -1.0), across.shape)
+    return Structures(rows, np.stack((-across, across, down), axis=-2))
+
+
+def _beam(u: Float, site: SpatialSite) -> Structures:
+    """Return a bar over the links above the hand, across the path, from near the arm's base outwards."""
+    d = site.sizes
+    radius, half = between(d.bar_radius, u[..., 5]), between(d.beam_half_length, u[..., 2])
+    out = left(site.heading)
+    out = np.where((out * site.place).sum(axis=-1, keepdims=True) < 0.0, -out, out)
+    middle = site.place + (half - d.beam_overlap)[..., None] * out
+    row = _row(_at_height(middle, site.top + d.link_margin + radius), half[..., None] * out, radius)
+    return Structures(row[:, :, None], np.broadcast_to((0.0, 0.0, 1.0), (*row.shape[:2], 1, 3)))
+
+
+def _depth(u: Float, site: SpatialSite) -> Float:
+    """Return the depth of a board's or sill's upper side below the hand, shape (N, K), [m]."""
+    return np.asarray(site.room + site.sizes.link_margin + 0.005 + 0.06 * u[..., 0] * (1.0 - site.hardness))
+
+
+def _together(*parts: Structures) -> Structures:
+    """Return several parts as one structure."""
+    return Structures(*(np.concatenate(part, axis=2) for part in zip(*parts, strict=True)))
+
+
+def _at_height(place: Float, height: Float) -> Float:
+    """Return places moved to heights, [m]."""
+    return np.concatenate((place[..., :2], height[..., None]), axis=-1)
+
+
+def _post(centre: Float, top: Float, radius: Float) -> Float:
+    """Return posts that stand on the table."""
+    top = np.maximum(top, radius + 0.02)
+    middle = _at_height(centre, 0.5 * (top + radius))
+    return _row(middle, _at_height(np.zeros_like(centre), 0.5 * (top - radius)), radius)
+
+
+def _row(centre: Float, axis: Float, radius: Float) -> Float:
+    """Return obstacles, shape (..., 7)."""
+    return np.concatenate((centre, axis, radius[..., None]), axis=-1)
