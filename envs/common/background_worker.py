@@ -1,4 +1,4 @@
-"""A thread beside the physics: NumPy works there while the engine, in C, works here."""
+"""Worker thread for NumPy code that runs while the physics engine steps."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ R = TypeVar("R")
 
 
 class BackgroundWorker:
-    """Does jobs in order, in a thread of its own or at once; what comes out is the same."""
+    """Executor of jobs in order, in one thread or immediately; the results are the same."""
 
     def __init__(self, threaded: bool) -> None:
-        """Take a thread, which starts with the first job, or none."""
+        """Choose a thread, which starts with the first job, or immediate execution."""
         self._threaded = threaded
         self._pool: ThreadPoolExecutor | None = None
 
     def submit(self, job: Callable[..., R], *arguments: Any) -> Future[R]:
-        """A promise of what `job(*arguments)` returns."""
+        """Return a future of `job(*arguments)`."""
         if not self._threaded:
             done: Future[R] = Future()
             done.set_result(job(*arguments))
@@ -28,7 +28,7 @@ class BackgroundWorker:
         return self._pool.submit(job, *arguments)
 
     def close(self) -> None:
-        """Let the thread go."""
+        """Stop the thread after its jobs; the next job starts a new one."""
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None

@@ -1,4 +1,4 @@
-"""MuJoCo, or the reason why it cannot be imported."""
+"""Import of MuJoCo with an explanation if it fails."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ try:
     import mujoco
     from mujoco import batch
 except AttributeError as error:
-    # With a back end whose library is missing, MuJoCo fails on an attribute of None.
+    # MuJoCo reads an attribute of None if the OpenGL library of MUJOCO_GL is missing.
     raise ImportError(
         f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} asks MuJoCo for an OpenGL library that is not installed: "
         "unset MUJOCO_GL, or install the library (Debian: apt-get install libegl1 libgl1, or libosmesa6 for osmesa)"
@@ -16,7 +16,7 @@ except AttributeError as error:
 except ImportError as error:
     raise ImportError(
         f"MuJoCo 4 or newer is needed and could not be imported ({error}); where an older version was upgraded in "
-        "place, mend it with: pip install --force-reinstall 'mujoco>=4'"
+        "place, repair it with: pip install --force-reinstall 'mujoco>=4'"
     ) from error
 
 __all__ = ["batch", "mujoco"]

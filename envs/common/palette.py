@@ -1,4 +1,4 @@
-"""One palette for pictures, plots and films."""
+"""Colours of pictures, plots and films."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Colour = tuple[float, float, float]
 
 
 class Palette(NamedTuple):
-    """The colour of everything that is drawn."""
+    """Colour of each kind of thing that is drawn."""
 
     plan: Colour = (0.36, 0.62, 0.90)
     executed: Colour = (0.07, 0.13, 0.27)

@@ -1,4 +1,4 @@
-"""Arguments at the border: what is refused, and why."""
+"""Validation of arguments; errors name the argument, the allowed values and the value."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from viapoint.envs.common.types import Float
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
-    """A whole number of at least `least`."""
+    """Return a whole number that is at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
     return int(value)
 
 
 def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments as they are now, whatever becomes of a caller's lists and mappings."""
+    """Return a copy of arguments, independent of later changes of the caller's lists and mappings."""
     return {
         name: copy.copy(value) if isinstance(value, Mapping | list) else value
         for name, value in arguments.items()
@@ -29,7 +29,7 @@ def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
-    """An exact number or (fewest, most) as the pair."""
+    """Return (fewest, most) from an exact number or such a pair."""
     pair = (number, number) if isinstance(number, int | np.integer) else number
     try:
         fewest, most = pair
@@ -39,14 +39,14 @@ def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
 
 
 def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> float:
-    """A finite real number of at least `least`."""
+    """Return a finite real number that is at least `least`; `why` explains the bound in the error."""
     if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < np.inf:
         raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
     return float(value)
 
 
 def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Refuse keyword arguments that there are not, with those that there are beside the number of environments."""
+    """Raise TypeError for unknown keyword arguments; the message lists the known ones."""
     if unknown:
         allowed = [name for name in known if name not in ("num_envs", "unknown", "return")]
         raise TypeError(
@@ -55,14 +55,14 @@ def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
 
 
 def reset_options(options: Any) -> dict[str, Any]:
-    """A copy of what `reset(options=...)` was given."""
+    """Return a copy of the options of `reset`."""
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
     return dict(options or {})
 
 
 def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
-    """The environments that a reset mask names; without a mask, all."""
+    """Return the indices of the environments in a reset mask; without a mask, of all."""
     if mask is None:
         return np.arange(num_envs)
     mask = np.asarray(mask)
@@ -71,7 +71,7 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
             f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}"
         )
     if not running and not mask.all():
-        raise ValueError("options['reset_mask'] must name every environment at the first reset")
+        raise ValueError("options['reset_mask'] must be True for every environment at the first reset")
     return np.flatnonzero(mask)
 
 
@@ -93,7 +93,7 @@ def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
-    """Finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
+    """Return finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
     shape = (num_envs, len(names))
     array = real_numbers(actions, shape).astype(np.float64, copy=False)
     if array.shape != shape:
@@ -106,7 +106,7 @@ def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
-    """A seed for each environment: `seed + i`, `seed[i]`, or None."""
+    """Return a seed for each environment: `seed + i`, `seed[i]`, or None."""
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, np.ndarray) and not seed.ndim:

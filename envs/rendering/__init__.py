@@ -1,1 +1,1 @@
-"""Rendering of movements."""
+"""Rendering of movements and episodes."""

@@ -1,6 +1,6 @@
-"""Where pictures come from: an OpenGL context that needs no display, and a window that does.
+"""OpenGL contexts: pictures in memory, which need no display, and a window on the screen.
 
-Nothing here touches OpenGL or the environment variables before the first picture.
+OpenGL is loaded with the first picture. The environment variables are never changed.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 from viapoint.envs.common.types import Frame
 
 OFF = ("disable", "disabled", "off", "false", "0")
-"""What MUJOCO_GL says to forbid rendering."""
-LARGEST = 8192
-"""Side of a picture beyond which it is not rendered larger than it is, as OpenGL may have no room for it."""
+"""Values of MUJOCO_GL that disable rendering."""
+MAX_SIDE = 8192
+"""Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones."""
 INSTALL = "on Debian and Ubuntu: apt-get install libegl1 libgl1"
 
 
@@ -31,33 +31,34 @@ class GLUnavailableError(gym.error.DependencyNotInstalled):
 
 
 class Canvas:
-    """Picture in memory that a scene is rendered to.
+    """Offscreen buffer that scenes are rendered to.
 
-    `mujoco.Renderer` is not used: it takes the OpenGL platform that MUJOCO_GL named when MuJoCo was imported, GLFW if
-    none, which needs a display, and it leaves its context current in the thread that rendered.
+    `mujoco.Renderer` is not used because it takes the OpenGL platform of MUJOCO_GL at the import of MuJoCo, by default
+    GLFW, which needs a display, and leaves its context current in the thread that rendered.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, supersampling: int = 1) -> None:
-        """Open a context for pictures of this size, whatever the model's own offscreen size is.
+        """Open a context for pictures of a size, independent of the model's own offscreen size.
 
         Args:
-            model: What is to be seen; its `vis.quality.offsamples` say how many samples a pixel takes.
-            width: Of a picture, in pixels.
-            height: Of a picture, in pixels.
-            supersampling: How many times larger it is rendered in both directions; shadows have no other smooth edges.
+            model: Model to render; `vis.quality.offsamples` is its number of samples per pixel.
+            width: Width of a picture, in pixels.
+            height: Height of a picture, in pixels.
+            supersampling: Factor by which pictures are rendered larger in both directions, and then averaged. Samples
+                per pixel smooth the edges of bodies, but not those of shadows.
 
         Raises:
-            GLUnavailableError: There is no OpenGL library, or it refuses.
+            GLUnavailableError: No OpenGL library can be used.
         """
         self._context: Any = None
-        self._factor = supersampling if supersampling * max(width, height) <= LARGEST else 1
+        self._factor = supersampling if supersampling * max(width, height) <= MAX_SIDE else 1
         self._rectangle = mujoco.MjrRect(0, 0, self._factor * width, self._factor * height)
         size = model.vis.global_
         size.offwidth, size.offheight = self._rectangle.width, self._rectangle.height
         self._context, self._mjr = _open(model)
 
     def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Render the scene to a picture, shape (height, width, 3)."""
+        """Render a scene to a picture, shape (height, width, 3)."""
         rows, columns, factor = self._rectangle.height, self._rectangle.width, self._factor
         pixels = np.empty((rows, columns, 3), dtype=np.uint8)
         with self._context.as_current():
@@ -68,7 +69,7 @@ class Canvas:
         return np.asarray(total // factor**2, dtype=np.uint8)
 
     def close(self) -> None:
-        """Give the context back; a second call changes nothing."""
+        """Free the context; a second call changes nothing."""
         context, self._context = self._context, None
         if context is not None:
             with context.as_current():
@@ -80,13 +81,13 @@ class Canvas:
 
 
 class Window:
-    """A window on the screen."""
+    """Window on the screen."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, title: str) -> None:
         """Open the window.
 
         Raises:
-            GLUnavailableError: There is no screen, or no OpenGL on it.
+            GLUnavailableError: There is no display, or no OpenGL on it.
         """
         self._window: Any = None
         if not _has_display():
@@ -114,7 +115,7 @@ class Window:
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
 
     def show(self, scene: mujoco.MjvScene) -> bool:
-        """Show the scene; False once the person has closed the window."""
+        """Show a scene; return False after the window has been closed."""
         if self._window is None or self._glfw.window_should_close(self._window):
             self.close()
             return False
@@ -138,18 +139,18 @@ class Window:
 
 
 def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
-    """A context for pictures in memory: what MUJOCO_GL says, else the first that this machine has."""
+    """Return an offscreen context on the platform of MUJOCO_GL, or else on the first that works."""
     wish = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wish in OFF:
-        raise GLUnavailableError(f"rendering is switched off by MUJOCO_GL={wish}: unset it, or set it to egl")
+        raise GLUnavailableError(f"rendering is disabled by MUJOCO_GL={wish}: unset it, or set it to egl")
     _import_triton()
     reasons = []
     for platform in _platforms(wish):
         try:
             return _open_on(platform, model)
-        except AttributeError:  # PyOpenGL's way to say that it found no library
+        except AttributeError:  # raised by PyOpenGL if it finds no library
             reasons.append(f"{platform}: library not found")
-        except Exception as error:  # every platform has failures of its own, down to MuJoCo's FatalError
+        except Exception as error:  # platforms raise errors of many kinds, including MuJoCo's FatalError
             reasons.append(f"{platform}: {error}")
     raise GLUnavailableError(
         f"no OpenGL library could be used to render ({'; '.join(reasons)}). Install one ({INSTALL}), "
@@ -159,30 +160,30 @@ def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
 
 def _open_on(platform: str, model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # GLFW warns where the exception that follows says the same
+        warnings.simplefilter("ignore")  # GLFW warns before the exception with the same message
         size = model.vis.global_.offwidth, model.vis.global_.offheight
         context = importlib.import_module(f"mujoco.{platform}").GLContext(*size)
         with context.as_current():
             if platform == "glfw" and not importlib.import_module("glfw").get_current_context():
-                raise OSError("no window could be opened")  # going on would end the process
+                raise OSError("no window could be opened")  # MuJoCo would end the process
             mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, mjr)
     return context, mjr
 
 
 def _import_triton() -> None:
-    """Import triton, if torch can use it, before OpenGL is loaded.
+    """Import triton before OpenGL is loaded, if torch can use it.
 
-    Mesa's software renderer and triton both bring LLVM. If Mesa's is loaded first, the later import of triton, which
-    torch does when it makes an optimizer, ends the process; in the other order both work.
+    Mesa's software renderer and triton each bring their LLVM. If Mesa's is loaded first, the later import of triton,
+    with torch's first optimizer, ends the process; in the other order both work.
     """
     if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
-        with contextlib.suppress(Exception):  # a broken triton is torch's concern
+        with contextlib.suppress(Exception):  # a broken triton concerns torch only
             importlib.import_module("triton")
 
 
 def _platforms(wish: str) -> tuple[str, ...]:
-    """MuJoCo's OpenGL platforms in the order to try."""
+    """Return MuJoCo's OpenGL platforms in the order in which to try them."""
     if wish in ("egl", "osmesa", "glfw", "cgl"):
         return (wish,)
     if sys.platform == "darwin":

@@ -1,88 +1,89 @@
-"""A movement as it is drawn, and what it touched."""
+"""Executed movements to draw, and their first contacts."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, point_distance_squared
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
 
-TOUCHING = 0.01
-"""Clearance up to which an obstacle is what was touched, [m]."""
+CONTACT_TOLERANCE = 0.01
+"""Greatest clearance of an obstacle that counts as the one in contact, [m]."""
 
 
-class Touch(NamedTuple):
-    """What touched what, and when."""
+class FirstContact(NamedTuple):
+    """First contact of a movement."""
 
     step: int
-    """Physics step of the first contact: the index into a rollout of the state in which they touched."""
+    """Physics step: the index into the movement of the state in contact."""
     obstacle: int
-    """Row of the obstacle; -1 where the arm touched itself or the table."""
+    """Row of the obstacle; -1 if the arm touched itself or the table."""
     link: int | None
-    """Index of the link; None is the hand."""
-    place: Float
-    """Where on the hand or on the link's axis, shape (D,), [m]."""
+    """Index of the link, or None for the hand."""
+    position: Float
+    """Nearest point of the hand or of the link's axis, shape (D,), [m]."""
 
 
 class Movement(NamedTuple):
-    """A movement as it is drawn: its states from the start on, one more than physics steps."""
+    """Movement to draw: its states from the start on, one more than physics steps."""
 
     planned: Float
-    """Hand path of the plan, shape (T + 1, D), [m]."""
+    """Planned path of the hand, shape (T + 1, D), [m]."""
     vias: Float
-    """Shape (K, D), [m]."""
+    """Via-points, shape (K, D), [m]."""
     joints: Float
-    """Shape (T + 1, J), [rad]."""
+    """Joint angles, shape (T + 1, J), [rad]."""
     hand: Float
-    """Shape (T + 1, D), [m]."""
-    touch: Touch | None
-    """The first contact."""
+    """Executed path of the hand, shape (T + 1, D), [m]."""
+    contact: FirstContact | None
+    """First contact, if any."""
 
     @classmethod
     def of(cls, collision_model: CollisionModel, scene: Scenes, plan: Plan, rollout: Rollout) -> Movement:
-        """The movement of one plan in one scene; both have one row."""
+        """Return the movement of a plan in a scene; both have one row."""
         arm = collision_model.arm
-        start = np.asarray(arm.inverse_kinematics(scene.start))
-        joints = np.concatenate((start, rollout.joints))
+        joints = np.concatenate((np.asarray(arm.inverse_kinematics(scene.start)), rollout.joints))
         return cls(
             planned=np.concatenate((scene.start, rollout.planned)),
             vias=np.asarray(plan.waypoints).reshape(-1, arm.dimension)[1:-1],
             joints=joints,
             hand=np.concatenate((scene.start, rollout.hand)),
-            touch=first_touch(collision_model, scene, joints, rollout.contact),
+            contact=first_contact(collision_model, scene, joints, rollout.contact),
         )
 
 
-def first_touch(
-    collision_model: CollisionModel, scene: Scenes, joints: Float, contact: NDArray[np.bool_]
-) -> Touch | None:
-    """What the arm touched first: the nearest part and obstacle where the physics first reports contact."""
+def first_contact(
+    collision_model: CollisionModel, scene: Scenes, joints: Float, contact: Bool
+) -> FirstContact | None:
+    """Return the first contact: the nearest body and obstacle at the first step at which the simulation reports one.
+
+    Args:
+        collision_model: Arm, and whether its links collide.
+        scene: Scene of one row.
+        joints: Joint angles, shape (T + 1, J), [rad].
+        contact: True for steps with contact, shape (T,).
+    """
     if not contact.any():
         return None
     arm, step = collision_model.arm, int(contact.argmax())
-    posture = joints[None, step : step + 1]
-    rows, present = scene.obstacles, scene.present
-    parts = [hand_clearance(np.asarray(arm.hand_position(posture)), arm.hand_radius, rows, present)]
+    joints = joints[None, step : step + 1]
+    hand, links = (np.asarray(each(joints)) for each in (arm.hand_position, arm.links))
+    obstacles = scene.obstacles, scene.present
+    bodies = [hand_clearance(hand, arm.hand_radius, *obstacles)]
     if collision_model.whole_arm:
-        links = np.asarray(arm.links(posture))
-        for i, radius in enumerate(arm.link_radii):
-            parts.append(arm_clearance(links[..., i : i + 1, :, :], (radius,), rows, present))
-    if not rows.shape[1] or min(float(each.min()) for each in parts) > TOUCHING:
-        return Touch(step, -1, None, np.asarray(arm.hand_position(posture))[0, 0])
-    part, obstacle = np.unravel_index(np.argmin(np.stack(parts)[:, 0]), (len(parts), rows.shape[1]))
-    link = int(part) - 1 if part else None
-    ends = (
-        np.asarray(arm.hand_position(posture))[0]
-        if link is None
-        else np.asarray(arm.links(posture))[0, 0, link]
-    )
-    places = ends[0] + np.linspace(0.0, 1.0, 200)[:, None] * (ends[-1] - ends[0])
-    nearest = point_distance_squared(places, rows[0, obstacle : obstacle + 1]).argmin()
-    return Touch(step, int(obstacle), link, places[nearest])
+        each = enumerate(arm.link_radii)
+        bodies += [arm_clearance(links[..., i : i + 1, :, :], (radius,), *obstacles) for i, radius in each]
+    clearance = np.concatenate(bodies)
+    if not clearance.size or clearance.min() > CONTACT_TOLERANCE:
+        return FirstContact(step, -1, None, hand[0, 0])
+    body, obstacle = (int(i) for i in np.unravel_index(clearance.argmin(), clearance.shape))
+    ends = links[0, 0, body - 1] if body else hand[0]
+    points = ends[0] + np.linspace(0.0, 1.0, 200)[:, None] * (ends[-1] - ends[0])
+    nearest = point_distance_squared(points, scene.obstacles[0, obstacle : obstacle + 1]).argmin()
+    return FirstContact(step, obstacle, body - 1 if body else None, points[nearest])

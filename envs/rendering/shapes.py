@@ -1,4 +1,4 @@
-"""Shapes added to a MuJoCo scene for the eye alone."""
+"""Decorative shapes in a MuJoCo scene, which have no physics."""
 
 from __future__ import annotations
 
@@ -8,64 +8,65 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 
 Geom = Any
-"""A shape in a scene."""
+"""Decorative geom of a scene."""
 Shape = mujoco.mjtGeom
 
 MATT, GLOWING = 0.0, 1.0
-"""How much of its colour a thing shows without light: lines are ink, things are lit."""
+"""Emission relative to the colour: lines glow, bodies are lit."""
 VAULT = 0.4
-"""Height of a post's head relative to its radius."""
+"""Height of a post's rounded head relative to its radius."""
 
 
-class Pencil:
-    """Adds shapes to a scene until its room is used up."""
+class ShapeWriter:
+    """Writer of decorative shapes into a scene; shapes beyond the scene's capacity are left out."""
 
     def __init__(self, scene: mujoco.MjvScene) -> None:
         self._scene = scene
 
     def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
-        """A sphere at `centre` (3,) [m]."""
+        """Add a sphere at `centre` (3,) [m]."""
         self._add(Shape.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
 
     def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
-        """A flat cylinder that stands on `centre` (3,) [m]."""
+        """Add a flat cylinder that stands on `centre` (3,) [m]."""
         middle = np.array([*centre[:2], centre[2] + height / 2.0])
         self._add(Shape.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
 
     def rod(
         self, first: Float, second: Float, radius: float, colour: Colour, glow: float = MATT
     ) -> Geom | None:
-        """A capsule from `first` (3,) to `second` (3,) [m]."""
+        """Add a capsule from `first` (3,) to `second` (3,) [m]."""
         geom = self._add(Shape.mjGEOM_CAPSULE, (radius,) * 3, first, colour, glow)
         if geom is not None:
             mujoco.mjv_connector(geom, Shape.mjGEOM_CAPSULE, radius, first, second)
         return geom
 
     def line(self, points: Float, radius: float, colour: Colour) -> None:
-        """A tube through `points` (n, 3) [m] that throws no shadow."""
+        """Add a tube through `points` (n, 3) [m] without a shadow."""
         for first, second in itertools.pairwise(points):
             geom = self.rod(first, second, radius, colour, GLOWING)
             if geom is not None:
                 geom.castshadow = False
 
     def ring(self, centre: Float, radius: float, thickness: float, colour: Colour) -> None:
-        """A circle painted on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
+        """Add a circle on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
         self.disc(centre, radius, 0.001, colour, GLOWING)
         self.disc(centre, radius - thickness, 0.002, PALETTE.table)
 
     def post(self, foot: Float, top: float, radius: float, colour: Colour) -> None:
-        """An upright post with a vaulted head, from `foot` (3,) up to the height `top` [m]."""
+        """Add an upright post with a rounded head, from `foot` (3,) up to the height `top` [m]."""
         vault = VAULT * radius
         self.disc(foot, radius, top - vault - foot[2], colour)
         head = np.array([*foot[:2], top - vault])
         self._add(Shape.mjGEOM_ELLIPSOID, (radius, radius, vault), head, colour, MATT)
 
     def wall(self, foot: Float, half_axis: Float, top: float, radius: float, colour: Colour) -> None:
-        """A rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
+        """Add a rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
         crest = top - radius
         ends = foot - half_axis, foot + half_axis
         for end in ends:
@@ -98,16 +99,15 @@ class Pencil:
 
 
 def resampled(points: Float, spacing: float) -> Float:
-    """A polyline through `points` (n, D) with points about `spacing` apart, [m]; both ends are kept."""
-    steps = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=-1))
-    length = np.concatenate(([0.0], np.cumsum(steps)))
+    """Return points about `spacing` [m] apart along a polyline through `points` (n, D) [m], with both ends."""
+    length = np.concatenate(([0.0], np.cumsum(norm(np.diff(points, axis=0)))))
     count = max(int(np.ceil(length[-1] / spacing)), 1) + 1
     places = np.linspace(0.0, length[-1], count)
     return np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
 
 
 def in_space(points: Float, height: float) -> Float:
-    """Points (..., D) of the plane at `height` [m]; those of space as they are."""
+    """Return points (..., D) [m] in space: those of the plane at a height [m], others unchanged."""
     if points.shape[-1] == 3:
         return points
     return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)

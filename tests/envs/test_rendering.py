@@ -4,7 +4,7 @@ import pytest
 from drawn import AROUND, OBSTACLES, SCENE, STRAIGHT, moved
 
 from viapoint.envs.rendering import renderer, scene_view
-from viapoint.envs.rendering.overlay import Movement, first_touch
+from viapoint.envs.rendering.overlay import Movement, first_contact
 from viapoint.envs.rendering.renderer import check_render_mode, frame_steps
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
@@ -112,10 +112,10 @@ def test_the_obstacle_that_was_touched_is_named(name):
     movement = Movement.of(
         inner.task.collision_model, scene, plan, inner.last_rollout
     )  # fmt: skip
-    assert movement.touch.obstacle == 1
-    assert movement.touch.step == inner.last_rollout.contact.argmax()
+    assert movement.contact.obstacle == 1
+    assert movement.contact.step == inner.last_rollout.contact.argmax()
     tip = np.array([-0.11, 0.4])
-    assert np.linalg.norm(movement.touch.place - tip) < 0.01 + max(inner.task.arm.link_radii)
+    assert np.linalg.norm(movement.contact.position - tip) < 0.01 + max(inner.task.arm.link_radii)
 
 
 def test_pictures_leave_no_trace_in_the_simulation(make):
@@ -167,7 +167,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
 
 
 def test_a_full_scene_is_drawn_in_part_and_not_refused(make, monkeypatch):
-    monkeypatch.setattr(scene_view, "ROOM", 12)
+    monkeypatch.setattr(scene_view, "MAX_GEOMS", 12)
     env = make(side=16)
     moved(env, AROUND)
     assert env.render().shape == (16, 16, 3)
@@ -197,5 +197,5 @@ def test_a_contact_that_is_with_no_obstacle_is_drawn_as_such():
     env.reset(seed=0)
     scene = env.batch.scenes
     joints = np.repeat(env.task.arm.inverse_kinematics(scene.start), 3, axis=0)
-    touch = first_touch(env.task.collision_model, scene, joints, np.array([False, True, True]))
-    assert (touch.step, touch.obstacle, touch.link) == (1, -1, None)
+    contact = first_contact(env.task.collision_model, scene, joints, np.array([False, True, True]))
+    assert (contact.step, contact.obstacle, contact.link) == (1, -1, None)

@@ -12,7 +12,7 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.rendering.overlay import Movement, Touch
+from viapoint.envs.rendering.overlay import FirstContact, Movement
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
 
@@ -53,21 +53,21 @@ def draw_movement(
     _draw_ends(axes, scene, scale)
     if plan is not None:
         _draw_plan(axes, plan, scale)
-    joints, hand, touch = np.asarray(arm.inverse_kinematics(scene.start))[0], scene.start[0], None
+    joints, hand, contact = np.asarray(arm.inverse_kinematics(scene.start))[0], scene.start[0], None
     if plan is not None and rollout is not None:
         movement = Movement.of(CollisionModel(arm, whole_arm), scene, plan, rollout)
         last = len(movement.hand) - 1 if step is None else step
         _draw_execution(axes, movement, last, scale)
-        touch = movement.touch if movement.touch is not None and last >= movement.touch.step else None
-        pose = touch.step if touch is not None and step is None else last
+        contact = movement.contact if movement.contact is not None and last >= movement.contact.step else None
+        pose = contact.step if contact is not None and step is None else last
         joints, hand = movement.joints[pose], movement.hand[pose]
-    _draw_obstacles(axes, arm, scene, None if touch is None else touch.obstacle)
+    _draw_obstacles(axes, arm, scene, None if contact is None else contact.obstacle)
     if arm_shown:
         _draw_arm(axes, arm, joints, above=not whole_arm)
-        colour = PALETTE.contact if touch is not None and touch.link is None else PALETTE.executed
+        colour = PALETTE.contact if contact is not None and contact.link is None else PALETTE.executed
         axes.add_patch(Circle(_xy(hand), arm.hand_radius, color=colour, linewidth=0, zorder=7))
-    if touch is not None:
-        _draw_contact(axes, touch, scale)
+    if contact is not None:
+        _draw_contact(axes, contact, scale)
 
 
 def capsule(first: Float, second: Float, radius: float) -> Float:
@@ -122,7 +122,7 @@ def _draw_plan(axes: Axes, plan: Plan, scale: float) -> None:
 
 def _draw_execution(axes: Axes, movement: Movement, step: int, scale: float) -> None:
     """Draw the executed path up to a step, red after contact."""
-    free = step if movement.touch is None else min(step, movement.touch.step)
+    free = step if movement.contact is None else min(step, movement.contact.step)
     for first, last, colour in ((0, free, PALETTE.executed), (free, step, PALETTE.contact)):
         executed = movement.hand[first : last + 1, :2]
         axes.plot(*executed.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
@@ -138,10 +138,10 @@ def _draw_arm(axes: Axes, arm: Arm, joints: Float, *, above: bool) -> None:
         axes.add_patch(Circle(_xy(first), 0.4 * radius, color=PALETTE.joint, linewidth=0, zorder=6.7))
 
 
-def _draw_contact(axes: Axes, touch: Touch, scale: float) -> None:
+def _draw_contact(axes: Axes, contact: FirstContact, scale: float) -> None:
     """Draw a cross at the first contact."""
     for colour, size, width in (("white", 10.5, 4.4), (PALETTE.contact, 9.5, 2.4)):
-        (cross,) = axes.plot(*_xy(touch.place), "x", color=colour, zorder=8)
+        (cross,) = axes.plot(*_xy(contact.position), "x", color=colour, zorder=8)
         cross.set(markersize=size * scale, markeredgewidth=width * scale)
 
 
