@@ -1,10 +1,10 @@
-"""Everything in docs/results.md, by one command: trainings, evaluations, baselines, the page and its figures.
+"""Reproduce docs/results.md: trainings, evaluations, baselines, the page and its figures.
 
     python benchmarks/learning.py --jobs 2
     python benchmarks/learning.py --help
 
-Each training is a run folder and each evaluation a file below --out; whatever is there already is kept, so a second
-call goes on where the first stopped, and the page is made from what is there and says which seeds are in.
+Each training is a run folder and each evaluation a file below --out. Existing ones are kept, so a second call continues
+where the first stopped. The page is made from the existing files and states which seeds are included.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 import tyro
-from study import gather, page, work
+from study import aggregate, jobs, page
 from study.figures import draw
 from study.merge import check_conditions, merged
 from study.plan import Study
@@ -32,24 +32,24 @@ from study.plan import Study
 from viapoint.training.io.files import read_json, write_bytes, write_json
 
 Answer = tuple[bool, str]
-"""Whether a job went well, and what it told."""
+"""Success of a job, and its summary or error."""
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Do what is left to do, write the page, and return how many jobs failed; 1 if the page is of other conditions."""
-    study = tyro.cli(Study, args=words, config=(tyro.conf.OmitArgPrefixes,))
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run open jobs, write the page, and return the number of failed jobs; 1 if the page has other conditions."""
+    study = tyro.cli(Study, args=arguments, config=(tyro.conf.OmitArgPrefixes,))
     known = study.docs / "results.json"
     before = read_json(known) if known.is_file() and "page" in study.only and not study.alone else None
     try:
-        check_conditions(study, before or gather.conditions(study))
+        check_conditions(study, before or aggregate.conditions(study))
     except ValueError as error:
         print(error, file=sys.stderr)
         return 1
-    failed = carry_out(work.jobs(study), study.jobs)
+    failed = run_jobs(jobs.all_jobs(study), study.jobs)
     if "time" in study.only:
-        print(work.time_decisions(study), flush=True)
+        print(jobs.time_decisions(study), flush=True)
     if "page" in study.only:
-        record = gather.gather(study)
+        record = aggregate.aggregate(study)
         record = record if before is None else merged(record, before)
         study.docs.joinpath("images").mkdir(parents=True, exist_ok=True)
         write_json(known, record)
@@ -62,25 +62,25 @@ def main(words: Sequence[str] | None = None) -> int:
     return len(failed)
 
 
-def carry_out(jobs: Sequence[work.Job], processes: int) -> list[tuple[str, str]]:
-    """Do the jobs, some at a time, and say how each went; the labels and reasons of those that failed are returned."""
+def run_jobs(queue: Sequence[jobs.Job], processes: int) -> list[tuple[str, str]]:
+    """Run jobs in parallel, print their summaries, and return the labels and errors of those that failed."""
     failed, began = [], time.monotonic()
-    for number, (job, (well, told)) in enumerate(_answers(jobs, processes), 1):
+    for number, (job, (succeeded, summary)) in enumerate(_answers(queue, processes), 1):
         minutes = (time.monotonic() - began) / 60.0
         print(
-            f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}: {'' if well else 'FAILED: '}{told}",
+            f"[{number}/{len(queue)}, {minutes:.1f} min] {job.label}: {'' if succeeded else 'FAILED: '}{summary}",
             flush=True,
         )
-        if not well:
-            failed.append((job.label, told))
+        if not succeeded:
+            failed.append((job.label, summary))
     return failed
 
 
-def _answers(jobs: Sequence[work.Job], processes: int) -> Iterator[tuple[work.Job, Answer]]:
-    """Each job with its answer, in the order in which they end; what is done already needs no process."""
-    quick = [not processes or job.done() for job in jobs]
-    yield from ((job, _answer(job)) for job, here in zip(jobs, quick, strict=True) if here)
-    waiting = [job for job, here in zip(jobs, quick, strict=True) if not here]
+def _answers(queue: Sequence[jobs.Job], processes: int) -> Iterator[tuple[jobs.Job, Answer]]:
+    """Yield jobs with their answers as they end; jobs that are done already need no process."""
+    here = [job for job in queue if not processes or job.done()]
+    yield from ((job, _answer(job)) for job in here)
+    waiting = [job for job in queue if job not in here]
     places = list(range(processes))
     running: dict[Any, Any] = {}
     context = multiprocessing.get_context("spawn")
@@ -88,7 +88,9 @@ def _answers(jobs: Sequence[work.Job], processes: int) -> Iterator[tuple[work.Jo
         while waiting and places:
             job, place = waiting.pop(0), places.pop(0)
             mine, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_work, args=(job, place, processes, theirs), name=job.label)
+            process = context.Process(
+                target=_run_in_process, args=(job, place, processes, theirs), name=job.label
+            )
             process.start()
             theirs.close()
             running[mine] = process, job, place
@@ -105,27 +107,27 @@ def _answers(jobs: Sequence[work.Job], processes: int) -> Iterator[tuple[work.Jo
             yield job, answer
 
 
-def _work(job: work.Job, place: int, processes: int, answer: Any) -> None:
-    """Do a job in a process of its own, on its share of the cores, so that times can be compared."""
+def _run_in_process(job: jobs.Job, place: int, processes: int, answer: Any) -> None:
+    """Run a job in a process of its own, on its share of the cores, so that times can be compared."""
     threading.Thread(target=_save_and_leave, daemon=True).start()
     if hasattr(os, "sched_getaffinity"):
         mine = sorted(os.sched_getaffinity(0))[place::processes]
         if mine:
             os.sched_setaffinity(0, mine)
-    with contextlib.suppress(BrokenPipeError):  # nobody is left to hear it
+    with contextlib.suppress(BrokenPipeError):  # the parent is gone
         answer.send(_answer(job))
 
 
-def _answer(job: work.Job) -> Answer:
-    """Whether a job went well, and what it told."""
+def _answer(job: jobs.Job) -> Answer:
+    """Run a job and return its success with its summary or error."""
     try:
-        return True, job.work(*job.arguments)
+        return True, job.run(*job.arguments)
     except Exception as error:
         return False, f"{type(error).__name__}: {error}"
 
 
 def _save_and_leave() -> None:
-    """Stop as by Ctrl-C once the parent is gone, however it went: a training saves itself first."""
+    """Interrupt this process as by Ctrl-C once its parent is gone; a training saves itself first."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,1 +1,1 @@
-"""The measurements behind docs/results.md: what is trained, the work, the numbers, the page, the figures."""
+"""Study behind docs/results.md: plan, jobs, aggregation, page and figures."""

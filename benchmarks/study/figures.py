@@ -1,4 +1,4 @@
-"""One figure for each environment: how fast the methods learn, and what they can do."""
+"""Figure of each environment: learning curves and success by band."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
+from study.jobs import ALONE, CHECKED, UNTRAINED, WAYS
 from study.page import figure_name
 from study.plan import short
-from study.work import ALONE, CHECKED, UNTRAINED, WAYS
 from viapoint.training.evaluation.statistics import interquartile_mean
 from viapoint.training.io.files import write_bytes
 from viapoint.training.plotting.plots import AXES, style_axes
@@ -45,7 +45,7 @@ DOTS_PER_INCH, SHADES = 100, 96
 
 
 def draw(record: Numbers, folder: Path) -> list[Path]:
-    """Draw the figure of every environment that has an agent; the paths."""
+    """Draw the figure of every environment that has an agent, and return the paths."""
     return [
         _draw(env, numbers, folder / figure_name(env))
         for env, numbers in record["environments"].items()
@@ -71,7 +71,7 @@ def _draw(env: str, numbers: Numbers, path: Path) -> Path:
 
 
 def _learning(axes: Any, curves: Numbers) -> None:
-    """Success on validation scenes against three clocks: interquartile mean, least and most of the seeds."""
+    """Draw success on validation scenes against three clocks: interquartile mean and range of the seeds."""
     for ax, (key, label, scale) in zip(axes, AXES, strict=True):
         for name, curve in curves.items():
             if len(curve["success"]) < 2:
@@ -83,7 +83,7 @@ def _learning(axes: Any, curves: Numbers) -> None:
             ax.fill_between(x, rates.min(axis=1), rates.max(axis=1), color=colour, alpha=0.18, linewidth=0.0)
         ax.set_xscale("log")
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        ax.xaxis.set_major_formatter(FuncFormatter(_in_short))
+        ax.xaxis.set_major_formatter(FuncFormatter(_short_number))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlabel(label, fontsize=8)
         _tidy(ax)
@@ -93,7 +93,7 @@ def _learning(axes: Any, curves: Numbers) -> None:
 
 
 def _abilities(ax: Axes, numbers: Numbers, name: str) -> None:
-    """Success by band with intervals, on one set."""
+    """Draw success by band with intervals, on one set."""
     bands = [band for band in BANDS if numbers["sets"][name]["bands"][band]]
     rows = [
         (
@@ -124,8 +124,8 @@ def _abilities(ax: Axes, numbers: Numbers, name: str) -> None:
     _tidy(ax)
 
 
-def _in_short(value: float, _: Any) -> str:
-    """A number of a tick: 0.03, 300, 10k, 3M."""
+def _short_number(value: float, _: Any) -> str:
+    """Format a tick: 0.03, 300, 10k, 3M."""
     for unit, suffix in ((1e6, "M"), (1e3, "k")):
         if value >= unit:
             return f"{value / unit:g}{suffix}"
@@ -139,7 +139,7 @@ def _tidy(ax: Axes) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """As a small file: a few dozen shades are enough."""
+    """Save a figure as a small PNG; SHADES colours are enough."""
     drawn, packed = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, dpi=DOTS_PER_INCH, metadata={"Software": None})
     picture = Image.open(drawn).convert("RGB").quantize(SHADES, dither=Image.Dither.NONE)

@@ -1,8 +1,8 @@
-"""New numbers beside those that the page holds already, so that a study can grow on more than one machine.
+"""Merging of new numbers with those of the page, so that a study can grow on more than one machine.
 
-A page's numbers outlive the run folders they come from. What was not measured again stays as it is, as long as it was
-measured on the same scenes. A method that was measured again replaces the entry there is once it tells all that this
-does, of as many seeds: on the same sets, and beside the same baselines.
+The numbers of the page outlive the run folders. Entries that were not measured again are kept if they are of the same
+scenes. A new entry of a method replaces the old one if it has at least as many seeds and covers the same sets and
+baselines.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from study.gather import conditions, improvement
+from study.aggregate import conditions, improvement
 from study.plan import ABLATIONS, FREEDOM, METHODS, WHOLE, Study, Variant
 from viapoint.envs.registration import TASKS
 from viapoint.training.planners.baselines import METHODS as BASELINE_METHODS
@@ -19,10 +19,10 @@ Numbers = dict[str, Any]
 
 
 def check_conditions(study: Study, old: Numbers) -> None:
-    """Refuse to put numbers beside others that were measured under other conditions.
+    """Check that the old record has the conditions of the study.
 
     Raises:
-        ValueError: The old record is of other numbers of decisions, scenes or checks.
+        ValueError: The old record has other numbers of decisions, scenes or checks.
     """
     for name, mine in conditions(study).items():
         if mine != old.get(name):
@@ -33,7 +33,7 @@ def check_conditions(study: Study, old: Numbers) -> None:
 
 
 def merged(new: Numbers, old: Numbers) -> Numbers:
-    """A record of what is in either, under the same conditions; nothing old where the scenes are others."""
+    """Return the union of two records of the same conditions; old entries of other scenes are dropped."""
     environments = dict(old["environments"])
     others = [
         env
@@ -59,7 +59,7 @@ def _without(numbers: Numbers, environments: Sequence[str]) -> Numbers:
 
 
 def _each(new: Numbers, old: Numbers, join: Callable[[Any, Any], Any]) -> Numbers:
-    """What is in either, by environment."""
+    """Join the entries of two records by environment."""
     return {
         env: join(new[env], old[env]) if env in new and env in old else {**old, **new}[env]
         for env in {**old, **new}
@@ -78,9 +78,9 @@ def _freedom(new: Numbers, old: Numbers) -> Numbers:
 
 
 def _environment(new: Numbers, old: Numbers) -> Numbers:
-    """One environment's; what compares or describes the whole agent comes from where its entry does."""
-    told = all(_covers(new[name], old[name]) for name in ("failures", "compared"))
-    found = [each for each in new["methods"] if told or each["name"] != WHOLE.name]
+    """Join two records of an environment; comparisons of the whole agent come from the record of its entry."""
+    complete = all(_covers(new[name], old[name]) for name in ("failures", "compared"))
+    found = [each for each in new["methods"] if complete or each["name"] != WHOLE.name]
     methods = _joined(found, old["methods"], METHODS)
     mine = {each["name"] for each in methods if each in new["methods"]}
     whole = new if WHOLE.name in mine else old
@@ -105,7 +105,7 @@ def _environment(new: Numbers, old: Numbers) -> Numbers:
 
 
 def _joined(new: Sequence[Numbers], old: Sequence[Numbers], order: Sequence[Variant]) -> list[Numbers]:
-    """One entry of each method."""
+    """Return one entry of each method."""
     entries = {each["name"]: each for each in old}
     for each in new:
         known = entries.get(each["name"], {"seeds": [], "sets": {}})
@@ -115,7 +115,7 @@ def _joined(new: Sequence[Numbers], old: Sequence[Numbers], order: Sequence[Vari
 
 
 def _covers(new: Any, old: Any) -> bool:
-    """Whether new numbers tell all that the old ones do."""
+    """Return whether new numbers have a value wherever the old ones do."""
     if isinstance(old, dict):
         return not old or (isinstance(new, dict) and all(_covers(new.get(name), old[name]) for name in old))
     return old is None or new is not None

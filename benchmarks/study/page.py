@@ -1,4 +1,4 @@
-"""From numbers to docs/results.md: prose is a template, every number comes from the record."""
+"""Page docs/results.md from the record: prose is a template, and every number comes from the record."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from study.jobs import ALONE, CHECKED, N_PLANNED, WAYS
 from study.plan import FREEDOM_LABELS, WHOLE, short
 from study.prose import FAILURES, FREEDOM, INTRODUCTION, KNOWLEDGE, TAGS
-from study.work import ALONE, CHECKED, PLANNED, WAYS
 from viapoint.training.runs import callback
 from viapoint.training.scene_sets.scene_set import BANDS
 
@@ -17,7 +17,7 @@ Rows = list[list[str]]
 
 
 def page(record: Numbers) -> str:
-    """The whole document."""
+    """Return the whole page as Markdown."""
     parts = [INTRODUCTION.format(seeds=_seeds(record)), KNOWLEDGE]
     parts += [_environment(env, each) for env, each in record["environments"].items()]
     parts.append(FAILURES)
@@ -33,7 +33,7 @@ def page(record: Numbers) -> str:
 
 
 def _seeds(record: Numbers) -> str:
-    """Which trainings are in."""
+    """Return a sentence about the seeds that are included."""
     wanted = record["seeds"]
     entries = [
         (short(env), entry) for env, each in record["environments"].items() for entry in each["methods"]
@@ -53,7 +53,7 @@ def _seeds(record: Numbers) -> str:
 
 
 def _environment(env: str, numbers: Numbers) -> str:
-    """One environment: figure, a table for each set, what follows from them."""
+    """Return the section of one environment: figure, tables and comparisons."""
     lines = [f"## {short(env)}"]
     if numbers["methods"]:
         lines.append(f"![Learning curves and success by band](images/{figure_name(env)})")
@@ -70,13 +70,13 @@ def _environment(env: str, numbers: Numbers) -> str:
 
 
 def figure_name(env: str) -> str:
-    """File of an environment's figure."""
+    """Return the file name of an environment's figure."""
     words = re.findall("[A-Z][a-z]*", short(env).partition("-")[0])
     return "_".join(["results", *words]).lower() + ".png"
 
 
 def _rows(numbers: Numbers, name: str, about: Numbers) -> Rows:
-    """Every method on one set."""
+    """Return the rows of all methods on one set."""
     bands = [band for band in BANDS if about["bands"][band]] if sum(about["bands"].values()) else []
     head = ["method", "seeds", "success (95 %)", *bands, "jerk / planner", "duration / planner", "decision"]
     head += ["minutes (cores)", "decisions", "simulated"]
@@ -119,7 +119,7 @@ def _effort(entry: Numbers) -> list[str]:
 
 
 def _families(numbers: Numbers, name: str, about: Numbers) -> str:
-    """Success by family of scenes, where a set has families."""
+    """Return a table of success by family of scenes, empty where a set has no families."""
     families = about["families"]
     if not families:
         return ""
@@ -152,7 +152,7 @@ def _comparison(numbers: Numbers, name: str) -> str:
 
 
 def _failure_table(found: Numbers, name: str) -> str:
-    """Failures by kind."""
+    """Return a table of failures by kind."""
     if not found:
         return ""
     kinds = next(iter(found.values()))
@@ -185,7 +185,7 @@ def _improvement(found: Numbers) -> str:
 
 
 def _ablations(env: str, entries: Sequence[Numbers]) -> str:
-    """What each part contributes."""
+    """Return the section of ablations."""
     lines = [f"## What each part contributes: {short(env)}"]
     whole = entries[0]
     for name in whole["sets"]:
@@ -209,8 +209,8 @@ def _with_rarest(found: Numbers | None) -> list[str]:
 
 
 def _freedom(env: str, found: Numbers, record: Numbers) -> str:
-    """K and timing by band."""
-    lines = [FREEDOM.format(planned=PLANNED).replace("pay?", f"pay? {short(env)}", 1).strip()]
+    """Return the section of action spaces: number of via-points and timing."""
+    lines = [FREEDOM.format(planned=N_PLANNED).replace("pay?", f"pay? {short(env)}", 1).strip()]
     sets = list(dict.fromkeys(name for entry in found["agents"] for name in entry["sets"]))
     for name in sets:
         rows = [["agent", "seeds", "success (95 %)", *BANDS, "checked proposals", "jerk / planner"]]
@@ -231,7 +231,7 @@ def _freedom(env: str, found: Numbers, record: Numbers) -> str:
 
 
 def _answer(entries: Sequence[Numbers], name: str) -> str:
-    """In which bands some other freedom beats one via-point by more than the intervals."""
+    """Return a sentence that compares the best action space of each band with one via-point."""
     here = [entry for entry in entries if name in entry["sets"]]
     if len(here) < 2 or here[0]["name"] != WHOLE.name:
         return ""
@@ -249,7 +249,7 @@ def _answer(entries: Sequence[Numbers], name: str) -> str:
 
 
 def _tags() -> str:
-    """What a training logs."""
+    """Return the section of TensorBoard tags."""
     rows = [["tag", "meaning"], *([f"`{tag}`", words] for tag, words in TAGS.items())]
     known = {*callback.OUTCOMES, *callback.VALIDATED}
     assert known <= set(TAGS), known - set(TAGS)
@@ -258,7 +258,7 @@ def _tags() -> str:
 
 
 def _table(rows: Rows) -> str:
-    """Markdown; columns in which no method has a value are left out."""
+    """Return a Markdown table without the columns in which no method has a value."""
     shown = [i for i in range(len(rows[0])) if i == 0 or any(row[i] != "-" for row in rows[1:])]
     lines = [[row[i] for i in shown] for row in rows]
     lines.insert(1, ["---"] + ["---:"] * (len(shown) - 1))

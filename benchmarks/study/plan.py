@@ -1,4 +1,4 @@
-"""What is trained and how often: tables of variants, and the configuration of the study."""
+"""Plan of the study: tables of variants and the configuration."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from viapoint.training.scene_sets.scene_set import SETS, shipped_path
 Table = Literal["results", "ablations", "freedom"]
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
 MEASURED = tuple(name for name in SETS if name != "validation")
-"""Sets that are measured once training is over; models are chosen on `validation` alone."""
+"""Sets that are measured after training; models are selected on `validation` alone."""
 BASELINES = (
     "stored", "straight", "constant", "random", "random16", "random80", "search16", "search64", "search512",
     "search4096", "ompl",
 )  # fmt: skip
-"""Baselines of the results by their names; `planner` are the solutions that are stored with the scenes."""
+"""Baselines of the results; `stored` are the planner's solutions in the files of scenes."""
 VALIDATIONS, CHECKPOINTS = 8, 2
-"""Of each training, however long it is."""
+"""Numbers of validations and of checkpoints in each training."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One way to learn."""
+    """Variant of a learning method."""
 
     name: str
-    """Of its folder."""
+    """Name of its folder."""
     label: str
-    """In the tables."""
+    """Name in tables."""
     algo: Algorithm = "viaq"
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of the algorithm, or of ViaQ's policy, instead of the preset's."""
+    """Settings of the algorithm, or of ViaQ's policy, that replace those of the preset."""
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    """Of the environment."""
+    """Arguments of the environment."""
     step_wise: bool = False
-    """Whether it learns on the environment's step-wise twin, an action in every control step."""
+    """True for training on the step-wise twin of the environment, with an action in every control step."""
 
 
 METHODS = (
@@ -56,7 +56,7 @@ METHODS = (
         if algo in STEP_PRESETS
     ),
 )
-"""Each algorithm as its preset says."""
+"""Algorithms with their presets."""
 WHOLE = METHODS[0]
 DEFAULT_METHODS = (*get_args(Algorithm), "sac-step", "ppo-step")
 TWINS = {whole: step for step, whole in STEP_TASKS.items()}
@@ -101,7 +101,7 @@ ABLATIONS = (
         name="viaq-random", label="random actions only during training", settings={"explore_uniformly": 1.0}
     ),
 )
-"""The whole agent, and the agent without each of its parts; the column without checks is measured for all of them."""
+"""Whole agent, and agents without one of its parts."""
 FREEDOM = tuple(
     WHOLE
     if (n_via, timing) == (1, "optimal")
@@ -113,48 +113,48 @@ FREEDOM = tuple(
     for n_via in (1, 2, 3)
     for timing in ("optimal", "learned")
 )
-"""More via-points, and their timing left to the agent."""
+"""Action spaces: one to three via-points, with optimal or learned timing."""
 FREEDOM_LABELS = {each.name: each.label for each in FREEDOM} | {WHOLE.name: "K = 1, optimal timing"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Train, evaluate, and write docs/results.md with its figures; a second call goes on where the first stopped.
+    """Train, evaluate, and write docs/results.md with its figures; a second call continues where the first stopped.
 
     Example: python benchmarks/learning.py --jobs 2
     """
 
     out: Path = Path("runs/study")
-    """Folder of the run folders and of everything measured."""
+    """Folder of run folders and evaluations."""
     docs: Path = Path("docs")
     """Folder for results.md, results.json and images/results_*.png."""
     envs: tuple[str, ...] = ()
-    """Environments of the results; all that have frozen test scenes if not given."""
+    """Environments of the results; by default all that have frozen test scenes."""
     methods: tuple[str, ...] = DEFAULT_METHODS
-    """Of the results: learning algorithms, and with `-step` those that act in every control step."""
+    """Learning methods of the results; those with `-step` act in every control step."""
     studied: tuple[str, ...] = (DEFAULT_ENV,)
-    """Environments of ablations and freedom."""
+    """Environments of the tables ablations and freedom."""
     tables: tuple[Table, ...] = get_args(Table)
-    """Which tables are worked on; the page shows whatever is there."""
+    """Tables to measure; the page shows all existing numbers."""
     only: tuple[Step, ...] = get_args(Step)
-    """Which steps are taken."""
+    """Steps to run."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    """Of the trainings."""
+    """Seeds of the trainings."""
     jobs: int = 1
-    """Processes that train and measure at once, each on its share of the cores; 0 works in this process."""
+    """Number of parallel processes, each on its share of the cores; 0 for this process."""
     baselines: tuple[str, ...] = BASELINES
-    """Of the results; `stored` is the planner's solutions from the files of scenes, `planner` searches anew."""
+    """Baselines of the results; `stored` are the planner's solutions in the files of scenes, `planner` a new search."""
     checks: int = 64
-    """How many of an agent's proposals are checked by exact geometry in its second row."""
+    """Number of proposals that an agent checks with computed geometry in its second row."""
     alone: bool = False
-    """Leave out what the page holds and these files do not, such as what was measured on another machine."""
+    """Replace the page; by default numbers from other machines are kept."""
     n_timesteps: int | None = None
-    """Decisions of each training; as the preset says if not given. For trials."""
+    """Decisions of each training, for trials; by default those of the preset."""
     n_scenes: int | None = None
-    """Scenes of each set, at most. For trials."""
+    """Greatest number of scenes of each set, for trials."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+        """Check names and ranges."""
         for name, known in (
             ("envs", [env for env in TASKS if sets_of(env)]),
             ("studied", [env for env in TASKS if sets_of(env)]),
@@ -172,18 +172,18 @@ class Study:
 
     @property
     def environments(self) -> tuple[str, ...]:
-        """Of the results."""
+        """Environments of the results."""
         return self.envs or tuple(env for env in TASKS if sets_of(env))
 
     def variants(self, table: Table, env: str) -> tuple[Variant, ...]:
-        """The rows of a table of an environment."""
+        """Return the variants of a table of an environment."""
         if table == "results":
             asked = (each for each in METHODS if each.name in self.methods)
             return tuple(each for each in asked if env in TWINS or not each.step_wise)
         return ABLATIONS if table == "ablations" else FREEDOM
 
     def cells(self) -> list[Cell]:
-        """All trainings, seed after seed, so that every table has its first seed early."""
+        """Return all trainings, ordered by seed, so that every table has its first seed early."""
         found: dict[Cell, None] = {}
         for seed in self.seeds:
             for table in self.tables:
@@ -195,26 +195,26 @@ class Study:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One training of the study."""
+    """Training of the study."""
 
     env: str
     variant: Variant
     seed: int
 
     def __hash__(self) -> int:
-        """Variants are known by their names."""
+        """Return a hash; variants are identified by their names."""
         return hash((self.env, self.variant.name, self.seed))
 
     def __str__(self) -> str:
-        """In a line."""
+        """Return a label of one line."""
         return f"{short(self.env)} {self.variant.name} seed {self.seed}"
 
     def folder(self, study: Study) -> Path:
-        """Of the run."""
+        """Return the folder of the run."""
         return study.out / short(self.env) / self.variant.name / f"seed-{self.seed}"
 
     def training(self, study: Study) -> TrainConfig:
-        """The configuration of the run."""
+        """Return the configuration of the run."""
         config = TrainConfig(
             env=TWINS[self.env] if self.variant.step_wise else self.env,
             algo=self.variant.algo,
@@ -223,7 +223,7 @@ class Cell:
             out=self.folder(study),
             eval_scenes=min(study.n_scenes or 500, 500),
             env_kwargs=dict(self.variant.env_kwargs),
-            hyperparameters=placed(self.variant.settings)
+            hyperparameters=split_settings(self.variant.settings)
             if self.variant.algo == "viaq"
             else dict(self.variant.settings),
             progress=False,
@@ -236,11 +236,11 @@ class Cell:
         )
 
 
-def placed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as hyperparameters: ViaQ's own ones, and those of its policy in `policy_kwargs`.
+def split_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as hyperparameters of ViaQ, with those of its policy in `policy_kwargs`.
 
     Raises:
-        ValueError: Neither knows one of them.
+        ValueError: A setting is neither of ViaQ nor of its policy.
     """
     own, policy = (set(inspect.signature(kind.__init__).parameters) for kind in (ViaQ, ViaQPolicy))
     unknown = sorted(set(settings) - own - policy)
@@ -254,10 +254,10 @@ def placed(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def sets_of(env: str) -> list[str]:
-    """Names of the measured sets that an environment has."""
+    """Return the names of the measured sets of an environment."""
     return [name for name in MEASURED if shipped_path(name, env).is_file()]
 
 
 def short(env: str) -> str:
-    """An environment's id without its namespace."""
+    """Return the id of an environment without its namespace."""
     return env.rpartition("/")[2]

@@ -1,4 +1,4 @@
-"""What docs/results.md says in words; its numbers are filled in by page.py."""
+"""Prose of docs/results.md; page.py fills in the numbers."""
 
 INTRODUCTION = """# Results
 
@@ -74,4 +74,4 @@ TAGS = {
     "validation/decision_time": "median of single decisions, s",
     "time/simulated_seconds": "simulated so far; `time/fps` is decisions per second",
 }
-"""What the tags of the log mean."""
+"""Meanings of the tags in the log."""

@@ -11,8 +11,8 @@ import learning
 import numpy as np
 import pytest
 from PIL import Image
-from study import gather, page, work
-from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, placed
+from study import aggregate, jobs, page
+from study.plan import ABLATIONS, FREEDOM, WHOLE, Cell, Study, split_settings
 
 from viapoint.training.io.files import read_json
 from viapoint.training.runs.run_dir import Run
@@ -74,31 +74,33 @@ def test_the_figure_is_small(done):
 
 
 def test_a_second_call_does_nothing_again(done, monkeypatch):
-    assert all(job.done() for job in work.jobs(study_of(done, baselines=("stored", "random16", "search16"))))
+    assert all(
+        job.done() for job in jobs.all_jobs(study_of(done, baselines=("stored", "random16", "search16")))
+    )
 
     def never(*args, **kwargs):
         pytest.fail("did again what was done")
 
     before = {path: path.read_bytes() for path in (done / "docs").rglob("*.*")}
     for name in ("train", "evaluate_methods"):
-        monkeypatch.setattr(work, name, never)
+        monkeypatch.setattr(jobs, name, never)
     assert learning.main(words(done, *STEPS)) == 0
     assert before == {path: path.read_bytes() for path in (done / "docs").rglob("*.*")}
 
 
 def test_what_is_lost_is_measured_again(done, monkeypatch):
-    measured, evaluate = [], work.evaluate_methods
+    measured, evaluate = [], jobs.evaluate_methods
 
     def counted(methods, *rest, **kwargs):
         measured.append([method.name for method in methods])
         return evaluate(methods, *rest, **kwargs)
 
-    monkeypatch.setattr(work, "evaluate_methods", counted)
+    monkeypatch.setattr(jobs, "evaluate_methods", counted)
     lost = done / "runs" / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "study-test.json"
     before = lost.read_bytes()
     lost.unlink()
     assert (
-        "test" not in gather.gather(study_of(done))["environments"][ENV]["methods"][0]["sets"]
+        "test" not in aggregate.aggregate(study_of(done))["environments"][ENV]["methods"][0]["sets"]
     )  # half is nothing
     assert learning.main(words(done, *STEPS)) == 0
     assert measured == [["alone", "checked", "untrained"]]
@@ -113,14 +115,14 @@ def test_what_is_interrupted_is_not_kept(monkeypatch, tmp_path):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work.StoredSolutions, "decide", interrupted)
+    monkeypatch.setattr(jobs.StoredSolutions, "decide", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        work.baseline(ENV, "stored", study_of(tmp_path))
+        jobs.baseline(ENV, "stored", study_of(tmp_path))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_partial_study_says_which_seeds_are_in(done):
-    record = gather.gather(study_of(done, seeds=(0, 1, 2)))
+    record = aggregate.aggregate(study_of(done, seeds=(0, 1, 2)))
     text = page.page(record)
     assert "Seeds asked for: 0, 1, 2." in text
     assert "**Not all of them are in**; what there is: PlanarObstacles-v0, viaq: 0, 1." in text
@@ -130,19 +132,19 @@ def test_a_run_with_other_settings_is_refused_and_left_out(done, capsys):
     assert learning.main(words(done, "--only", "train", "--n-timesteps", "128", "--seeds", "0")) == 1
     assert "was trained with other settings (n_timesteps)" in capsys.readouterr().err
     other = study_of(done, n_timesteps=128)
-    assert gather.finished(ENV, WHOLE, other) == []
-    assert "None is in yet." in page.page(gather.gather(other))
+    assert aggregate.finished(ENV, WHOLE, other) == []
+    assert "None is in yet." in page.page(aggregate.aggregate(other))
 
 
 def test_decisions_are_timed_once(done):
     study = study_of(done, baselines=("random16",))
-    work.time_decisions(study)
-    times = read_json(work.timings_path(ENV, study))
+    jobs.time_decisions(study)
+    times = read_json(jobs.timings_path(ENV, study))
     assert set(times) == {"random16", "viaq alone", "viaq checked", "viaq untrained"}
     assert all(0.0 < each["median"] < 10.0 for each in times.values())
-    work.time_decisions(study)
-    assert read_json(work.timings_path(ENV, study)) == times
-    assert gather.gather(study)["environments"][ENV]["decision_time"]["random16"] == pytest.approx(
+    jobs.time_decisions(study)
+    assert read_json(jobs.timings_path(ENV, study)) == times
+    assert aggregate.aggregate(study)["environments"][ENV]["decision_time"]["random16"] == pytest.approx(
         times["random16"]["median"], abs=1e-6
     )
 
@@ -193,9 +195,12 @@ def test_ablations_and_freedom_are_told_by_band(done):
 
 
 def test_settings_go_where_they_are_taken():
-    assert placed({"temperature": 0.2, "width": 8}) == {"temperature": 0.2, "policy_kwargs": {"width": 8}}
+    assert split_settings({"temperature": 0.2, "width": 8}) == {
+        "temperature": 0.2,
+        "policy_kwargs": {"width": 8},
+    }
     with pytest.raises(ValueError, match="neither ViaQ nor its policy has a setting 'colour'"):
-        placed({"colour": 1})
+        split_settings({"colour": 1})
 
 
 def test_trainings_are_ordered_by_seed_and_shared_between_tables(tmp_path):
@@ -227,19 +232,19 @@ def test_one_job_that_fails_does_not_stop_the_others(tmp_path, monkeypatch):
     study = study_of(tmp_path)
 
     def job(label, function, *arguments):
-        return work.Job(label, function, arguments, work.has_planned)
+        return jobs.Job(label, function, arguments, jobs.has_planned)
 
-    jobs = [
+    queue = [
         job("dead", os._exit, 7),
-        job("custom", work.read_json, tmp_path / "nothing.json"),  # an error that cannot be pickled
+        job("custom", jobs.read_json, tmp_path / "nothing.json"),  # an error that cannot be pickled
     ]
-    monkeypatch.setattr(work.Job, "done", lambda self: False)
-    failed = dict(learning.carry_out(jobs, 1))
+    monkeypatch.setattr(jobs.Job, "done", lambda self: False)
+    failed = dict(learning.run_jobs(queue, 1))
     assert set(failed) == {"dead", "custom"}
     assert "ended with code 7" in failed["dead"]
     assert "nothing.json: is missing" in failed["custom"]
-    here = [job("bad", work.scenes, "nowhere", ENV, study), job("good", work.cores)]
-    failed = learning.carry_out(here, 0)
+    here = [job("bad", jobs.scenes, "nowhere", ENV, study), job("good", jobs.cores)]
+    failed = learning.run_jobs(here, 0)
     assert [label for label, _ in failed] == ["bad"]
     assert "scenes must be one of" in failed[0][1]
 
@@ -248,7 +253,7 @@ def test_a_cell_that_cannot_be_trained_says_why(tmp_path):
     study = study_of(tmp_path)
     variant = dataclasses.replace(WHOLE, name="strange", settings={"colour": 1})
     with pytest.raises(ValueError, match="setting 'colour'"):
-        work.complete(Cell(env=ENV, variant=variant, seed=0), study)
+        jobs.train_and_evaluate(Cell(env=ENV, variant=variant, seed=0), study)
 
 
 def test_no_number_of_the_page_is_typed_by_hand():

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import learning
-from study import gather
+from study import aggregate
 from study.merge import merged
 from study.plan import METHODS, WHOLE
 
@@ -24,7 +24,7 @@ def part(record, names):
         if WHOLE.name not in names:
             each["failures"] = {name: {} for name in each["failures"]}
             each["compared"] = {name: {} for name in each["compared"]}
-        each["improvement"] = gather.improvement(each["methods"])
+        each["improvement"] = aggregate.improvement(each["methods"])
     return some
 
 

@@ -1,4 +1,4 @@
-"""From files to numbers: one record that holds every number of the page."""
+"""Aggregation of the files of a study into one record with every number of the page."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from study import work
+from study import jobs
+from study.jobs import ALONE, CHECKED, WAYS
 from study.plan import ABLATIONS, FREEDOM, FREEDOM_LABELS, WHOLE, Cell, Study, Variant, sets_of
-from study.work import ALONE, CHECKED, WAYS
 from viapoint.envs.common.types import Bool
 from viapoint.training.evaluation.statistics import across_seeds, mcnemar, probability_of_improvement
 from viapoint.training.io.files import read_json
@@ -22,8 +22,8 @@ from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 Numbers = dict[str, Any]
 
 
-def gather(study: Study) -> Numbers:
-    """Everything that the page tells, from the files that are there."""
+def aggregate(study: Study) -> Numbers:
+    """Return the record of the page from the existing files."""
     record: Numbers = _rounded(
         {
             "versions": versions(),
@@ -38,19 +38,19 @@ def gather(study: Study) -> Numbers:
 
 
 def conditions(study: Study) -> Numbers:
-    """What must be the same for numbers to stand side by side."""
+    """Return the conditions that must agree for numbers to share a page."""
     trial = {"n_timesteps": study.n_timesteps, "n_scenes": study.n_scenes}
     return {"trial": trial, "checks": study.checks}
 
 
 def _environment(env: str, study: Study) -> Numbers:
-    """One environment's results."""
+    """Return the results of one environment."""
     variants = study.variants("results", env)
     found = _table(env, variants, {}, study)
-    path = work.timings_path(env, study)
+    path = jobs.timings_path(env, study)
     times = {name: each["median"] for name, each in read_json(path).items()} if path.is_file() else {}
     return {
-        "sets": {name: _described(work.scenes(name, env, study)) for name in sets_of(env)},
+        "sets": {name: _described(jobs.scenes(name, env, study)) for name in sets_of(env)},
         "methods": found,
         "baselines": _baselines(env, study),
         "decision_time": times,
@@ -72,19 +72,19 @@ def _described(frozen: FrozenScenes) -> Numbers:
 
 
 def _family(frozen: FrozenScenes) -> NDArray[np.str_]:
-    """The family of each scene, empty where a set has none, shape (N,)."""
+    """Return the family of each scene, empty where a set has none, shape (N,)."""
     family = getattr(frozen, "family", None)
     return np.full(len(frozen.share), "") if family is None else np.asarray(family).astype(str)
 
 
 def finished(env: str, variant: Variant, study: Study) -> list[Cell]:
-    """The trainings of a variant that are done."""
+    """Return the trainings of a variant that are done."""
     cells = [Cell(env=env, variant=variant, seed=seed) for seed in study.seeds]
-    return [cell for cell in cells if work.state(cell, study) == "trained"]
+    return [cell for cell in cells if jobs.state(cell, study) == "trained"]
 
 
 def _table(env: str, variants: Sequence[Variant], labels: dict[str, str], study: Study) -> list[Numbers]:
-    """One entry for each variant that has a seed."""
+    """Return one entry for each variant that has a trained seed."""
     found = []
     for variant in variants:
         cells = finished(env, variant, study)
@@ -104,7 +104,7 @@ def _table(env: str, variants: Sequence[Variant], labels: dict[str, str], study:
 
 
 def _training(cells: Sequence[Cell], study: Study) -> Numbers:
-    """What the trainings took: medians over seeds."""
+    """Return the effort of the trainings, medians over seeds."""
     runs = [Run(cell.folder(study)) for cell in cells]
     last = [run.curve[-1] for run in runs]
     cores = [run.folder / "cores.json" for run in runs]
@@ -117,30 +117,30 @@ def _training(cells: Sequence[Cell], study: Study) -> Numbers:
 
 
 def _agent(cells: Sequence[Cell], name: str, study: Study) -> Numbers:
-    """An agent's ways to decide on one set; empty unless every seed was measured."""
+    """Return the numbers of each decision mode of an agent on one set; empty unless every seed was measured."""
     records = _records(cells, name, study)
     if len(records) < len(cells):
         return {}
-    frozen = work.scenes(name, cells[0].env, study)
+    frozen = jobs.scenes(name, cells[0].env, study)
     ways = [way for way in WAYS if way in records[0]["methods"]]
     return {way: _numbers(records, way, frozen, study) for way in ways}
 
 
 def _records(cells: Sequence[Cell], name: str, study: Study) -> list[Numbers]:
-    """The evaluations that are there, and of these agents and scenes."""
+    """Return the stored evaluations of these agents and scenes."""
     found = []
     for cell in cells:
-        run, frozen = Run(cell.folder(study)), work.scenes(name, cell.env, study)
-        identity = work.identity_of(frozen, run.best, study)
-        record = work.kept(work.evaluation_path(cell, name, study), identity)
+        run, frozen = Run(cell.folder(study)), jobs.scenes(name, cell.env, study)
+        identity = jobs.identity_of(frozen, run.best, study)
+        record = jobs.stored(jobs.evaluation_path(cell, name, study), identity)
         if record is not None:
             found.append(record)
     return found
 
 
 def _numbers(records: Sequence[Numbers], method: str, frozen: FrozenScenes, study: Study) -> Numbers:
-    """A row of a table: success over seeds by band and family, smoothness and duration beside the planner's."""
-    success = work.rate_table(records, method, "is_success")
+    """Return a row of a table: success by band and family, jerk and duration relative to the planner's."""
+    success = jobs.rate_table(records, method, "is_success")
     frozen = frozen.take(slice(0, success.shape[1]))
     family = _family(frozen)
     names = [str(each) for each in np.unique(family) if each]
@@ -155,7 +155,7 @@ def _numbers(records: Sequence[Numbers], method: str, frozen: FrozenScenes, stud
         "by_family": {
             each: _interval(success[:, family == each], frozen.band[family == each]) for each in names
         },
-        "collision": float(work.rate_table(records, method, "collision").mean()),
+        "collision": float(jobs.rate_table(records, method, "collision").mean()),
         **_beside_the_planner(records, method, success.astype(bool), frozen, study),
     }
 
@@ -163,20 +163,20 @@ def _numbers(records: Sequence[Numbers], method: str, frozen: FrozenScenes, stud
 def _beside_the_planner(
     records: Sequence[Numbers], method: str, success: Bool, frozen: FrozenScenes, study: Study
 ) -> Numbers:
-    """Jerk ratio and duration of successes relative to the planner's in the same scenes: the median of scenes.
+    """Return jerk ratio and duration of successes relative to the planner's in the same scenes.
 
-    [median over seeds, least, most], or None without the planner or a success.
+    Each is [median over seeds, least, greatest] of the medians over scenes, or None without the planner or a success.
     """
-    path = work.baseline_path(frozen.env_id, frozen.name, "stored", study)
+    path = jobs.baseline_path(frozen.env_id, frozen.name, "stored", study)
     result: Numbers = {"jerk": None, "duration": None}
-    planner = work.kept(path, {"scenes": work.scenes(frozen.name, frozen.env_id, study).sha256})
+    planner = jobs.stored(path, {"scenes": jobs.scenes(frozen.name, frozen.env_id, study).sha256})
     if planner is None:
         return result
     name = next(iter(planner["methods"]))
-    solved = work.rate_table([planner], name, "is_success")[0, : success.shape[1]].astype(bool)
+    solved = jobs.rate_table([planner], name, "is_success")[0, : success.shape[1]].astype(bool)
     for key, outcome in (("jerk", "jerk_ratio"), ("duration", "duration")):
-        mine = work.rate_table(records, method, outcome)
-        theirs = work.rate_table([planner], name, outcome)[0, : success.shape[1]]
+        mine = jobs.rate_table(records, method, outcome)
+        theirs = jobs.rate_table([planner], name, outcome)[0, : success.shape[1]]
         medians = [
             float(np.median(row[both] / theirs[both]))
             for row, both in zip(mine, success & solved, strict=True)
@@ -195,8 +195,8 @@ def _baselines(env: str, study: Study) -> list[Numbers]:
     for name in (each for each in ("stored", *BASELINE_METHODS) if each in study.baselines):
         sets = {}
         for each in sets_of(env):
-            frozen = work.scenes(each, env, study)
-            record = work.kept(work.baseline_path(env, each, name, study), {"scenes": frozen.sha256})
+            frozen = jobs.scenes(each, env, study)
+            record = jobs.stored(jobs.baseline_path(env, each, name, study), {"scenes": frozen.sha256})
             if record is not None:
                 label = next(iter(record["methods"]))
                 sets[each] = _numbers([record], label, frozen, study)
@@ -206,7 +206,7 @@ def _baselines(env: str, study: Study) -> list[Numbers]:
 
 
 def _curves(env: str, variant: Variant, study: Study) -> Numbers:
-    """Success on validation scenes, shape (points, seeds), against three clocks, medians over seeds."""
+    """Return success on validation scenes, shape (points, seeds), and three clocks, medians over seeds."""
     curves = [Run(cell.folder(study)).curve for cell in finished(env, variant, study)]
     points = list(zip(*curves, strict=False))
     clocks = ("decisions", "simulated_seconds", "seconds")
@@ -219,9 +219,9 @@ def _curves(env: str, variant: Variant, study: Study) -> Numbers:
 
 
 def _failures(env: str, name: str, study: Study) -> Numbers:
-    """How often each kind occurs, mean over seeds as a share of all scenes; for each way to decide."""
+    """Return the share of all scenes that fail by each kind, mean over seeds, for each decision mode."""
     records = _records(finished(env, WHOLE, study), name, study)
-    number = len(work.scenes(name, env, study).share)
+    number = len(jobs.scenes(name, env, study).share)
     ways = [way for way in (ALONE, CHECKED) if records and way in records[0]["failures"]]
 
     def share(way: str, kind: str, what: str) -> float:
@@ -242,7 +242,7 @@ def _failures(env: str, name: str, study: Study) -> Numbers:
 
 
 def improvement(methods: Sequence[Numbers]) -> Numbers:
-    """Probability that a run of the whole agent, policy alone, beats one of another algorithm on the test scenes."""
+    """Return the probability that a run of the whole agent, policy alone, beats a run of another algorithm (`test`)."""
     each = {m["name"]: m["sets"]["test"][ALONE]["each"] for m in methods if "test" in m["sets"]}
     mine = each.pop(WHOLE.name, None)
     if mine is None:
@@ -258,15 +258,15 @@ def improvement(methods: Sequence[Numbers]) -> Numbers:
 
 def _compared(env: str, name: str, study: Study) -> Numbers:
     """Compare the agent with a search that checks as many plans, scene by scene; empty without such a search."""
-    frozen = work.scenes(name, env, study)
-    other = work.kept(
-        work.baseline_path(env, name, f"search{study.checks}", study), {"scenes": frozen.sha256}
+    frozen = jobs.scenes(name, env, study)
+    other = jobs.stored(
+        jobs.baseline_path(env, name, f"search{study.checks}", study), {"scenes": frozen.sha256}
     )
     records = _records(finished(env, WHOLE, study), name, study)
     if other is None or not records:
         return {}
-    second = work.rate_table([other], next(iter(other["methods"])), "is_success")[0] > 0.5
-    first = work.rate_table(records, CHECKED, "is_success") > 0.5
+    second = jobs.rate_table([other], next(iter(other["methods"])), "is_success")[0] > 0.5
+    first = jobs.rate_table(records, CHECKED, "is_success") > 0.5
     tests = [mcnemar(row, second) for row in first]
     differences = [test.difference for test in tests]
     return {
@@ -276,18 +276,18 @@ def _compared(env: str, name: str, study: Study) -> Numbers:
 
 
 def _freedom(env: str, study: Study) -> Numbers:
-    """The agent and the planner with more via-points and with timing of their own."""
+    """Return the numbers of agent and planner with more via-points and with learned timing."""
     planner = {}
     for variant in FREEDOM:
-        frozen = work.scenes("test", env, study).take(slice(0, work.PLANNED))
-        record = work.kept(work.planned_path(env, variant, study), {"scenes": frozen.sha256})
+        frozen = jobs.scenes("test", env, study).take(slice(0, jobs.N_PLANNED))
+        record = jobs.stored(jobs.planned_path(env, variant, study), {"scenes": frozen.sha256})
         if record is not None:
             planner[variant.name] = _numbers([record], next(iter(record["methods"])), frozen, study)
     return {"agents": _table(env, FREEDOM, FREEDOM_LABELS, study), "planner": planner}
 
 
 def _rounded(value: Any) -> Any:
-    """Floats to a millionth."""
+    """Round floats of nested values to a millionth."""
     if isinstance(value, dict):
         return {str(name): _rounded(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

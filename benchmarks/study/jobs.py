@@ -1,4 +1,4 @@
-"""The work: trainings, evaluations, baselines and timings, each kept in a file and done once."""
+"""Jobs of the study: trainings, evaluations, baselines and timings, each stored in a file and done once."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread, resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
-KEPT = ("is_success", "collision", "jerk_ratio", "duration")
-"""Outcomes that are kept scene by scene."""
-SAME = ("env", "algo", "seed", "n_timesteps", "n_envs", "env_kwargs", "hyperparameters")
-"""What must be the same in two configurations for their runs to be the same."""
-PLANNED = 200
-"""Scenes that the planner solves anew for each degree of freedom."""
-TIMED = 100
-"""Scenes of the timing."""
+STORED_OUTCOMES = ("is_success", "collision", "jerk_ratio", "duration")
+"""Outcomes that are stored for every scene."""
+IDENTIFYING = ("env", "algo", "seed", "n_timesteps", "n_envs", "env_kwargs", "hyperparameters")
+"""Fields of the configuration that must agree for a run to be of this study."""
+N_PLANNED = 200
+"""Number of scenes that the planner searches anew for each action space."""
+N_TIMED = 100
+"""Number of scenes in which decisions are timed."""
 ALONE, CHECKED, UNTRAINED = "alone", "checked", "untrained"
-"""Ways to decide: by the network alone, by checks of its proposals, and by checks of those of the untrained network."""
+"""Decision modes: the network alone, checked proposals, and checked proposals of the untrained network."""
 WAYS = {
     ALONE: "policy alone",
     CHECKED: "checked proposals",
     UNTRAINED: "untrained, checked proposals",
 }
-"""Names of these in tables."""
+"""Names of the decision modes in tables."""
 
 
 class Job(NamedTuple):
-    """Something to do, in this process or in another one."""
+    """Job for this process or another one."""
 
     label: str
-    work: Callable[..., str]
+    run: Callable[..., str]
     arguments: tuple[Any, ...]
     is_done: Callable[..., bool]
 
     def done(self) -> bool:
-        """Whether it has been done before, so that doing it again only tells how it went."""
+        """Return whether the job is done; running it again then only reports the result."""
         try:
             return self.is_done(*self.arguments)
         except (ValueError, OSError):
-            return False  # the work itself will say what is wrong
+            return False  # running the job reports the error
 
 
-def jobs(study: Study) -> list[Job]:
-    """What there is to do, but for timing; the work itself sees what is done already."""
+def all_jobs(study: Study) -> list[Job]:
+    """Return all jobs except the timing; each job skips what is done."""
     found = []
     if {"train", "evaluate"} & set(study.only):
-        found += [Job(str(cell), complete, (cell, study), completed) for cell in study.cells()]
+        found += [Job(str(cell), train_and_evaluate, (cell, study), is_complete) for cell in study.cells()]
     if "baselines" in study.only:
         if "results" in study.tables:
             found += [
@@ -72,57 +72,62 @@ def jobs(study: Study) -> list[Job]:
             ]
         if "freedom" in study.tables:
             found += [
-                Job(f"{short(env)} planner {variant.name}", planned, (env, variant, study), has_planned)
+                Job(
+                    f"{short(env)} planner {variant.name}",
+                    plan_with_freedom,
+                    (env, variant, study),
+                    has_planned,
+                )
                 for env in study.studied
                 for variant in FREEDOM
             ]
     return found
 
 
-def completed(cell: Cell, study: Study) -> bool:
-    """Whether a training and its evaluations are done, as far as they are asked for, or cannot be done."""
-    there = state(cell, study)
-    if there != "trained":
-        return there not in ("absent", "unfinished")
+def is_complete(cell: Cell, study: Study) -> bool:
+    """Return whether the requested steps of a training are done, or cannot be done."""
+    status = state(cell, study)
+    if status != "trained":
+        return status not in ("absent", "unfinished")
     model = Run(cell.folder(study)).best
     return "evaluate" not in study.only or all(
-        kept(evaluation_path(cell, name, study), identity_of(scenes(name, cell.env, study), model, study))
+        stored(evaluation_path(cell, name, study), identity_of(scenes(name, cell.env, study), model, study))
         for name in sets_of(cell.env)
     )
 
 
 def has_baseline(env: str, name: str, study: Study) -> bool:
-    """Whether a baseline is measured on every set."""
+    """Return whether a baseline is measured on every set."""
     return all(
-        kept(baseline_path(env, each, name, study), {"scenes": scenes(each, env, study).sha256})
+        stored(baseline_path(env, each, name, study), {"scenes": scenes(each, env, study).sha256})
         for each in sets_of(env)
     )
 
 
 def has_planned(env: str, variant: Variant, study: Study) -> bool:
-    """Whether the planner is measured with a degree of freedom."""
-    frozen = scenes("test", env, study).take(slice(0, PLANNED))
-    return kept(planned_path(env, variant, study), {"scenes": frozen.sha256}) is not None
+    """Return whether the planner is measured with an action space."""
+    frozen = scenes("test", env, study).take(slice(0, N_PLANNED))
+    return stored(planned_path(env, variant, study), {"scenes": frozen.sha256}) is not None
 
 
-def complete(cell: Cell, study: Study) -> str:
-    """Train and measure, as far as it is asked for and not done; says how it went."""
-    done = state(cell, study)
-    if done not in ("absent", "unfinished", "trained"):
-        raise ValueError(f"{cell.folder(study)} {done}")
-    if "train" in study.only and done != "trained":
+def train_and_evaluate(cell: Cell, study: Study) -> str:
+    """Train and evaluate as requested and not done yet; return a summary."""
+    status = state(cell, study)
+    if status not in ("absent", "unfinished", "trained"):
+        raise ValueError(f"{cell.folder(study)} {status}")
+    if "train" in study.only and status != "trained":
         again = TrainConfig(out=cell.folder(study), resume=True, progress=False)
-        run = train(cell.training(study) if done == "absent" else again)
+        run = train(cell.training(study) if status == "absent" else again)
         write_json(run.folder / "cores.json", {"cores": cores(), "of": os.cpu_count()})
-        done = "trained"
-    if "evaluate" in study.only and done == "trained":
-        rates = [f"{name} {_rates(measured(cell, name, study))}" for name in sets_of(cell.env)]
+        status = "trained"
+    if "evaluate" in study.only and status == "trained":
+        rates = [f"{name} {_rates(agent_evaluation(cell, name, study))}" for name in sets_of(cell.env)]
         return "; ".join(rates)
-    return done
+    return status
 
 
 def state(cell: Cell, study: Study) -> str:
-    """`absent`, `unfinished`, `trained`, or in words what is in the way."""
+    """Return `absent`, `unfinished`, `trained`, or the reason why the cell cannot be trained."""
     try:
         config = cell.training(study)
     except ValueError as error:
@@ -131,19 +136,19 @@ def state(cell: Cell, study: Study) -> str:
         return "absent"
     run = Run(config.folder)
     asked, found = (json.loads(json.dumps(as_json(each))) for each in (resolved(config), run.config))
-    other = [name for name in SAME if asked[name] != found[name]]
+    other = [name for name in IDENTIFYING if asked[name] != found[name]]
     if other:
         return f"was trained with other settings ({', '.join(other)}): move it away or name another --out"
     finished = run.decisions >= run.config.total_timesteps and (run.folder / "final").is_dir()
     return "trained" if finished else "unfinished"
 
 
-def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
-    """The evaluation of a trained agent on a set, from its file where it is of this agent and these scenes."""
+def agent_evaluation(cell: Cell, name: str, study: Study) -> dict[str, Any]:
+    """Return the evaluation of a trained agent on a set, from its file if that is of this agent and these scenes."""
     run, frozen = Run(cell.folder(study)), scenes(name, cell.env, study)
     identity = identity_of(frozen, run.best, study)
     path = evaluation_path(cell, name, study)
-    found = kept(path, identity)
+    found = stored(path, identity)
     if found is not None:
         return found
     model: Any = load_model(run.best)
@@ -162,7 +167,7 @@ def measured(cell: Cell, name: str, study: Study) -> dict[str, Any]:
 
 
 def agents(model: Any, study: Study) -> dict[str, tuple[Any, int]]:
-    """Return the ways in which an agent is measured: model and number of checks."""
+    """Return model and number of checks of each decision mode of an agent."""
     found = {ALONE: (model, 0)}
     if hasattr(model.policy, "checks"):
         found |= {CHECKED: (model, study.checks), UNTRAINED: (untrained(model), study.checks)}
@@ -170,7 +175,7 @@ def agents(model: Any, study: Study) -> dict[str, tuple[Any, int]]:
 
 
 def identity_of(frozen: FrozenScenes, model: Path, study: Study) -> dict[str, Any]:
-    """What an evaluation must say to be of this agent and these scenes."""
+    """Return the entries that identify an evaluation: scenes, weights and number of checks."""
     return {
         "scenes": frozen.sha256,
         "weights": hashlib.sha256((model / "weights.safetensors").read_bytes()).hexdigest(),
@@ -184,7 +189,7 @@ def baseline(env: str, name: str, study: Study) -> str:
     rates = []
     for each in sets_of(env):
         frozen, path = scenes(each, env, study), baseline_path(env, each, name, study)
-        record = kept(path, {"scenes": frozen.sha256})
+        record = stored(path, {"scenes": frozen.sha256})
         if record is None:
             if name == "stored":
                 method = StoredSolutions(frozen)
@@ -195,11 +200,11 @@ def baseline(env: str, name: str, study: Study) -> str:
     return "; ".join(rates)
 
 
-def planned(env: str, variant: Variant, study: Study) -> str:
-    """Let the planner search with a degree of freedom, in the first test scenes."""
-    frozen = scenes("test", env, study).take(slice(0, PLANNED))
+def plan_with_freedom(env: str, variant: Variant, study: Study) -> str:
+    """Measure the planner with an action space, in the first test scenes."""
+    frozen = scenes("test", env, study).take(slice(0, N_PLANNED))
     path, kwargs = planned_path(env, variant, study), dict(variant.env_kwargs)
-    record = kept(path, {"scenes": frozen.sha256})
+    record = stored(path, {"scenes": frozen.sha256})
     if record is None:
         record = _measure_baseline(make_method("planner", env, **kwargs), frozen, env, path, kwargs)
     return _rates(record)
@@ -218,7 +223,7 @@ def _measure_baseline(
 def _results(
     methods: Sequence[Method], frozen: FrozenScenes, env: str, kwargs: dict[str, Any], timed: bool = False
 ) -> tuple[MethodResult, ...]:
-    """What came of each method in all scenes; where it was interrupted, nothing is kept."""
+    """Evaluate methods in all scenes; an interrupted evaluation raises KeyboardInterrupt and stores nothing."""
     with one_thread():
         results = evaluate_methods(methods, frozen, env, env_kwargs=kwargs, time_decisions=timed).results
     if any(each.interrupted for each in results):
@@ -227,9 +232,9 @@ def _results(
 
 
 def time_decisions(study: Study) -> str:
-    """Time single decisions of one agent of each algorithm, on one thread, with nothing else at work here."""
+    """Time single decisions of one agent of each algorithm, on one thread and without other jobs."""
     for env in study.environments:
-        frozen = scenes("test", env, study).take(slice(0, TIMED))
+        frozen = scenes("test", env, study).take(slice(0, N_TIMED))
         path = timings_path(env, study)
         times: dict[str, Any] = read_json(path) if path.is_file() else {}
         for name, source, method in _to_time(env, study):
@@ -243,7 +248,7 @@ def time_decisions(study: Study) -> str:
 
 
 def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method]]]:
-    """Name, what it depends on, and the method."""
+    """Return name, source and factory of each timed method; a changed source makes a time obsolete."""
     found: list[tuple[str, str, Callable[[], Method]]] = [
         (name, name, lambda name=name: make_method(name, env, threads=1))  # type: ignore[misc]
         for name in ("random16", "random80", *SEARCHES, "planner", "ompl")
@@ -264,43 +269,45 @@ def _to_time(env: str, study: Study) -> list[tuple[str, str, Callable[[], Method
 
 
 def scenes(name: str, env: str, study: Study) -> FrozenScenes:
-    """A set of scenes, or its first ones."""
+    """Return a set of scenes, or its first `n_scenes`."""
     return load(name, env).take(slice(0, study.n_scenes))
 
 
 def evaluation_path(cell: Cell, name: str, study: Study) -> Path:
-    """Of an agent's evaluation on a set."""
+    """Return the file of an agent's evaluation on a set."""
     return cell.folder(study) / "evaluations" / f"study-{name}.json"
 
 
 def baseline_path(env: str, set_name: str, name: str, study: Study) -> Path:
-    """Of a baseline's evaluation."""
+    """Return the file of a baseline's evaluation."""
     return study.out / short(env) / "baselines" / f"{set_name}-{name}.json"
 
 
 def planned_path(env: str, variant: Variant, study: Study) -> Path:
-    """Of the planner's evaluation with a degree of freedom."""
+    """Return the file of the planner's evaluation with an action space."""
     return study.out / short(env) / "planner" / f"{variant.name}.json"
 
 
 def timings_path(env: str, study: Study) -> Path:
-    """Of the times of single decisions."""
+    """Return the file of decision times."""
     return study.out / short(env) / "timings.json"
 
 
 def compact(result: MethodResult) -> dict[str, Any]:
-    """The metrics, and the outcomes that the tables are made of."""
-    outcomes = {name: np.round(np.asarray(result.outcomes[name], float), 6).tolist() for name in KEPT}
+    """Return the metrics of a result and its outcomes in every scene."""
+    outcomes = {
+        name: np.round(np.asarray(result.outcomes[name], float), 6).tolist() for name in STORED_OUTCOMES
+    }
     return {"summary": result.summary(), "outcomes": outcomes}
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
-    """The record in a file, None where there is none of this identity."""
+def stored(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the record in a file, or None if there is none with this identity."""
     if not path.is_file():
         return None
     record = read_json(path)
@@ -313,5 +320,5 @@ def _rates(record: dict[str, Any]) -> str:
 
 
 def rate_table(records: Sequence[dict[str, Any]], method: str, outcome: str) -> np.ndarray:
-    """An outcome scene by scene, shape (records, scenes)."""
+    """Return an outcome in every scene, shape (records, scenes)."""
     return np.array([record["methods"][method]["outcomes"][outcome] for record in records], dtype=float)
