@@ -1,4 +1,4 @@
-"""What is refused at the border, in one error that names the offender, what came and what is allowed."""
+"""Invalid arguments raise one error that names the argument, its value and the allowed values."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,3 +1,5 @@
+"""Pictures and films of movements."""
+
 import gymnasium as gym
 import numpy as np
 import pytest

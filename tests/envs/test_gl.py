@@ -1,3 +1,5 @@
+"""OpenGL contexts and windows."""
+
 import gc
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Clearance is exact, and it is what MuJoCo's contacts say."""
+"""Clearance is exact and agrees with MuJoCo's contacts."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""An arm of one's own, from an MJCF file."""
+"""Laws of arms that are loaded from MJCF files."""
 
 import pickle
 import re
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from foreign_arms import HOME, JOINTS, UR5E, ur5e
+from imported_arms import HOME, JOINTS, UR5E, ur5e
 from gymnasium.envs.registration import EnvSpec
 
 import viapoint.envs
@@ -313,6 +313,20 @@ def test_the_fetch_of_gymnasium_robotics():
     _, _, info = env.unwrapped.execute_actions(np.zeros((16, 4)))
     assert info["is_success"].all()
     assert info["tracking_error"].max() < 2e-3
+
+
+def test_the_page_runs_and_its_numbers_are_measured(monkeypatch, capsys):
+    monkeypatch.chdir(DOCS.parent)
+    page, names = (DOCS / "bring-your-arm.md").read_text(encoding="utf-8"), {}
+    for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        if "TrainConfig" not in example:
+            exec(example, names)
+    error = capsys.readouterr().out.splitlines()[-1]
+    size = " x ".join(f"{width:.2f}" for width in np.diff(names["ur5e"].ik.box, axis=0)[0])
+    assert f"| `docs/ur5e.xml` | 6 | {size} m | {error} |" in page
+    np.testing.assert_allclose(names["points"], [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]], atol=1e-6)
+    for env in (names["env"], names["envs"]):
+        env.close()
 
 
 def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):

@@ -1,4 +1,4 @@
-"""What is looked at only where it matters is what it would be, were everything looked at."""
+"""Bounds and searches that skip distances give the results of all distances."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What other people's files bring: joints that are left out, odd inertias and forces, and what is refused."""
+"""MJCF files of other projects: fixed joints, unusual inertias and forces, and errors."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from foreign_arms import HOME, JOINTS, UR5E, ur5e, written
+from imported_arms import HOME, JOINTS, UR5E, ur5e, written
 
 import viapoint.envs
 from viapoint.envs.arm_import import reachability

@@ -1,4 +1,4 @@
-"""The arm of the page, as its file and variants of it have it."""
+"""Arm of docs/bring-your-arm.md, and variants of its file."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def ur5e(**changes):
 
 
 def written(path, *changes):
-    """The file of the page with words replaced, at `path`; each word must be there."""
+    """Write the file with some words replaced to `path`; each word must be there."""
     text = UR5E.read_text()
     for old, new in changes:
         assert old in text, old
