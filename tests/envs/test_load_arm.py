@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from imported_arms import HOME, JOINTS, UR5E, ur5e
 from gymnasium.envs.registration import EnvSpec
+from imported_arms import HOME, JOINTS, UR5E, ur5e
 
 import viapoint.envs
 from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
