@@ -15,21 +15,11 @@ if TYPE_CHECKING:
     from viapoint.envs.arms import register_arm
     from viapoint.envs.arms.base import Arm
     from viapoint.envs.record_video import RecordMovements
-    from viapoint.envs.replanning_env import OnlineReachEnv, OnlineReachVectorEnv
-    from viapoint.envs.single_env import ReachEnv
-    from viapoint.envs.vector_env import ReachVectorEnv
-    from viapoint.envs.velocity_env import StepReachEnv, StepReachVectorEnv
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
-        "OnlineReachEnv": "viapoint.envs.replanning_env",
-        "OnlineReachVectorEnv": "viapoint.envs.replanning_env",
         "Plan": "viapoint.envs.actions.via_points",
-        "ReachEnv": "viapoint.envs.single_env",
-        "ReachVectorEnv": "viapoint.envs.vector_env",
         "RecordMovements": "viapoint.envs.record_video",
-        "StepReachEnv": "viapoint.envs.velocity_env",
-        "StepReachVectorEnv": "viapoint.envs.velocity_env",
         "load_arm": "viapoint.envs.arm_import.loader",
         "register_arm": "viapoint.envs.arms",
     }
@@ -49,14 +39,8 @@ __all__ = [
     "ENV_IDS",
     "TASKS",
     "Arm",
-    "OnlineReachEnv",
-    "OnlineReachVectorEnv",
     "Plan",
-    "ReachEnv",
-    "ReachVectorEnv",
     "RecordMovements",
-    "StepReachEnv",
-    "StepReachVectorEnv",
     "load_arm",
     "register_arm",
 ]

@@ -16,7 +16,6 @@ from viapoint.training.algorithms.model_io import load_model, untrained
 from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
-from viapoint.training.io.config_json import as_json
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import SEARCHES, Method, agent_method, make_method
 from viapoint.training.plotting.failure_report import classify_failures
@@ -135,7 +134,7 @@ def state(cell: Cell, study: Study) -> str:
     if not (config.folder / "config.json").is_file():
         return "absent"
     run = Run(config.folder)
-    asked, found = (json.loads(json.dumps(as_json(each))) for each in (resolved(config), run.config))
+    asked, found = (json.loads(json.dumps(each.as_json())) for each in (resolved(config), run.config))
     other = [name for name in IDENTIFYING if asked[name] != found[name]]
     if other:
         return f"was trained with other settings ({', '.join(other)}): move it away or name another --out"

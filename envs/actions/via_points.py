@@ -29,7 +29,15 @@ MOST_VIAS = 16
 
 
 class Plan(NamedTuple):
-    """A movement as a person would write it down."""
+    """Movement as via-points and durations, or a batch of movements.
+
+    Example:
+        >>> from viapoint.envs import Plan
+        >>> plan = Plan([[-0.2, 0.3], [0.0, 0.45], [0.2, 0.3]], [0.5, 0.5])  # m and s
+        >>> trajectory = plan.trajectory()
+        >>> trajectory(0.5).round(3).tolist()  # position of the hand at 0.5 s
+        [0.0, 0.45]
+    """
 
     waypoints: Array
     """Start, via-points and goal, shape (..., K + 2, D), [m]."""
@@ -37,11 +45,11 @@ class Plan(NamedTuple):
     """Of the segments between them, shape (..., K + 1), [s]."""
 
     def take(self, rows: Any) -> Plan:
-        """The movements at `rows`, an index, slice or mask."""
+        """Return the movements at `rows`, an index, slice or mask of the batch."""
         return Plan(self.waypoints[rows], self.durations[rows])
 
     def trajectory(self) -> primitives.Trajectory:
-        """The minimum-jerk movement through the waypoints."""
+        """Return the minimum-jerk movement through the waypoints."""
         return primitives.through(self.waypoints, self.durations)
 
 

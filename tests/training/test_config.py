@@ -19,7 +19,6 @@ from viapoint.training.config.configs import (
     TrainConfig,
 )
 from viapoint.training.config.presets import PRESETS
-from viapoint.training.io.config_json import as_json, from_json
 from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS
 
 EXAMPLES = [
@@ -41,7 +40,7 @@ EXAMPLES = [
 
 @pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
 def test_round_trip(config):
-    assert from_json(type(config), json.loads(json.dumps(as_json(config)))) == config
+    assert type(config).from_json(json.loads(json.dumps(config.as_json()))) == config
 
 
 @pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
@@ -161,7 +160,7 @@ def test_every_method_can_be_named():
 
 def test_unknown_names_in_a_file_are_refused():
     with pytest.raises(ValueError, match="colour"):
-        from_json(TrainConfig, {"colour": "red"})
+        TrainConfig.from_json({"colour": "red"})
 
 
 def test_every_algorithm_has_a_preset_that_fits():

@@ -311,5 +311,5 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
     save_model(model, tmp_path)
     assert load_model(tmp_path).get_env().env_kwargs["arm"] == "mine"
     monkeypatch.delitem(ARMS, "mine")
-    with pytest.raises(BadFileError, match=r"got 'mine'; .*register_arm makes an arm"):
+    with pytest.raises(BadFileError, match=r"got 'mine'; .*register_arm registers an arm"):
         load_model(tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,12 +16,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, STEP_TASKS
 from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, save_model
+from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.search.geometry_search import scene_from_rest
-
-SHIPPED = Path(str(files("viapoint.training") / "pretrained"))
-"""Folder of the agents that come with the package."""
 
 
 class Agent(BaseAlgorithm):
@@ -38,7 +35,8 @@ class Agent(BaseAlgorithm):
         >>> plan = agent.plan(start=(-0.2, 0.3), goal=(0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
         >>> plan.waypoints.shape  # start, via-point and goal, [m]
         (3, 2)
-        >>> hand = plan.trajectory().position(np.linspace(0.0, plan.durations.sum(), 50))
+        >>> plan.trajectory()(np.linspace(0.0, plan.durations.sum(), 50)).shape  # positions of the hand, [m]
+        (50, 2)
     """
 
     trainable: bool = True
@@ -165,6 +163,7 @@ def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
 
     Example:
         >>> import gymnasium as gym
+        >>> from viapoint.training import load_agent
         >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
         >>> observation, _ = env.reset(seed=3)
         >>> agent = load_agent("viapoint/PlanarObstacles-v0")
@@ -182,9 +181,9 @@ def find_model(source: str | Path) -> Path:
     Raises:
         ValueError: It is none of them.
     """
-    folder, known = Path(source), ", ".join(f"viapoint/{each.name}" for each in sorted(SHIPPED.glob("*-v*")))
+    folder, known = Path(source), ", ".join(SHIPPED_IDS)
     if str(source) in ENV_IDS:
-        if str(source) not in known.split(", "):
+        if str(source) not in SHIPPED_IDS:
             raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {known}")
         return SHIPPED / folder.name
     if folder.suffix == ".zip" and not folder.exists():

@@ -60,6 +60,8 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         explore_candidates: Candidates of each decision during training.
         next_candidates: Candidates over which the value of the next observation is maximised.
         policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
+        replay_buffer_kwargs: Arguments of :class:`OutcomeReplayBuffer`.
+        replay_buffer_class: Not used; the replay buffer is an :class:`OutcomeReplayBuffer`.
         **kwargs: Arguments of :class:`OffPolicyAlgorithm`.
 
     Raises:

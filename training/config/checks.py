@@ -6,12 +6,17 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
+SHIPPED = Path(str(files("viapoint.training") / "pretrained"))
+"""Folder of the agents that come with the package."""
+SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))
+"""Ids of environments with a shipped agent."""
 
 BASELINES = (
     "untrained", "straight", "constant", "random", "random16", "random80", "planner", "ompl", "unrevised",

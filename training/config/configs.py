@@ -1,16 +1,19 @@
-"""What the commands can be told: plain records, checked when made, that become the command line."""
+"""Configurations of the commands: plain records that are checked when they are made."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import tyro
 
-from viapoint.envs.registration import STEP_TASKS
+from viapoint.envs.registration import ENV_IDS, STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
+    SHIPPED_IDS,
     check_baselines,
     check_env,
     check_env_kwargs,
@@ -25,47 +28,125 @@ from viapoint.training.config.discount import check_discount_unit
 from viapoint.training.config.key_values import NamedValues
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
+_ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
+_AGENT = tyro.conf.arg(
+    metavar="AGENT",
+    help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
+)
+EnvId = Annotated[str, _ENV]
+"""Id of an environment; the help of a command lists them."""
+
+if TYPE_CHECKING:
+    AnyPath = str | Path
+else:
+    AnyPath = Path  # the command line makes paths of words
+
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
+class Config:
+    """Configuration of a command; paths may be given as strings."""
+
+    least: ClassVar[Mapping[str, int]] = {}
+    """Least values of the whole numbers, by name; None is allowed where it is the default."""
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: A value is not allowed; the message lists the allowed values.
+        """
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, str) and "Path" in str(each.type):
+                object.__setattr__(self, each.name, Path(value))
+            if each.name in self.least and not (value is None and each.default is None):
+                check_whole(each.name, value, self.least[each.name])
+        self._check()
+
+    def _check(self) -> None:
+        """Check what is not a whole number."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        plain = {Path: str, tuple: list}
+        return {
+            name: next((to(value) for kind, to in plain.items() if isinstance(value, kind)), value)
+            for name, value in values.items()
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> Self:
+        """Return the configuration that plain values describe.
+
+        Raises:
+            ValueError: A name is unknown or a value is not allowed.
+        """
+        names = [each.name for each in dataclasses.fields(cls)]
+        unknown = sorted(set(record) - set(names))
+        if unknown:
+            raise ValueError(f"{cls.__name__} knows {', '.join(names)}, not {unknown[0]!r}")
+        return cls(
+            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(Config):
     """Train an agent.
 
     Example: viapoint train --env viapoint/PlanarObstacles-v0 --algo viaq --seed 0 --out runs/first
+
+    Raises:
+        ValueError: A value is not allowed; the message lists the allowed values.
+
+    Example:
+        >>> from viapoint.training import TrainConfig
+        >>> config = TrainConfig(env="viapoint/PandaObstacles-v0", seed=1, hyperparameters={"batch_size": 128})
+        >>> config.folder.as_posix(), config.total_timesteps
+        ('runs/PandaObstacles-v0-viaq-1', 40000)
     """
 
-    env: str = DEFAULT_ENV
-    """Id of the environment; an unknown one is answered with all that there are."""
+    least: ClassVar = {
+        "seed": 0,
+        "eval_scenes": 1,
+        "n_timesteps": 1,
+        "n_envs": 1,
+        "eval_every": 0,
+        "checkpoint_every": 1,
+    }
+
+    env: EnvId = DEFAULT_ENV
+    """Id of the environment."""
     algo: Algorithm = "viaq"
-    """Learning algorithm; training/config/presets.py holds the settings of each."""
+    """Learning algorithm."""
     seed: int = 0
-    """Seed of everything that is random: equal seeds give equal agents on one machine."""
+    """Seed of all random numbers; equal seeds give equal agents on one machine."""
     n_timesteps: int | None = None
-    """Decisions in all; as the preset says if not given."""
+    """Decisions in total; default: that of the preset."""
     n_envs: int | None = None
-    """Environments stepped together; as the preset says if not given."""
-    out: Path | None = None
-    """Run folder; runs/<environment>-<algorithm>-<seed> if not given."""
+    """Environments that are stepped together; default: that of the preset."""
+    out: AnyPath | None = None
+    """Run folder; default: runs/<environment>-<algorithm>-<seed>."""
     resume: bool = False
-    """Go on with the run in the folder from its last checkpoint, with its own configuration; --n-timesteps may extend
-    it, other flags must be those that it began with."""
+    """Continue the run in the folder from its last checkpoint; --n-timesteps may extend it, other flags must be as they
+    were."""
     eval_every: int | None = None
-    """Decisions between two evaluations on the validation scenes, 0 for none; as the preset says if not given."""
+    """Decisions between two evaluations on the validation scenes, 0 for none; default: that of the preset."""
     eval_scenes: int = 500
-    """Validation scenes used in each evaluation, at most."""
+    """Greatest number of validation scenes in each evaluation."""
     checkpoint_every: int | None = None
-    """Decisions between two checkpoints; as the preset says if not given."""
+    """Decisions between two checkpoints; default: that of the preset."""
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
-    """Settings of the algorithm in place of its preset's, in the same form: batch_size=256."""
+    """Hyperparameters that replace those of the preset, in the same form: batch_size=256."""
     discount_unit: float | None = None
-    """Seconds that are discounted by gamma once, where decisions differ in length and the environment tells it; as
-    the preset says if not given."""
+    """Time that gamma discounts once, [s], if decisions report their duration; default: that of the preset."""
     progress: bool = True
-    """Whether to show a progress bar."""
+    """Show a progress bar."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    def _check(self) -> None:
         check_env(self.env)
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
@@ -74,11 +155,6 @@ class TrainConfig:
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        for name, least in (("seed", 0), ("eval_scenes", 1)):
-            check_whole(name, getattr(self, name), least)
-        for name, least in (("n_timesteps", 1), ("n_envs", 1), ("eval_every", 0), ("checkpoint_every", 1)):
-            if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), least)
         check_env_kwargs(self.env_kwargs)
         check_hyperparameters(self.algo, self.hyperparameters)
         if self.discount_unit is not None:
@@ -86,17 +162,17 @@ class TrainConfig:
 
     @property
     def preset(self) -> Preset:
-        """What holds for everything that is not given."""
+        """Settings for everything that is not given."""
         return preset_of(self.env, self.algo)
 
     @property
     def total_timesteps(self) -> int:
-        """Decisions in all."""
+        """Decisions in total."""
         return self.n_timesteps or self.preset.n_timesteps
 
     @property
     def copies(self) -> int:
-        """Environments stepped together."""
+        """Environments that are stepped together."""
         return self.n_envs or self.preset.n_envs
 
     @property
@@ -111,24 +187,28 @@ class TrainConfig:
 
     @property
     def time_unit(self) -> float | None:
-        """Seconds that count gamma; None where each decision does, whatever it takes."""
+        """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
         return self.preset.discount_unit if self.discount_unit is None else self.discount_unit
 
     @property
     def folder(self) -> Path:
-        """The run folder."""
-        return self.out or Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
+        """Run folder."""
+        return (
+            Path(self.out)
+            if self.out
+            else Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig:
+class EvaluateConfig(Config):
     """Evaluate an agent and baselines on the same scenes.
 
     Example: viapoint evaluate runs/first --baselines straight planner --scenes test
     """
 
-    agent: tyro.conf.Positional[str | None] = None
-    """Run folder, model folder, or id of an environment with a shipped agent; baselines alone if not given."""
+    agent: Annotated[tyro.conf.Positional[str | None], _AGENT] = None
+    """Run folder, model folder, or id of an environment with a shipped agent; None for baselines alone."""
     baselines: tuple[str, ...] = ("straight", "random", "planner")
     """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
     search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
@@ -136,18 +216,19 @@ class EvaluateConfig:
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
-    """validation, test, hard, or a file of scenes."""
+    """Scene set: validation, test, hard, or a scene file."""
     n_scenes: int | None = None
-    """Only the first so many scenes; all if not given."""
+    """Number of scenes, from the first on; all if not given."""
     json: Path | None = None
-    """File for all results, scene by scene, as JSON."""
+    """JSON file for all results, scene by scene."""
     failures: Path | None = None
-    """Folder for counts and pictures of the agent's failures by kind; those of its last row in the table."""
-    env: str | None = None
-    """Id of the environment; that of the agent if not given."""
+    """Folder for counts and pictures of the agent's failures by kind, those of its last row in the table."""
+    env: Annotated[str | None, _ENV] = None
+    """Id of the environment; default: that of the agent."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    least: ClassVar = {"n_scenes": 1}
+
+    def _check(self) -> None:
         check_baselines(self.baselines)
         if self.env is not None:
             check_env(self.env)
@@ -157,8 +238,6 @@ class EvaluateConfig:
             check_whole("checks", number, 0)
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
-        if self.n_scenes is not None:
-            check_whole("n_scenes", self.n_scenes, 1)
         check_file("json", self.json)
         check_folder("failures", self.failures)
         for name, asked in (("checks", any(self.checks)), ("failures", self.failures is not None)):
@@ -167,58 +246,56 @@ class EvaluateConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayConfig:
+class PlayConfig(Config):
     """Record a video of an agent's movements.
 
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
-    agent: tyro.conf.Positional[str]
+    agent: Annotated[tyro.conf.Positional[str], _AGENT]
     """Run folder, model folder, or id of an environment with a shipped agent."""
     video: Path = Path("movements.mp4")
-    """File to write, an MP4."""
+    """MP4 file to write."""
     scenes: str = "test"
-    """validation, test, hard, or a file of scenes."""
+    """Scene set: validation, test, hard, or a scene file."""
     n_scenes: int = 8
-    """How many of them, evenly spread over the set."""
+    """Number of scenes, evenly spread over the set."""
     checks: int = 0
-    """How many of the agent's proposals are checked by exact geometry; 0 for none."""
+    """Number of proposals that the agent checks with exact geometry; 0 for none."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    least: ClassVar = {"n_scenes": 1, "checks": 0}
+
+    def _check(self) -> None:
         check_file("video", self.video, ".mp4")
-        check_whole("n_scenes", self.n_scenes, 1)
-        check_whole("checks", self.checks, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig:
-    """Measure throughput as ratios to what the engine alone and a plain copy would take.
+class BenchConfig(Config):
+    """Measure throughput relative to the physics engine alone and to a plain array copy.
 
     Example: viapoint bench --json bench.json
     """
 
-    env: str = DEFAULT_ENV
+    env: EnvId = DEFAULT_ENV
     """Id of the environment."""
     num_envs: int = 512
     """Environments in the batch."""
     repeats: int = 9
-    """Measurements of each side, of which the fastest counts; they alternate."""
+    """Alternating measurements of each side, of which the fastest counts."""
     json: Path | None = None
-    """File for the figures."""
+    """JSON file for the figures."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    least: ClassVar = {"num_envs": 1, "repeats": 1}
+
+    def _check(self) -> None:
         check_env(self.env)
         check_whole_movements(self.env)
-        check_whole("num_envs", self.num_envs, 1)
-        check_whole("repeats", self.repeats, 1)
         check_file("json", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperConfig:
-    """Reproduce Flash & Hogan 1985: every claim as a number, every figure, on the model and on the simulated arm.
+class PaperConfig(Config):
+    """Reproduce the claims and figures of Flash & Hogan 1985 with the model and on the simulated arm.
 
     Example: viapoint paper --out paper
     """
@@ -226,86 +303,80 @@ class PaperConfig:
     out: Path = Path("paper")
     """Folder for the figures and the table."""
     agent: Path | None = None
-    """Run folder of the agent that goes around the rows of lights; the shipped one, or the planner, if not given."""
+    """Run folder or model folder of the agent that moves around the rows of lights; default: the shipped agent."""
     guide: Path | None = None
     """Folder for the small pictures of docs/flash-hogan.md."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    def _check(self) -> None:
         check_folder("out", self.out)
         check_folder("guide", self.guide)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoConfig:
-    """Train, evaluate, draw and film an agent: everything in one folder.
+class DemoConfig(Config):
+    """Train an agent, evaluate it, and write table, figures and a video to one folder.
 
     Example: viapoint demo --out runs/demo
     """
 
     out: Path = Path("runs/demo")
-    """Folder for everything; what is there already is kept."""
-    env: str = DEFAULT_ENV
+    """Folder for all files; existing results are kept."""
+    env: EnvId = DEFAULT_ENV
     """Id of the environment."""
     seed: int = 0
     """Seed of the training."""
     n_timesteps: int | None = None
-    """Decisions to train for; a quarter of those of the preset if not given, so that nobody waits for long."""
+    """Decisions in total; default: a quarter of those of the preset."""
     n_scenes: int | None = None
-    """Test scenes to evaluate on; all if not given."""
+    """Number of test scenes; all if not given."""
     checks: int = 16
-    """How many of the agent's proposals are checked by exact geometry in its second row of the table."""
+    """Number of proposals that the agent checks with exact geometry in its second row of the table."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    least: ClassVar = {"seed": 0, "n_timesteps": 1, "n_scenes": 1, "checks": 1}
+
+    def _check(self) -> None:
         check_env(self.env)
         check_whole_movements(self.env)
         check_has_scenes(self.env)
         check_folder("out", self.out)
-        check_whole("seed", self.seed, 0)
-        check_whole("checks", self.checks, 1)
-        for name in ("n_timesteps", "n_scenes"):
-            if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), 1)
 
     @property
     def total_timesteps(self) -> int:
-        """Decisions of a training that begins."""
+        """Decisions of a new training."""
         return self.n_timesteps or TrainConfig(env=self.env).total_timesteps // 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorConfig:
-    """Tell what works on this machine, and what to install where something does not.
+class DoctorConfig(Config):
+    """Check what works on this machine, and print what to install where something does not.
 
     Example: viapoint doctor
     """
 
     out: Path = Path("runs")
-    """Folder that runs are to be written to."""
+    """Folder for runs, which is checked for write access."""
     json: bool = False
-    """Whether to print JSON for programs instead of lines for people."""
+    """Print JSON instead of text."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportConfig:
-    """Turn an archive of Stable-Baselines3 into a model of tensors and JSON. Opening such an archive runs its code.
+class ImportConfig(Config):
+    """Convert an archive of Stable-Baselines3 into a model folder. Opening such an archive runs its code.
 
     Example: viapoint import-sb3 model.zip --env viapoint/PlanarObstacles-v0 --out models/mine --trust
     """
 
     file: tyro.conf.Positional[Path]
-    """The archive that SB3's `model.save` wrote."""
-    env: str = DEFAULT_ENV
+    """Archive that `model.save` of Stable-Baselines3 wrote."""
+    env: EnvId = DEFAULT_ENV
     """Id of the environment that the model was trained on, with default arguments."""
     out: Path
-    """Folder for the model; must be new."""
+    """Folder for the model, which must be new."""
     algo: Literal["sac", "td3", "ppo", "tqc"] | None = None
-    """Its algorithm; recognised from the archive if not given."""
+    """Algorithm; recognised from the archive if not given."""
     trust: bool = False
-    """Open it without asking: you know where it comes from."""
+    """Open the archive without asking, because you trust its source."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+    def _check(self) -> None:
         check_env(self.env)
         check_folder("out", self.out)

@@ -15,7 +15,7 @@ from viapoint.training.scene_sets.scene_set import BANDS
 
 Summary = Mapping[str, Any]
 Record = Mapping[str, Any]
-"""What :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json` returns, or a file that holds it."""
+"""What :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict` returns, or a file that holds it."""
 
 
 class Column(NamedTuple):

@@ -68,7 +68,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
 
     Args:
         path: PNG file.
-        record: Record of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.Evaluation.as_json`.
+        record: Record of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict`.
     """
     summaries = record["methods"]
     figure = Figure(figsize=(8.0, 3.8), layout="constrained")

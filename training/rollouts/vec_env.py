@@ -1,4 +1,4 @@
-"""The environment as Stable-Baselines3 wants it, without one Python environment per copy."""
+"""Vector environment for Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ assert viapoint.envs.TASKS, "importing it registers the environments"
 Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
 REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration", "reachable")
-"""What of an episode's outcome goes into the info dictionaries."""
+"""Metrics of an episode that the info dictionaries report."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
-"""Terms of a decision's reward, which go into the info dictionaries."""
+"""Terms of a decision's reward, which the info dictionaries report."""
 
 
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
@@ -54,19 +54,31 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
 
 
 class ViaVecEnv(VecEnv):
-    """A native vector environment of Gymnasium behind the interface of SB3's `VecEnv`.
+    """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
-    All copies live in one vectorised environment; each step makes one short info dictionary per copy and
-    nothing else per copy. Episodes may be of one step or of many and may end at different times.
+    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy, and is several times
+    as fast; `viapoint bench` measures the ratio. Episodes may have one step or many, and may end at different times.
 
     Args:
-        env_id: Of a registered environment.
+        env_id: Id of a registered environment.
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
-        **kwargs: Of the environment.
+        **kwargs: Keyword arguments of the environment.
 
     Raises:
-        ValueError: The environment does not start its next episode in the step that ends the last one.
+        ValueError: There is no such environment, or it does not start the next episode in the step that ends the last.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.training import ViaVecEnv
+        >>> env = ViaVecEnv("viapoint/PlanarObstacles-v0", 64, seed=0, n_obstacles=3)
+        >>> observation = env.reset()
+        >>> observation["hand"].shape, env.action_space.shape  # [m]
+        ((64, 2), (3,))
+        >>> observation, reward, done, infos = env.step(np.zeros((64, 3), dtype=np.float32))
+        >>> reward.shape, done.tolist() == [True] * 64, sorted(infos[0])[:3]
+        ((64,), True, ['TimeLimit.truncated', 'collision', 'duration'])
+        >>> env.close()
     """
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
@@ -83,7 +95,7 @@ class ViaVecEnv(VecEnv):
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         super().__init__(num_envs, self.venv.single_observation_space, self.venv.single_action_space)
         self.last_outcome: dict[str, NDArray[Any]] = {}
-        """What came of the episodes that ended in the last step, one entry of each array per episode."""
+        """Outcomes of the episodes that ended in the last step, one entry of each array per episode."""
         self._batched_options: Mapping[str, Any] | None = None
         self._actions: NDArray[Any] | None = None
         self._returns = np.zeros(num_envs)
@@ -95,14 +107,17 @@ class ViaVecEnv(VecEnv):
 
     @property
     def physics_steps(self) -> int:
-        """Physics steps simulated so far; 0 where the environment does not count them."""
+        """Number of physics steps so far; 0 if the environment does not count them."""
         return self._steps_before + int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
     def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
-        """Options of the next reset: batched as the environment takes them, or a list of one per copy.
+        """Set the options of the next reset.
+
+        Args:
+            options: Batched options as the environment accepts them, or a list of one mapping per copy.
 
         Raises:
-            ValueError: There is not one mapping per copy, or they give different things.
+            ValueError: There is not one mapping per copy, or their names or shapes differ.
         """
         if options is None or isinstance(options, Mapping):
             self._batched_options = options
@@ -110,7 +125,7 @@ class ViaVecEnv(VecEnv):
             self._batched_options = _batched(options, self.num_envs)
 
     def reset(self) -> Observation:
-        """Start new episodes everywhere."""
+        """Start a new episode in every copy."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options, self._batched_options = self._batched_options, None  # refused ones must not be met again
         observation, _ = self.venv.reset(seed=seeds, options=options)
@@ -120,17 +135,17 @@ class ViaVecEnv(VecEnv):
         return started
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Remember the actions, shape (N, m)."""
+        """Store the actions of the next step, shape (N, m)."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step; where an episode ended, the observation is the next one's first.
+        """Step all copies; if an episode ended, the observation is the first one of the next episode.
 
         Returns:
-            Observation, reward (N,), done (N,) and N info dictionaries. These hold `elapsed` [s], how long the
-            decision took, where the environment tells it. At the end of an episode they hold besides
-            `terminal_observation`, `TimeLimit.truncated`, `episode` (return r, length l, seconds t since the
-            start) and what of :data:`REPORTED` the environment tells.
+            Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold `elapsed` [s], the
+            duration of the decision, if the environment reports it. At the end of an episode they also hold
+            `terminal_observation`, `TimeLimit.truncated`, `episode` (return r, length l, wall time t [s] since the
+            start) and those metrics of :data:`REPORTED` that the environment reports.
         """
         observation, reward, terminated, truncated, info = self.venv.step(self._actions)
         done = terminated | truncated
@@ -144,7 +159,7 @@ class ViaVecEnv(VecEnv):
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def _began_infos(self, info: Mapping[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
-        """Return one info per copy, with the time that its decision took and the terms of its reward, where known."""
+        """Return one info per copy, with the duration of its decision and the terms of its reward, if reported."""
         final = info.get("final_info", {})
         columns = {}
         for name in (ELAPSED, *TERMS):
@@ -178,7 +193,7 @@ class ViaVecEnv(VecEnv):
         self._returns[rows], self._lengths[rows] = 0.0, 0
 
     def state(self) -> dict[str, Any]:
-        """Random generators, running episodes and counters, as values and arrays for :meth:`restore`."""
+        """Return random generators, running episodes and counters as values and arrays for :meth:`restore`."""
         env = self.venv.unwrapped
         return {
             "generators": [generator.bit_generator.state for generator in env._generators],
@@ -190,7 +205,7 @@ class ViaVecEnv(VecEnv):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on where :meth:`state` was taken, in this environment or another of the same kind and number."""
+        """Continue from a state of this environment, or of one of the same kind and number of copies."""
         env = self.venv.unwrapped
         env.reset(options=state["scenes"])
         if state.get("episodes"):
@@ -201,11 +216,11 @@ class ViaVecEnv(VecEnv):
         self._steps_before = int(state["physics_steps"]) - int(env.physics_steps)
 
     def close(self) -> None:
-        """Let the environment go."""
+        """Close the environment."""
         self.venv.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The vector environment's attribute, the same for every copy asked for."""
+        """Return an attribute of the vector environment, once for each copy asked for."""
         return [getattr(self.venv.unwrapped, attr_name)] * len(self._rows(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -219,19 +234,16 @@ class ViaVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the vector environment once; the answer is the same for every copy asked for."""
+        """Call a method of the vector environment once, and return its result for each copy asked for."""
         answer = getattr(self.venv.unwrapped, method_name)(*method_args, **method_kwargs)
         return [answer] * len(self._rows(indices))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Whether the copies do what a wrapper would: infos tell of episodes as SB3's `Monitor` has them do.
-
-        They have no other wrappers: the vector environment is a native one.
-        """
+        """Return True for `Monitor` of Stable-Baselines3, whose infos all copies report, and False otherwise."""
         return [wrapper_class is Monitor] * len(self._rows(indices))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Rendered frames, one for each copy."""
+        """Return rendered frames, one for each copy."""
         frames = self.venv.render()
         return [None] * self.num_envs if frames is None else list(frames)
 
@@ -244,7 +256,7 @@ class ViaVecEnv(VecEnv):
 
 
 def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
-    """Options of each copy as those of all together."""
+    """Return the options of all copies in one mapping of batched arrays."""
     listed = isinstance(options, Sequence) and len(options) == num_envs
     if not listed or not all(isinstance(each, Mapping) for each in options):
         raise ValueError(

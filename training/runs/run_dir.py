@@ -27,7 +27,6 @@ from viapoint.training.algorithms.agent import best_model
 from viapoint.training.algorithms.model_io import save_model
 from viapoint.training.config.checks import check_folder
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.config_json import as_json, from_json
 from viapoint.training.io.files import (
     UNFINISHED,
     BadFileError,
@@ -44,13 +43,25 @@ PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-b
 
 
 class Run:
-    """One run folder.
+    """Run folder, which holds everything about one training.
 
     Args:
-        folder: An existing run.
+        folder: Folder of an existing run.
 
     Raises:
         BadFileError: The folder is not a run.
+
+    Example:
+        >>> import tempfile
+        >>> from viapoint.training import Run, TrainConfig, train
+        >>> folder = tempfile.mkdtemp()
+        >>> config = TrainConfig(
+        ...     env="viapoint/PlanarReach-v0", n_timesteps=32, n_envs=16, eval_scenes=8, out=folder, progress=False
+        ... )
+        >>> run = train(config)
+        >>> run = Run(folder)  # at any later time
+        >>> run.decisions, run.best.name, [record["decisions"] for record in run.curve]
+        (32, 'best', [0, 32])
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -62,7 +73,7 @@ class Run:
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder
         try:
-            self.config: TrainConfig = from_json(TrainConfig, read_json(folder / "config.json"))
+            self.config: TrainConfig = TrainConfig.from_json(read_json(folder / "config.json"))
         except (TypeError, ValueError) as error:
             if isinstance(error, BadFileError):
                 raise
@@ -240,7 +251,7 @@ def check_free(folder: Path) -> None:
 
 def _write_config(folder: Path, config: TrainConfig) -> None:
     """The last file to be written: a folder is a run from then on. What is of one call only is left out."""
-    write_json(folder / "config.json", {**as_json(config), "out": None, "resume": False})
+    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
 def versions() -> dict[str, str]:

@@ -20,7 +20,6 @@ from viapoint.training.algorithms.model_io import build
 from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.discount import ELAPSED
-from viapoint.training.io.config_json import as_json
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import Monitor, TrainingStoppedError
@@ -66,16 +65,15 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
     Example:
         >>> import tempfile
         >>> from viapoint.training import TrainConfig, train
-        >>> run = train(
-        ...     TrainConfig(
-        ...         env="viapoint/PlanarReach-v0",
-        ...         n_timesteps=64,
-        ...         n_envs=32,
-        ...         eval_scenes=8,
-        ...         out=tempfile.mkdtemp(),
-        ...         progress=False,
-        ...     )
+        >>> config = TrainConfig(
+        ...     env="viapoint/PlanarReach-v0",
+        ...     n_timesteps=64,
+        ...     n_envs=32,
+        ...     eval_scenes=8,
+        ...     out=tempfile.mkdtemp(),
+        ...     progress=False,
         ... )
+        >>> run = train(config)
         >>> run.best.name, run.final.name
         ('best', 'final')
     """
@@ -133,7 +131,7 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
     Raises:
         BadFileError: Something was asked for that the run did not begin with.
     """
-    begun, asked, default = (as_json(each) for each in (run.config, config, usual))
+    begun, asked, default = (each.as_json() for each in (run.config, config, usual))
     others = []
     for name in asked.keys() - MAY_CHANGE:
         values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}

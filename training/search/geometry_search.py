@@ -61,7 +61,7 @@ class GeometrySearch:
         ValueError: A number is out of range.
 
     Example:
-        >>> import viapoint.envs
+        >>> from viapoint.training import GeometrySearch
         >>> search = GeometrySearch("viapoint/PlanarObstacles-v0", n_checks=64)
         >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
         >>> plan.waypoints.shape, plan.durations.shape
