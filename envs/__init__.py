@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms import register_arm
     from viapoint.envs.arms.base import Arm
     from viapoint.envs.record_video import RecordMovements
+    from viapoint.envs.scenes.families import register_scene_family
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
@@ -22,6 +23,7 @@ else:
         "RecordMovements": "viapoint.envs.record_video",
         "load_arm": "viapoint.envs.arm_import.loader",
         "register_arm": "viapoint.envs.arms",
+        "register_scene_family": "viapoint.envs.scenes.families",
     }
 
     def __getattr__(name):
@@ -43,4 +45,5 @@ __all__ = [
     "RecordMovements",
     "load_arm",
     "register_arm",
+    "register_scene_family",
 ]

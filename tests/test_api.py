@@ -16,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import viapoint.envs as ve
 from viapoint import envs, primitives, training
 from viapoint.envs.arms import ARMS
+from viapoint.envs.scenes import families
 from viapoint.training import GeometrySearch, TrainConfig, ViaQ, ViaVecEnv, evaluate, load_agent, train
 from viapoint.training.io.files import BadFileError
 
@@ -76,6 +77,7 @@ def test_type_checkers_see_what_is_imported_on_first_use(package):
 @pytest.mark.parametrize("value", objects(lambda value: True))
 def test_examples_run(value, monkeypatch):
     monkeypatch.chdir(Path(__file__).parents[1])
+    monkeypatch.setattr(families, "_FAMILIES", {d: dict(each) for d, each in families._FAMILIES.items()})
     value = type(value) if isinstance(value, enum.Enum) else value
     tests = doctest.DocTestFinder(recurse=False).find(value, globs={})
     assert any(test.examples for test in tests), "there is no example"
@@ -297,6 +299,15 @@ def test_the_tour(tmp_path, monkeypatch):
     ve.register_arm(arm)
     points = np.mean(arm.workspace, axis=0)
     np.testing.assert_allclose(arm.hand_position(arm.inverse_kinematics(points)), points, atol=1e-6)
+
+    def build_post(uniforms, site):
+        centre = 0.5 * (site.start + site.goal)
+        return np.concatenate((centre, np.zeros_like(centre), 0.02 + 0.0 * uniforms.take(1)), axis=-1)[
+            :, None
+        ]
+
+    monkeypatch.setattr(families, "_FAMILIES", {d: dict(each) for d, each in families._FAMILIES.items()})
+    ve.register_scene_family("post", build_post, n_obstacles=1)
 
     config = TrainConfig(
         env="viapoint/Obstacles-v0", env_kwargs={"arm": arm.name}, n_timesteps=32, n_envs=16, eval_every=0,
