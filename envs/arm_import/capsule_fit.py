@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 
 Geom = mujoco.mjtGeom
@@ -73,7 +74,7 @@ def _capsule_along(centres: Float, radii: Float, axis: Float) -> Capsule:
     sideways = np.linalg.svd(axis[None])[2][1:]  # two directions normal to the axis
     flat = centres @ sideways.T
     middle = 0.5 * ((flat - radii[:, None]).min(axis=0) + (flat + radii[:, None]).max(axis=0))
-    away = np.sqrt(((flat - middle) ** 2).sum(axis=-1))
+    away = norm(flat - middle)
     radius = float((away + radii).max()) + ROUNDING
     slack = np.sqrt((radius - radii) ** 2 - np.minimum(away, radius - radii) ** 2)
     along = centres @ axis

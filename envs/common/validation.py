@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Int
 
 
 def whole_number(name: str, value: Any, least: int) -> int:
@@ -61,7 +61,7 @@ def reset_options(options: Any) -> dict[str, Any]:
     return dict(options or {})
 
 
-def masked_rows(mask: Any, num_envs: int, running: bool) -> NDArray[np.int64]:
+def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
     """Return the indices of the environments in a reset mask; without a mask, of all."""
     if mask is None:
         return np.arange(num_envs)

@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Int, Single
+from viapoint.envs.common.types import Bool, Float, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, segment_distance_squared
 
@@ -45,7 +44,7 @@ def nearest_approach(
     traced: LinkPositions,
     radii: tuple[float, ...],
     obstacles: Float,
-    present: NDArray[np.bool_],
+    present: Bool,
     last: Int | None = None,
 ) -> Float:
     """Return the least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.

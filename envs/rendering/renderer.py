@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float, Frame
+from viapoint.envs.common.types import Float, Frame, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.overlay import Movement
@@ -37,7 +36,7 @@ def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
     return mode
 
 
-def frame_steps(time: NDArray[np.float64], fps: int) -> NDArray[np.int64]:
+def frame_steps(time: Float, fps: int) -> Int:
     """Return the states of a movement that the frames of its film show, evenly in time from start to end.
 
     Args:
@@ -122,7 +121,7 @@ class MovementRenderer:
         view.set(scene, movement.joints[step], movement, step)
         return self._canvas.draw(view.scene)
 
-    def _play(self, view: SceneView, scene: Scenes, movement: Movement, steps: NDArray[np.int64]) -> None:
+    def _play(self, view: SceneView, scene: Scenes, movement: Movement, steps: Int) -> None:
         """Play the film in the window in real time; late frames are left out."""
         assert self._window is not None
         begin = time.monotonic()

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Index
 
 
@@ -149,7 +150,7 @@ def directions(angle: Float, rise: Float, dimension: int) -> Float:
 
 def unit(vectors: Float) -> Float:
     """Return vectors scaled to length one; zero vectors stay zero."""
-    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=-1, keepdims=True)), 1e-9))
+    return np.asarray(vectors / np.maximum(norm(vectors)[..., None], 1e-9))
 
 
 def left(vectors: Float) -> Float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.draws import Site, Uniforms, between, left, rotate, unit
 
@@ -55,7 +56,7 @@ def corridor(uniforms: Uniforms, site: PlanarSite) -> Float:
     middle, reach = between((0.4, 0.6), uniforms.take(1)), between((0.1, 0.2), uniforms.take(1))
     first, centre, last = (_at(site.path, middle + step * reach) for step in (-1.0, 0.0, 1.0))
     along, centre = unit(last - first), 0.25 * (first + last) + 0.5 * centre
-    half = 0.5 * np.sqrt(((last - first) ** 2).sum(axis=-1))
+    half = 0.5 * norm(last - first)
     across, radius = left(along), between(BAR_RADIUS, uniforms.take(1)[:, 0])
     away = site.room + between((0.012, 0.03), uniforms.take(1)[:, 0]) + radius
     walls, place = between((0.08, 0.2), uniforms.take(2)), _centred(uniforms, 0.8) * half

@@ -14,6 +14,7 @@ import numpy as np
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int, Single
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, segment_distance_squared
 from viapoint.envs.scenes.config import SceneDistribution
@@ -116,7 +117,7 @@ class HandObstacles(PlanarObstacles):
     def _candidates(self, uniforms: Uniforms, feasible: FeasiblePath, hardness: Float) -> Float:
         """Return posts and bars, shape (N, CANDIDATES, 5): half about the line, half beside the feasible path."""
         d, (start, goal, _) = self._distribution, feasible
-        along = (goal - start)[:, None] / np.sqrt(((goal - start) ** 2).sum(axis=-1))[:, None, None]
+        along = (goal - start)[:, None] / norm(goal - start)[:, None, None]
         fraction, offset = uniforms.take(CANDIDATES), 2.0 * uniforms.take(CANDIDATES) - 1.0
         half, radius, tilt = draw_shapes(uniforms, d, CANDIDATES)
         beside = np.arange(CANDIDATES) % 2 == 1
@@ -137,7 +138,7 @@ class HandObstacles(PlanarObstacles):
         This is an estimate at one place along the line, which steers difficulty only.
         """
         start, goal = feasible.start[:, None], feasible.goal[:, None]
-        along, length = unit(goal - start), np.sqrt(((goal - start) ** 2).sum(axis=-1))
+        along, length = unit(goal - start), norm(goal - start)
         across = left(along)
         centre, axis, radius = rows[..., :2] - start, rows[..., 2:4], rows[..., 4]
         fraction = np.clip((centre * along).sum(axis=-1) / length, 0.0, 1.0)
@@ -320,7 +321,7 @@ class WholeArmObstacles(PlanarObstacles):
     def _detours_of(self, feasible: FeasiblePath) -> Float:
         """Return detours of all scenes and detours near the feasible paths, shape (N, detours, phases, D), [m]."""
         start, goal, path = feasible
-        distance = np.sqrt(((goal - start) ** 2).sum(axis=-1))[:, None, None]
+        distance = norm(goal - start)[:, None, None]
         along = unit(goal - start)[:, None]
         along, across = along[:, None], left(along)[:, None]
         x = self._detours[..., 0] + (distance - self._distance) * _minimum_jerk(DETOUR_PHASES)

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.arms.base import Arm, CollisionModel
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 
 LARGEST_HALF_AXIS = 0.3
@@ -46,7 +46,7 @@ class Scenes(NamedTuple):
     """Rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]; absent rows are zero."""
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def present(self) -> Bool:
         """Whether a row is an obstacle, shape (N, n): an absent one has no radius."""
         return self.obstacles[..., -1] > 0.0
 
@@ -79,13 +79,13 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
     ]
     start = np.array([TARGETS[a] for a, _ in pairs])
     goal = np.array([TARGETS[b] for _, b in pairs])
-    along = (goal - start) / np.sqrt(((goal - start) ** 2).sum(-1, keepdims=True))
+    along = (goal - start) / norm(goal - start)[..., None]
     half = 0.5 * length * np.stack((-along[:, 1], along[:, 0]), axis=-1)
     rows = np.concatenate(((start + goal) / 2.0, half, np.full((len(pairs), 1), radius)), axis=-1)
     return pairs, Scenes(start, goal, rows[:, None, :])
 
 
-Problem = tuple[NDArray[np.bool_], Callable[[int], str]]
+Problem = tuple[Bool, Callable[[int], str]]
 """Which scenes have a fault, shape (N,), and the words for it in one of them."""
 
 
@@ -118,7 +118,7 @@ def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Proble
 
 
 def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
-    apart = np.sqrt(((scenes.goal - scenes.start) ** 2).sum(axis=-1))
+    apart = norm(scenes.goal - scenes.start)
     yield (
         apart < MIN_GOAL_DISTANCE,
         lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {MIN_GOAL_DISTANCE} m is needed",
@@ -135,7 +135,7 @@ def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
 
 def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
     dimension = scenes.start.shape[-1]
-    half = np.sqrt((scenes.obstacles[..., dimension : 2 * dimension] ** 2).sum(axis=-1))
+    half = norm(scenes.obstacles[..., dimension : 2 * dimension])
     radius = scenes.obstacles[..., -1]
     named = (scenes.obstacles != 0.0).any(axis=-1)
     for wrong, what in (

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.draws import Site, Uniforms, between, left, rotate
 
@@ -142,7 +143,7 @@ def tunnel(uniforms: Uniforms, site: SpatialSite) -> Structures:
 def from_path(rows: Float, site: SpatialSite) -> Structures:
     """Return obstacles, shape (N, K, n, 7), whose upper ends retreat from the place on the path."""
     away = rows[..., :3] + rows[..., 3:6] - site.place[:, :, None]
-    return Structures(rows, away / np.maximum(np.sqrt((away**2).sum(axis=-1, keepdims=True)), 1e-6))
+    return Structures(rows, away / np.maximum(norm(away)[..., None], 1e-6))
 
 
 def draw_obstacles(sizes: SpatialSizes, centre: Float, u: Float) -> Float:
@@ -160,7 +161,7 @@ def draw_obstacles(sizes: SpatialSizes, centre: Float, u: Float) -> Float:
     kind, size, turn, tilt = u[..., 0] * 97.0 % 1.0, u[..., 1], 2.0 * np.pi * u[..., 2], u[..., 3] - 0.5
     half = between(sizes.bar_half_length, u[..., 4])
     level = np.stack((np.cos(turn), np.sin(turn), 2.0 * tilt), axis=-1)
-    axis = half[..., None] * level / np.sqrt((level**2).sum(axis=-1, keepdims=True))
+    axis = half[..., None] * level / norm(level)[..., None]
     bar = _row(centre, axis, between(sizes.bar_radius, size))
     sphere = _row(centre, np.zeros_like(centre), between(sizes.sphere_radius, size))
     post = _post(centre, centre[..., 2] + 0.1 * u[..., 5], between(sizes.post_radius, size))

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float, Int, Single
@@ -132,7 +131,7 @@ class SweptVolume(NamedTuple):
             *(LinkBodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
         )
 
-    def top(self, phase: NDArray[np.int64], place: Float) -> Float:
+    def top(self, phase: Int, place: Float) -> Float:
         """Height of what of the links near the hand stands above it, at K times of each movement.
 
         Args:
