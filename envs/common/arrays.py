@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.types import Numbers
+from viapoint.envs.common.types import Float, Numbers
 from viapoint.primitives.array_api import Array, namespace_of
 
 N = TypeVar("N", bound=Numbers)
@@ -49,3 +49,10 @@ def norm(vectors: N) -> N:
     """Return the Euclidean length along the last axis of NumPy vectors."""
     length: N = np.asarray(np.sqrt(squared_length(vectors)))  # type: ignore[assignment]
     return length
+
+
+def in_space(points: Float, height: float = 0.0) -> Float:
+    """Return vectors (..., D) in three dimensions: those of the plane at a height, others unchanged."""
+    if points.shape[-1] == 3:
+        return points
+    return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)

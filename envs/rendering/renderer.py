@@ -10,13 +10,14 @@ import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float, Frame, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.scene_view import SPACING, SceneView
-from viapoint.envs.rendering.shapes import ShapeWriter, in_space, resampled
+from viapoint.envs.rendering.shapes import ShapeWriter, resampled
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout

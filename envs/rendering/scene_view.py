@@ -8,10 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 from viapoint.envs.rendering.overlay import Movement
-from viapoint.envs.rendering.shapes import GLOWING, ShapeWriter, in_space, resampled
+from viapoint.envs.rendering.shapes import GLOWING, ShapeWriter, resampled
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import Simulator
 

@@ -104,10 +104,3 @@ def resampled(points: Float, spacing: float) -> Float:
     count = max(int(np.ceil(length[-1] / spacing)), 1) + 1
     places = np.linspace(0.0, length[-1], count)
     return np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
-
-
-def in_space(points: Float, height: float) -> Float:
-    """Return points (..., D) [m] in space: those of the plane at a height [m], others unchanged."""
-    if points.shape[-1] == 3:
-        return points
-    return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)

@@ -10,6 +10,7 @@ from mujoco import batch
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.narrow_phase import LinkPositions
 
@@ -78,9 +79,9 @@ class Simulator:
         if not self._geoms:
             return
         dimension = (obstacles.shape[-1] - 1) // 2
-        centre = _in_space(obstacles[..., :dimension])
-        axis = _in_space(obstacles[..., dimension : 2 * dimension])
-        half = np.sqrt((axis * axis).sum(axis=-1))
+        centre = in_space(obstacles[..., :dimension])
+        axis = in_space(obstacles[..., dimension : 2 * dimension])
+        half = norm(axis)
         radius = obstacles[..., -1]
         self.batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
         self.batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
@@ -117,7 +118,7 @@ class Simulator:
         number = controls.shape[1]
         warnings = self._warnings(sims)
         absent = np.isnan(places[..., :1])
-        where = np.where(absent, OUT_OF_THE_WAY, _in_space(places)).reshape(*controls.shape[:2], -1)
+        where = np.where(absent, OUT_OF_THE_WAY, in_space(places)).reshape(*controls.shape[:2], -1)
         kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ()))
         out = self.batch.rollout(
             number, np.concatenate((controls, where), axis=-1), MOVING, record=(*kept, "ncon"), ids=sims
@@ -151,21 +152,14 @@ class Simulator:
         self._boxes[rows] = np.stack((*[np.zeros_like(half)] * 3, radius, radius, length), axis=-1)
 
 
-def _in_space(vectors: Float) -> Float:
-    """Vectors of the plane as vectors of space, at height zero; those of space as they are."""
-    if vectors.shape[-1] == 3:
-        return vectors
-    return np.concatenate((vectors, np.zeros_like(vectors[..., :1])), axis=-1)
-
-
 def _turn_up_to(axis: Float, half: Float) -> Float:
     """Quaternion that turns the z axis, along which MuJoCo lays its capsules, towards `axis`."""
     lying = half > 1e-9
     unit = np.where(lying[..., None], axis / np.where(lying, half, 1.0)[..., None], (0.0, 0.0, 1.0))
     unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction
     x, y, z = (unit[..., i] for i in range(3))
-    norm = np.sqrt(2.0 * (1.0 + z))
-    return np.stack(((1.0 + z) / norm, -y / norm, x / norm, np.zeros_like(z)), axis=-1)
+    length = np.sqrt(2.0 * (1.0 + z))
+    return np.stack(((1.0 + z) / length, -y / length, x / length, np.zeros_like(z)), axis=-1)
 
 
 def _finite(joints: Float) -> NDArray[np.bool_]:
