@@ -1,4 +1,4 @@
-"""Measure the search among computed plans: time of a decision and success, by task and number of checks.
+"""Measure GeometrySearch: time of a decision and success, by task and number of checks.
 
     OMP_NUM_THREADS=1 python benchmarks/geometry_search.py --scenes validation --number 200
 
@@ -6,12 +6,12 @@ Columns, times in [ms] and in one thread:
 
     single     first decision of one scene, all checks in one call
     batch      the same for each scene of a batch of 250
-    refined    first decision of one scene by the method of the table, which spends half of its checks on refinement
-    all        clearance, reach and reward of every candidate of a scene in the batch
-    ratio      `all` relative to its floor: one multiplication for each pair of an instant and an obstacle
+    refined    first decision of one scene by the method of the tables, with half of its checks in refinements
+    all        clearance, reach and reward of all candidates of a scene, in the batch
+    ratio      `all` relative to its lower bound: one multiplication for each pair of an instant and an obstacle
     solved     success of the method on the scenes, [%]
     jerk       median jerk ratio of its successes
-    decisions  of an episode, on average
+    decisions  mean number in an episode
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from viapoint.training.search.plan_checks import NODES, check_plans
 REPEATS = 9
 BATCH = 250
 LARGEST = 1 << 18
-"""Candidates of a batch at most."""
+"""Greatest number of candidates in a batch."""
 
 
 def milliseconds(function: Callable[[], Any], repeats: int = REPEATS) -> float:
@@ -85,12 +85,12 @@ def report(env_id: str, scenes: str, number: int, methods: list[str]) -> None:
     observation = trial.observe(some)
     for name in methods:
         method: Any = SEARCHES[name](trial)
-        done = trial.play(method, some, method.decide(observation))
-        jerk = np.median(done.info["jerk_ratio"][done.success]) if done.success.any() else np.nan
-        decisions = done.info["decisions"].mean() if "decisions" in done.info else 1.0
+        result = trial.play(method, some, method.decide(observation))
+        jerk = np.median(result.info["jerk_ratio"][result.success]) if result.success.any() else np.nan
+        decisions = result.info["decisions"].mean() if "decisions" in result.info else 1.0
         print(
             f"{env_id.removeprefix('viapoint/'):25} {name:10} {times(trial.task, method, observation)} "
-            f"{100.0 * done.success.mean():8.1f} {jerk:8.2f} {decisions:9.2f}",
+            f"{100.0 * result.success.mean():8.1f} {jerk:8.2f} {decisions:9.2f}",
             flush=True,
         )
     trial.close()
@@ -102,14 +102,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", default="validation")
-    parser.add_argument("--number", type=int, default=200, help="scenes of each task at most")
+    parser.add_argument("--number", type=int, default=200, help="greatest number of scenes of each task")
     parser.add_argument("--tasks", nargs="+", default=[*TASKS, *ONLINE_TASKS])
     parser.add_argument("--methods", nargs="+", default=list(SEARCHES))
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     heads = ("single", "batch", "refined", "all", "ratio", "solved", "jerk")
     print(f"{'task':25} {'method':10} {' '.join(f'{head:>8}' for head in heads)} {'decisions':>9}")
-    for env_id in chosen.tasks:
-        report(env_id, chosen.scenes, chosen.number, chosen.methods)
+    for env_id in arguments.tasks:
+        report(env_id, arguments.scenes, arguments.number, arguments.methods)
 
 
 if __name__ == "__main__":

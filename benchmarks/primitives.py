@@ -1,4 +1,4 @@
-"""How fast the primitives are, as ratios: against a plain copy of their output, and against SciPy's spline.
+"""Measure the speed of the primitives relative to a plain copy of their output and to SciPy's spline.
 
     OMP_NUM_THREADS=1 python benchmarks/primitives.py [--json FILE]
 
@@ -30,7 +30,7 @@ MOVEMENTS, SAMPLES, DIMENSION = 4096, 200, 2
 
 @dataclass(frozen=True)
 class Row:
-    """One measured number and what it is held against."""
+    """Measured time with its reference."""
 
     name: str
     microseconds: float
@@ -38,18 +38,18 @@ class Row:
     measure: str
     value: float
     limit: float | None
-    """The value that it must not exceed."""
+    """Greatest allowed value."""
 
     @property
     def holds(self) -> bool:
         return self.limit is None or self.value <= self.limit
 
 
-def best(work: Callable[[], Any], count: int, repeat: int = 5) -> float:
-    """Microseconds per movement, the best of `repeat` runs."""
+def best(function: Callable[[], Any], count: int, repeat: int = 5) -> float:
+    """Return microseconds per movement, the best of `repeat` runs."""
     clock = time.process_time  # other work on the machine does not count
-    loops = max(1, int(0.02 / max(timeit.timeit(work, number=1), 1e-6)))
-    return min(timeit.repeat(work, timer=clock, number=loops, repeat=repeat)) / loops / count * 1e6
+    loops = max(1, int(0.02 / max(timeit.timeit(function, number=1), 1e-6)))
+    return min(timeit.repeat(function, timer=clock, number=loops, repeat=repeat)) / loops / count * 1e6
 
 
 def scene(vias: int, count: int = MOVEMENTS) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +58,7 @@ def scene(vias: int, count: int = MOVEMENTS) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scipy_spline(knots: np.ndarray, waypoints: np.ndarray, at: np.ndarray) -> list[np.ndarray]:
-    """SciPy's quintic spline with clamped ends through waypoints (K + 2, ...), three derivatives."""
+    """Evaluate SciPy's quintic spline with clamped ends through waypoints (K + 2, ...), three derivatives."""
     from scipy.interpolate import make_interp_spline
 
     rest = np.zeros(waypoints.shape[1:])
@@ -68,7 +68,7 @@ def scipy_spline(knots: np.ndarray, waypoints: np.ndarray, at: np.ndarray) -> li
 
 
 def sampling_rows(vias: int) -> list[Row]:
-    """Solving and sampling, with knot times of each movement's own and shared."""
+    """Measure solving and sampling, with separate and with shared knot times."""
     waypoints, durations = scene(vias)
     out = np.zeros((3, MOVEMENTS, SAMPLES, DIMENSION))
     source = np.ones_like(out)

@@ -1,12 +1,12 @@
-"""Whether equal seeds give equal episodes, bit for bit, however they are run; and the hashes of the first thousand.
+"""Check that equal seeds give bit-equal episodes in every mode of execution, and compare their stored hashes.
 
-    python benchmarks/reliability_determinism.py            # run them every way, compare with the file
-    python benchmarks/reliability_determinism.py --write    # make the file anew, after the environments were changed
+    python benchmarks/reliability_determinism.py            # run every mode and compare with the file
+    python benchmarks/reliability_determinism.py --write    # write the file after a change of the environments
     python benchmarks/reliability_determinism.py --write --ids viapoint/PlanarWholeArm-v0
 
-Episode i of an environment is what follows `reset(seed=i)` under actions drawn from i alone. Its hash is taken over the
-first observation, the last one, every reward and all of `info`. The hashes lie in tests/envs/episode_hashes.json,
-together with what their last bits depend on: MuJoCo, NumPy, the C library and the processor's vector instructions.
+Episode i of an environment begins with `reset(seed=i)` and has actions that depend on i alone. Its hash is that of the
+first and last observation, all rewards and all of `info`. The hashes are in tests/envs/episode_hashes.json, with the
+versions that their last bits depend on: MuJoCo, NumPy, the C library and the processor's vector instructions.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ FILE = Path(__file__).parents[1] / "tests" / "envs" / "episode_hashes.json"
 IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
 EPISODES = 1_000
 EVERY = 100
-"""The file holds a hash of the first 100 episodes, of the first 200 and so on."""
+"""Interval of stored hashes: of the first 100 episodes, of the first 200 and so on."""
 STEPS = 400
-"""An episode ends before it has so many steps."""
+"""Upper bound of the steps of an episode."""
 
 assert viapoint.envs, "importing it registers the environments"
 
 
 def fingerprint() -> dict[str, str]:
-    """What the last bits of a result depend on, besides the program."""
+    """Return the versions that the last bits of a result depend on."""
     from numpy._core._multiarray_umath import __cpu_features__
 
     present = "+".join(sorted(name for name, there in __cpu_features__.items() if there))
@@ -82,12 +82,12 @@ def arithmetic() -> str:
 
 
 def actions(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """The actions of an episode, shape (STEPS, *shape)."""
+    """Return the actions of an episode, shape (STEPS, *shape)."""
     return np.random.default_rng((seed, 1)).uniform(-1.0, 1.0, (STEPS, *shape)).astype(np.float32)
 
 
 class Digest:
-    """The hash of one episode, as it goes on."""
+    """Hash of one episode, updated step by step."""
 
     def __init__(self, observation: dict[str, np.ndarray]) -> None:
         self.sum = hashlib.sha256()
@@ -107,7 +107,7 @@ class Digest:
 
 
 def single(env_id: str, seeds: Sequence[int], **kwargs: Any) -> list[bytes]:
-    """The episodes of these seeds, one after the other."""
+    """Return the hashes of episodes in a single environment."""
     env, result = gym.make(env_id, disable_env_checker=True, **kwargs), []
     for seed in seeds:
         observation, _ = env.reset(seed=int(seed))
@@ -117,14 +117,14 @@ def single(env_id: str, seeds: Sequence[int], **kwargs: Any) -> list[bytes]:
             digest.step(reward)
             if over := terminated or truncated:
                 break
-        assert over, "an episode has no end"
+        assert over, "an episode does not end"
         result.append(digest.end(observation, info))
     env.close()
     return result
 
 
 def together(env: gym.vector.VectorEnv, seeds: Sequence[int]) -> list[bytes]:
-    """The episodes of these seeds in a vector environment, at most as many at once as it has."""
+    """Return the hashes of episodes in a vector environment, `num_envs` at a time."""
     result: list[bytes] = []
     shape = env.single_action_space.shape
     for first in range(0, len(seeds), env.num_envs):
@@ -149,22 +149,22 @@ def _chunk(env: gym.vector.VectorEnv, seeds: list[int], planned: np.ndarray) -> 
                 ends[i] = digests[i].end(info["final_obs"][i], values)
         if None not in ends:
             return ends
-    raise AssertionError("an episode has no end")
+    raise AssertionError("an episode does not end")
 
 
 def native(env_id: str, seeds: Sequence[int], num_envs: int, threads: int = 1) -> list[bytes]:
-    """In the native vector environment."""
+    """Return the hashes of episodes in the native vector environment."""
     return together(gym.make_vec(env_id, num_envs=num_envs, threads=threads), seeds)
 
 
 def synchronous(env_id: str, seeds: Sequence[int], num_envs: int) -> list[bytes]:
-    """In Gymnasium's own vector of single environments."""
+    """Return the hashes of episodes in Gymnasium's vector of single environments."""
     makers = [lambda: gym.make(env_id, disable_env_checker=True)] * num_envs
     return together(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP), seeds)
 
 
 def elsewhere(env_id: str, seeds: Sequence[int], processes: int) -> list[bytes]:
-    """In new processes, the seeds shared out among them."""
+    """Return the hashes of episodes in new processes, which share the seeds."""
     shares = [list(seeds[i::processes]) for i in range(processes)]
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         parts = pool.starmap(single, [(env_id, share) for share in shares])
@@ -179,22 +179,22 @@ WAYS: dict[str, Callable[[str, Sequence[int]], list[bytes]]] = {
     "seven single ones in SyncVectorEnv": lambda env_id, seeds: synchronous(env_id, seeds, 7),
     "two other processes": lambda env_id, seeds: elsewhere(env_id, seeds, 2),
 }
-"""How episodes can be run besides 100 at a time on one thread."""
+"""Modes of execution that are compared with 100 episodes at a time on one thread."""
 
 
 def reference(env_id: str, episodes: int) -> list[bytes]:
-    """The first episodes, 100 at a time on one thread."""
+    """Return the hashes of the first episodes, 100 at a time on one thread."""
     return native(env_id, range(episodes), 100)
 
 
 def hashes(digests: Sequence[bytes]) -> list[str]:
-    """A hash of the first EVERY episodes, of the first two times EVERY and so on."""
+    """Return a hash of the first EVERY episodes, of the first two times EVERY and so on."""
     ends = range(EVERY, len(digests) + 1, EVERY)
     return [hashlib.sha256(b"".join(digests[:end])).hexdigest()[:16] for end in ends]
 
 
 def write(ids: Sequence[str]) -> None:
-    """Make the file, or its entries of some environments where all else is as it was."""
+    """Write the file, or its entries of some environments if the versions are unchanged."""
     made = fingerprint()
     kept = json.loads(FILE.read_text()) if FILE.exists() else {}
     known = kept["hashes"] if kept.get("made_with") == made else {}
@@ -207,7 +207,7 @@ def write(ids: Sequence[str]) -> None:
 
 
 def check(ids: Sequence[str], episodes: int) -> bool:
-    """Run every way and compare; whether all is equal."""
+    """Run every mode and return whether all hashes are equal."""
     stored, good = json.loads(FILE.read_text()), True
     comparable = stored["made_with"] == fingerprint()
     for env_id in ids:

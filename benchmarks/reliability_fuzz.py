@@ -1,11 +1,11 @@
-"""Adversarial actions, scenes and orders of calls: nothing but documented errors, nothing that is not finite.
+"""Fuzz the environments with adversarial actions, scenes and sequences of calls.
 
     python benchmarks/reliability_fuzz.py [--ids ID ...] [--actions N] [--scenes N] [--calls N] [--json FILE]
 
-For every environment: 100,000 actions at and beyond the edges of their space; 10,000 scenes with obstacles that touch,
-contain and repeat each other, as large, thin and short as can be written; and 5,000 calls of reset, partial reset,
-step and close in random order, with good and with bad arguments. A call either does what it should or raises
-`ValueError` or `gymnasium.error.ResetNeeded`; what it returns is finite and within its space; memory does not grow.
+For every environment: 100,000 actions at and beyond the bounds of their space; 10,000 scenes with obstacles that touch,
+contain and repeat each other, of extreme sizes; and 5,000 calls of reset, partial reset, step and close in random
+order, with valid and invalid arguments. A call succeeds or raises `ValueError` or `gymnasium.error.ResetNeeded`; its
+results are finite and within their spaces; memory does not grow.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
 
 IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
 DOCUMENTED = (ValueError, gym.error.ResetNeeded)
-"""What a call may raise."""
+"""Exceptions that a call may raise."""
 PARTS = 10
-"""In which each fuzzing is done, so that memory can be looked at between them."""
+"""Number of parts of each run; memory is measured after each."""
 ALLOWED = 8.0
-"""Growth of memory that counts as none, [MB]."""
+"""Allowed growth of memory, [MB]."""
 TINY = float(np.finfo(np.float32).smallest_subnormal)
 EDGES = np.array(
     [-1.0, 1.0, 0.0, -0.0, TINY, -TINY, 1e-300, np.nextafter(1.0, 0.0), np.nextafter(1.0, 2.0), 3e38, -1e300]
@@ -44,8 +44,8 @@ EDGES = np.array(
 assert viapoint.envs, "importing it registers the environments"
 
 
-def nasty_actions(generator: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Finite actions of every nasty kind, shape (N, m)."""
+def adversarial_actions(generator: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Return finite adversarial actions, shape (N, m)."""
     uniform = generator.uniform(-1.0, 1.0, shape)
     kinds = (
         uniform,
@@ -60,7 +60,7 @@ def nasty_actions(generator: np.random.Generator, shape: tuple[int, int]) -> np.
 
 
 def check(env: Any, observation: Any, reward: Any, info: dict[str, Any]) -> None:
-    """What a step of a vector environment returned is finite and within its space."""
+    """Check that the results of a step are finite and within their spaces."""
     assert env.observation_space.contains(observation), "an observation is out of its space"
     assert np.isfinite(reward).all(), "a reward is not finite"
     for name, value in {**info, **info.get("final_info", {})}.items():
@@ -73,13 +73,13 @@ def check(env: Any, observation: Any, reward: Any, info: dict[str, Any]) -> None
 
 
 def fuzz_actions(env_id: str, number: int, seed: int = 0, num_envs: int = 250) -> Counter[str]:
-    """Steps with nasty actions, and now and then one that must be refused without a trace."""
+    """Run steps with adversarial actions; invalid ones in between must be rejected without side effects."""
     generator, found = np.random.default_rng(seed), Counter[str]()
     env = gym.make_vec(env_id, num_envs=num_envs, threads=1)
     env.reset(seed=seed)
     shape = env.action_space.shape
     while found["actions"] < number:
-        actions = nasty_actions(generator, shape)
+        actions = adversarial_actions(generator, shape)
         if generator.random() < 0.2:
             bad = actions.copy()
             bad[tuple(generator.integers(shape))] = generator.choice([np.nan, np.inf, -np.inf])
@@ -98,8 +98,8 @@ def fuzz_actions(env_id: str, number: int, seed: int = 0, num_envs: int = 250) -
     return found
 
 
-def nasty_scene(generator: np.random.Generator, env: Any) -> dict[str, np.ndarray]:
-    """Options for `reset` that set up a scene of obstacles nobody would place."""
+def adversarial_scene(generator: np.random.Generator, env: Any) -> dict[str, np.ndarray]:
+    """Return options for `reset` with an adversarial scene."""
     task = env.unwrapped.task
     d, rows = task.arm.dimension, env.unwrapped.observation_layout.n_rows
     start, goal = generator.uniform(-0.6, 0.6, (2, d))
@@ -134,19 +134,21 @@ def nasty_scene(generator: np.random.Generator, env: Any) -> dict[str, np.ndarra
 
 
 def fuzz_scenes(env_id: str, number: int, seed: int = 0) -> Counter[str]:
-    """Nasty scenes: each is refused, with a reason, or played."""
+    """Run adversarial scenes; each is rejected with a reason, or an episode runs in it."""
     generator, found = np.random.default_rng(seed), Counter[str]()
     env = gym.make(env_id, disable_env_checker=True)
     for count in range(number):
         env.reset(seed=seed + count)
         try:
-            observation, _ = env.reset(options=nasty_scene(generator, env))
+            observation, _ = env.reset(options=adversarial_scene(generator, env))
         except ValueError as error:
             found["refused" if str(error) else "refused without a reason"] += 1
         else:
             found["played"] += 1
             assert env.observation_space.contains(observation)
-        observation, reward, _, _, info = env.step(nasty_actions(generator, (1, *env.action_space.shape))[0])
+        observation, reward, _, _, info = env.step(
+            adversarial_actions(generator, (1, *env.action_space.shape))[0]
+        )
         assert env.observation_space.contains(observation), "an observation is out of its space"
         assert np.isfinite([reward, *info.values()]).all(), "a reward or info is not finite"
         found["unstable"] += bool(info["unstable"])
@@ -155,7 +157,7 @@ def fuzz_scenes(env_id: str, number: int, seed: int = 0) -> Counter[str]:
 
 
 def _calls(generator: np.random.Generator, env: Any) -> dict[str, Callable[[], Any]]:
-    """Calls of a vector environment, good and bad."""
+    """Return valid and invalid calls of a vector environment."""
     n, shape = env.num_envs, env.action_space.shape
     mask = generator.random(n) < 0.5
     bad_mask = (np.ones(n + 1, dtype=bool), np.zeros(n, dtype=bool), np.ones(n), "all")[generator.integers(4)]
@@ -169,7 +171,7 @@ def _calls(generator: np.random.Generator, env: Any) -> dict[str, Callable[[], A
         "reset some badly": lambda: env.reset(options={"reset_mask": bad_mask}),
         "reset to a bad scene": lambda: env.reset(options={"start": np.full(shape[1], np.nan)}),
         "reset by an unknown name": lambda: env.reset(options={"speed": 3}),
-        "step": lambda: env.step(nasty_actions(generator, shape)),
+        "step": lambda: env.step(adversarial_actions(generator, shape)),
         "step at rest": lambda: env.step(np.zeros(shape)),
         "step badly": lambda: env.step(np.full(shape, np.nan)),
         "step in a wrong shape": lambda: env.step(np.zeros((n, shape[1] + 1))),
@@ -179,7 +181,7 @@ def _calls(generator: np.random.Generator, env: Any) -> dict[str, Callable[[], A
 
 
 def fuzz_calls(env_id: str, number: int, seed: int = 0) -> Counter[str]:
-    """Calls in random order, in new environments now and then."""
+    """Run calls in random order, with a new environment after every 500."""
     generator, found, env = np.random.default_rng(seed), Counter[str](), None
     for count in range(number):
         if env is None or count % 500 == 0:
@@ -206,21 +208,21 @@ def fuzz_calls(env_id: str, number: int, seed: int = 0) -> Counter[str]:
 
 
 def memory() -> float:
-    """Resident memory of this process, without what its allocator could give back, [MB]."""
+    """Return the resident memory of this process without free blocks of its allocator, [MB]."""
     getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
-def measured(fuzz: Callable[..., Counter[str]], env_id: str, number: int) -> dict[str, Any]:
-    """What came of it, and how much more memory is taken at least in the second half than in the first.
+def run_in_parts(fuzz: Callable[..., Counter[str]], env_id: str, number: int) -> dict[str, Any]:
+    """Return the counts of a run and the growth of memory from its first half to its second.
 
-    The least of several looks tells a leak from a block that the allocator now keeps and now gives back.
+    Each half counts with its minimum, which distinguishes a leak from blocks that the allocator keeps for a while.
     """
-    found, looks, began = Counter[str](), [], time.process_time()
+    found, samples, began = Counter[str](), [], time.process_time()
     for part in range(PARTS):
         found.update(fuzz(env_id, max(1, number // PARTS), seed=part * 10**6))
-        looks.append(memory())
-    growth = min(looks[PARTS // 2 :]) - min(looks[: PARTS // 2])
+        samples.append(memory())
+    growth = min(samples[PARTS // 2 :]) - min(samples[: PARTS // 2])
     return {
         **found,
         "memory_growth": round(growth, 2),
@@ -240,7 +242,7 @@ def main() -> None:
     for env_id in arguments.ids:
         for fuzz in (fuzz_actions, fuzz_scenes, fuzz_calls):
             kind = fuzz.__name__.removeprefix("fuzz_")
-            result = measured(fuzz, env_id, getattr(arguments, kind))
+            result = run_in_parts(fuzz, env_id, getattr(arguments, kind))
             results.setdefault(env_id, {})[kind] = result
             print(env_id, kind, json.dumps(result), flush=True)
             if arguments.json is not None:

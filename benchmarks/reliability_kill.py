@@ -1,12 +1,11 @@
-"""Kills trainings at random moments, takes them up again, and compares them with those that were left alone.
+"""Kill trainings at random moments, resume them, and compare them with uninterrupted trainings.
 
     python benchmarks/reliability_kill.py [--kills 50] [--seed 0] [--json FILE]
 
-The process is ended by SIGKILL, which leaves it no time for anything. The moment is uniform over the time that a whole
-training takes, from the first import on; checkpoints are frequent, so that many kills fall amid a write. A killed
-training is resumed, and may be killed again, until it ends by itself. Then its best and its last model, its learning
-curve and its last checkpoint, with optimisers, replay buffer, random states and environment, must be those of the
-training that was left alone, bit for bit.
+SIGKILL ends the process at a random moment, uniform over the time of a whole training from the first import on.
+Checkpoints are frequent, so many kills happen during a write. A killed training is resumed, and may be killed again,
+until it ends. Then its best and its last model, its learning curve and its last checkpoint, with optimisers, replay
+buffer, random states and environment, must be bit-equal to those of the uninterrupted training.
 """
 
 from __future__ import annotations
@@ -42,12 +41,12 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
 }
 CLOCK = ("seconds", "decision_time", "t")
-"""Names of what is measured in seconds of real time."""
+"""Names of entries that hold real time."""
 DECISIONS, COPIES, EVERY = 480, 16, 32
 
 
 def config(folder: Path, algo: str, *, resume: bool = False) -> TrainConfig:
-    """A training of a second or two that writes much."""
+    """Return the configuration of a training of about two seconds with frequent writes."""
     return TrainConfig(
         env=ENV, algo=algo, out=folder, resume=resume, n_timesteps=DECISIONS, n_envs=COPIES,
         eval_every=2 * EVERY, eval_scenes=8, checkpoint_every=EVERY, env_kwargs={"threads": 1},
@@ -56,7 +55,7 @@ def config(folder: Path, algo: str, *, resume: bool = False) -> TrainConfig:
 
 
 def start(folder: Path, algo: str, log: Path) -> int:
-    """Train in a process of its own; its number. What it says goes to the log."""
+    """Start a training in a new process with its output in the log, and return the process id."""
     process = os.fork()
     if process:
         return process
@@ -76,7 +75,7 @@ def start(folder: Path, algo: str, log: Path) -> int:
 
 
 def kill_after(process: int, seconds: float) -> bool:
-    """Kill a process at that time; False if it had ended by itself, without an error."""
+    """Kill a process after a time; return False if it has ended before, without an error."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         ended, status = os.waitpid(process, os.WNOHANG)
@@ -90,7 +89,7 @@ def kill_after(process: int, seconds: float) -> bool:
 
 
 def content(folder: Path) -> dict[str, Any]:
-    """Everything that a run came to, but for how long it took."""
+    """Return the results of a run without its times."""
     run = Run(folder)
     newest = run.checkpoints()[-1]
     state = read_json(newest / "state.json")
@@ -98,22 +97,22 @@ def content(folder: Path) -> dict[str, Any]:
         del state[name]
     arrays = {name: read_arrays(folder / name / "weights.safetensors") for name in ("best", "final")}
     return {
-        "curve": timeless(run.curve),
-        "state": timeless(state),
+        "curve": without_times(run.curve),
+        "state": without_times(state),
         "checkpoint": newest.name,
         "arrays": {**arrays, "tensors": read_arrays(newest / "tensors.safetensors")},
     }
 
 
-def timeless(value: Any) -> Any:
-    """Nested values without what the clock said."""
+def without_times(value: Any) -> Any:
+    """Return nested values without entries of real time."""
     if isinstance(value, dict):
-        return {name: timeless(each) for name, each in value.items() if name not in CLOCK}
-    return [timeless(each) for each in value] if isinstance(value, list) else value
+        return {name: without_times(each) for name, each in value.items() if name not in CLOCK}
+    return [without_times(each) for each in value] if isinstance(value, list) else value
 
 
 def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """What is not the same in two runs."""
+    """Return the names of entries that differ between two runs."""
     found = [name for name in ("curve", "state", "checkpoint") if one[name] != other[name]]
     for group, arrays in one["arrays"].items():
         theirs = other["arrays"][group]
@@ -126,13 +125,13 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
     return one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes()
 
 
-def amid_a_write(folder: Path) -> bool:
-    """Whether a kill left an unfinished file or folder."""
+def killed_during_write(folder: Path) -> bool:
+    """Return whether a kill left an unfinished file or folder."""
     return any(UNFINISHED.fullmatch(path.name) for path in folder.rglob(".*"))
 
 
 def experiment(algo: str, kills: int, generator: np.random.Generator, base: Path) -> dict[str, Any]:
-    """At least so many kills of one algorithm's trainings."""
+    """Run and kill trainings of one algorithm until there are at least `kills` kills."""
     log, began = base / f"{algo}.log", time.monotonic()
     assert not kill_after(start(base / f"{algo}-whole", algo, log), 1e6)
     seconds = time.monotonic() - began
@@ -142,7 +141,7 @@ def experiment(algo: str, kills: int, generator: np.random.Generator, base: Path
         folder = base / f"{algo}-{result['runs']}"
         while kill_after(start(folder, algo, log), generator.uniform(0.0, seconds)):
             result["kills"] += 1
-            result["amid a write"] += amid_a_write(folder)
+            result["amid a write"] += killed_during_write(folder)
             result["before the run existed"] += not (folder / "config.json").exists()
         result["runs"] += 1
         result["differing"] += differences(whole, content(folder))

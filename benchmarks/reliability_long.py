@@ -1,11 +1,11 @@
-"""Whether memory and speed stay as they are: a million decisions, and ten thousand environments made and closed.
+"""Measure whether memory and speed are constant over a million decisions and ten thousand environments.
 
     python benchmarks/reliability_long.py decisions --json decisions.json   # about half an hour of one core
     python benchmarks/reliability_long.py cycles    --json cycles.json      # about a quarter of an hour
     python benchmarks/reliability_long.py picture decisions.json cycles.json --out docs/images/reliability_memory.png
 
-Memory is the resident set of this process. Speed is decisions per second of processor time, so that other work on the
-machine does not count. Linux only, as both are read from /proc.
+Memory is the resident set of this process. Speed is decisions per second of processor time, which other processes do
+not influence. Both are read from /proc, so this runs on Linux only.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from viapoint.envs.rendering import renderer
 
 MEGABYTE = 1 << 20
 LEAST = 10
-"""Points before anything can be said."""
+"""Least number of points for a result."""
 SAMPLES = 200
-"""Points of a curve."""
+"""Number of points of a curve."""
 WARM = 0.1
-"""Part of a run in which caches fill, left out of the slope."""
+"""Fraction of a run in which caches fill, left out of the slope."""
 ALLOWED = 8.0
-"""Growth after it that counts as flat, [MB]."""
+"""Allowed growth of memory after the warm-up, [MB]."""
 RENDERED = 5
-"""One in so many environments is rendered: a software context takes half a second."""
+"""Interval of rendered environments: a software context takes half a second."""
 SLOWER = 0.1
-"""Loss of speed from the first fifth to the last that counts as none."""
+"""Allowed loss of speed from the first fifth to the last."""
 
 
 def state() -> dict[str, float]:
-    """Memory [MB], open files and threads of this process."""
+    """Return memory [MB], open files and threads of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return {
         "memory": pages * os.sysconf("SC_PAGE_SIZE") / MEGABYTE,
@@ -53,7 +53,7 @@ def state() -> dict[str, float]:
 
 
 def decisions(env_id: str, number: int, num_envs: int = 500) -> Iterator[dict[str, Any]]:
-    """Random decisions in the vector environment; what was found so far, again and again."""
+    """Run random decisions in the vector environment and yield intermediate results."""
     env = gym.make_vec(env_id, num_envs=num_envs, threads=1)
     env.reset(seed=0)
     generator = np.random.default_rng(0)
@@ -74,16 +74,16 @@ def decisions(env_id: str, number: int, num_envs: int = 500) -> Iterator[dict[st
 
 
 def speeds(curve: list[dict[str, float]]) -> dict[str, float]:
-    """Speed in the first fifth and in the last, [1/s of processor time]."""
+    """Return the speed in the first fifth and in the last, [1/s of processor time]."""
     rate = np.diff([point["count"] for point in curve]) / np.diff([point["seconds"] for point in curve])
     fifth = len(rate) // 5
     return {"first_speed": float(np.median(rate[:fifth])), "last_speed": float(np.median(rate[-fifth:]))}
 
 
 def cycles(number: int, size: int = 64) -> Iterator[dict[str, Any]]:
-    """Environments of every id made, used and closed: single ones, every fifth rendered, every fifth a vector."""
+    """Create, use and close environments of every id; every fifth is rendered, every fifth is a vector."""
     what = f"environments made, used and closed, one in {RENDERED} rendered"
-    renderer.STILL_SUPERSAMPLING = 1  # it is contexts that could leak, not the size of one picture
+    renderer.STILL_SUPERSAMPLING = 1  # contexts could leak, the size of a picture does not matter
     ids, curve, began = sorted(viapoint.envs.TASKS), [], time.process_time()
     every = max(1, number // SAMPLES)
     for cycle in range(number + 1):
@@ -102,7 +102,7 @@ def cycles(number: int, size: int = 64) -> Iterator[dict[str, Any]]:
 
 
 def growth(curve: list[dict[str, float]]) -> dict[str, Any]:
-    """The curve, and what grew after the warm-up, by a straight line through all points."""
+    """Return the curve and the growth after the warm-up by linear regression."""
     kept = curve[int(WARM * len(curve)) :]
     count = [point["count"] for point in kept]
     slope = np.polyfit(count, [point["memory"] for point in kept], 1)[0]
@@ -115,7 +115,7 @@ def growth(curve: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def verdict(result: dict[str, Any]) -> bool:
-    """Print the figures; whether they are as they should be."""
+    """Print the numbers and return whether they are within the limits."""
     count, growth = result["curve"][-1]["count"], result["memory_growth"]
     print(f"{count:,} {result['what']}")
     print(f"  memory {result['curve'][0]['memory']:.1f} MB at the start, {growth:+.2f} MB after the warm-up")
@@ -131,7 +131,7 @@ def verdict(result: dict[str, Any]) -> bool:
 
 
 def picture(results: list[dict[str, Any]], path: Path) -> None:
-    """Memory over what was done."""
+    """Draw memory over the number of decisions or environments."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2 * len(results), 2.6), dpi=80, layout="constrained")

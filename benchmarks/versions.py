@@ -1,11 +1,11 @@
-"""Runs the test suite with the oldest versions that pyproject.toml allows, and with the newest that pip finds.
+"""Run the test suite with the oldest versions that pyproject.toml allows, or with the newest that pip finds.
 
     python benchmarks/versions.py oldest [--folder DIR] [--json FILE] [TESTS ...]
     python benchmarks/versions.py newest
 
-A virtual environment of its own is made in the folder (a temporary one by default), with a copy of the tracked files,
-so nothing here changes. Oldest means what the lower bounds of the dependencies say; what a bound does not name is left
-to pip. The bounds of pytest and of the other tools of development are not tried.
+The tests run in a new virtual environment in the folder (a temporary one by default) with a copy of the tracked files.
+The oldest versions are the lower bounds of the dependencies; pip selects the others. The bounds of pytest and of other
+development tools are not tested.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TOOLS = [
 
 
 def lower_bounds() -> dict[str, str]:
-    """Dependencies with the least version that is allowed."""
+    """Return the dependencies with their lower bounds."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = [*project["dependencies"], *project["optional-dependencies"]["training"]]
     found = [BOUND.match(line) for line in lines]
@@ -46,7 +46,7 @@ def lower_bounds() -> dict[str, str]:
 
 
 def make(folder: Path, which: str) -> Path:
-    """The interpreter of a virtual environment with the oldest or the newest versions; a second call goes on."""
+    """Return the interpreter of a virtual environment with the oldest or newest versions, made if it is missing."""
     python, tree = folder / "venv" / "bin" / "python", folder / "tree"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
@@ -68,7 +68,7 @@ def make(folder: Path, which: str) -> Path:
 
 
 def installed(python: Path) -> dict[str, str]:
-    """Versions that the interpreter has."""
+    """Return the versions that are installed for an interpreter."""
     script = "import importlib.metadata as m, json, sys; print(json.dumps({n: m.version(n) for n in sys.argv[1:]}))"
     done = subprocess.run([python, "-c", script, *lower_bounds()], check=True, capture_output=True, text=True)
     return {"python": sys.version.split()[0], **json.loads(done.stdout)}

@@ -1,4 +1,4 @@
-"""The flow from action to observation as one picture, made of the data of one movement."""
+"""Figure of the flow from action to observation, with the data of one movement."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.paper.simulated import required_torque
 from viapoint.training.plotting.top_view import draw_movement
 
 SIZE = (12.4, 6.5)
-"""[inches]"""
+"""Width and height, [inch]."""
 COLUMNS, ROWS = (0.045, 0.292, 0.539, 0.786), (0.60, 0.085)
 """Left and lower edges of the panels, in fractions of the figure."""
 WIDE, TALL = 0.175, 0.295
-"""Of a panel, in fractions of the figure."""
+"""Width and height of a panel, in fractions of the figure."""
 ASPECT = TALL * SIZE[1] / (WIDE * SIZE[0])
 """Height of a panel over its width."""
 GREY = (0.45, 0.47, 0.52)
 MARGIN = 0.035
-"""Around what is seen of a scene, [m]."""
+"""Margin around a scene, [m]."""
 
 
 class Data(NamedTuple):
-    """What the panels show."""
+    """Data of one movement."""
 
     env: Any
     scene: Scenes
-    """One row."""
+    """Scene of one row."""
     action: Float
     """Shape (m,)."""
     plan: Plan
@@ -48,7 +49,7 @@ class Data(NamedTuple):
 
     @property
     def time(self) -> Float:
-        """Of the planned movement, [s]."""
+        """Instants of the planned movement, [s]."""
         return np.linspace(0.0, float(self.plan.durations.sum()), 241)
 
 
@@ -63,12 +64,12 @@ def draw_flow(
     """Draw the flow of the last movement of an environment.
 
     Args:
-        path: Of the PNG.
-        env: It has just made the movement, with `render_mode="rgb_array"`.
-        scene: Where, one row.
-        action: What was decided, shape (m,).
-        observation: What was known before.
-        info: What came of it.
+        path: PNG file.
+        env: Environment with `render_mode="rgb_array"` after the movement.
+        scene: Scene of one row.
+        action: Action of the movement, shape (m,).
+        observation: Observation before the movement.
+        info: Info after the movement.
     """
     inner: Any = env.unwrapped
     data = Data(env, scene, action, inner.last_plan, observation, info)
@@ -133,18 +134,14 @@ def _references(axes: Axes, data: Data) -> None:
 
 
 def _controls(axes: Axes, data: Data) -> None:
-    """The torque that the controls stand for on the references: less stiffness x angle and damping x rate."""
-    arm, trajectory = data.env.unwrapped.task.arm, data.plan.trajectory()
-    position, velocity, acceleration = (np.asarray(trajectory(data.time, nu)) for nu in (0, 1, 2))
-    joints = np.asarray(arm.inverse_kinematics(position))
-    rates = np.gradient(joints, data.time, axis=0)
-    torque = arm.controls(position, velocity, acceleration) - arm.stiffness * joints - arm.damping * rates
+    """Draw the torque that the references require."""
+    torque = required_torque(data.env.unwrapped.task.arm, data.plan.trajectory(), len(data.time))
     colours = PALETTE.executed, PALETTE.via
     for column, name, colour in zip(torque.T, ("shoulder", "elbow"), colours, strict=True):
         axes.plot(data.time, column, color=colour, linewidth=2.2, label=name)
     axes.axhline(0.0, color=GREY, linewidth=0.6)
     axes.legend(fontsize=8, frameon=False, loc="best")
-    _label(axes, data, "torque asked for [N m]")
+    _label(axes, data, "required torque [N m]")
 
 
 def _rollout(axes: Axes, data: Data) -> None:
@@ -202,14 +199,14 @@ def _frame(axes: Axes) -> None:
         spine.set_visible(side in ("left", "bottom"))
 
 
-def _label(axes: Axes, data: Data, what: str) -> None:
+def _label(axes: Axes, data: Data, quantity: str) -> None:
     axes.set_xlim(0.0, data.time[-1] * 1.02)
     axes.set_xlabel("time [s]", fontsize=8, color=GREY, labelpad=1)
-    axes.set_ylabel(what, fontsize=8, color=GREY, labelpad=1)
+    axes.set_ylabel(quantity, fontsize=8, color=GREY, labelpad=1)
 
 
 def _view(data: Data) -> tuple[tuple[float, float], tuple[float, float]]:
-    """A window around the scene with the shape of the panel."""
+    """Return limits around the scene with the aspect ratio of the panel."""
     rows = data.scene.obstacles[0, data.scene.present[0]]
     points = np.concatenate((data.plan.waypoints, rows[:, :2] + rows[:, 2:4], rows[:, :2] - rows[:, 2:4]))
     middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2.0, np.ptp(points, axis=0)
@@ -219,7 +216,7 @@ def _view(data: Data) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _arrows(figure: Figure) -> None:
-    """From panel to panel: along the upper row, down, back along the lower row, and up through the agent."""
+    """Draw arrows from panel to panel: along the upper row, back along the lower row, and up through the agent."""
     gap = 0.012
     for row, direction in ((0, 1), (1, -1)):
         for column in range(3):

@@ -1,4 +1,4 @@
-"""A picture of the families of hard scenes: `python docs/figures/families.py`."""
+"""Figure of the families of hard scenes: `python docs/figures/families.py`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from viapoint.training.scene_sets.scene_set import load
 FAMILIES = [name for name, family in scene_families(2).items() if family.hard]
 TASKS = {"PlanarObstacles": "the hand must clear", "PlanarWholeArm": "every link must clear"}
 VIEW = ((-0.55, 0.45), (-0.10, 0.78))
-"""[m]"""
+"""Limits of x and y, [m]."""
 TILE = 2.0
-"""Width of one scene, [inches]."""
+"""Width of one scene, [inch]."""
 
 
 def draw_families(path: Path, number: int = 0) -> None:
     """Draw the scene of the given number of each family of each task, with the planner's solution.
 
     Args:
-        path: Of the picture, a PNG.
-        number: Counts the scenes of a family in the set `hard`.
+        path: PNG file.
+        number: Number of the scene within its family in the set `hard`.
     """
     figure = Figure(figsize=(TILE * len(FAMILIES), 0.98 * TILE * len(TASKS)), dpi=90)
     FigureCanvasAgg(figure)
@@ -51,7 +51,7 @@ def draw_families(path: Path, number: int = 0) -> None:
 
 
 def main() -> None:
-    """Draw the picture of the documentation, or the page of some other scenes."""
+    """Draw the figure of the documentation, or of other scenes."""
     parser = argparse.ArgumentParser(description="Draw scenes of every family.")
     parser.add_argument("--out", type=Path, default=Path("docs/images/hard_families.png"), help="the picture")
     parser.add_argument("--number", type=int, default=0, help="of the scene in its family")

@@ -24,7 +24,7 @@ def save(figure: plt.Figure, name: str) -> None:
 
 
 def reach() -> None:
-    """Position, speed, acceleration and jerk of a reach for the three orders."""
+    """Draw position, speed, acceleration and jerk of a reach for the three orders."""
     figure, axes = plt.subplots(1, 4, figsize=(12, 2.8))
     time = np.linspace(0, 1, 301)
     names = ("position [m]", "speed [m/s]", "acceleration [m/s²]", "jerk [m/s³]")
@@ -39,7 +39,7 @@ def reach() -> None:
 
 
 def family() -> None:
-    """Movements through via-points of growing height: paths, speeds, curvatures."""
+    """Draw movements through via-points of growing height: paths, speeds, curvatures."""
     figure, (paths, speeds, bends) = plt.subplots(1, 3, figsize=(12, 3.2))
     time = np.linspace(0, 1, 401)
     for height in np.linspace(0, 0.6, 7):
@@ -60,7 +60,7 @@ def family() -> None:
 
 
 def passage() -> None:
-    """Cost against passage time, and the passage time against the place of the via-point."""
+    """Draw cost against passage time, and passage time against the position of the via-point."""
     figure, (costs, times) = plt.subplots(1, 2, figsize=(9, 3.2))
     t = np.linspace(0.15, 0.85, 300)
     for along, colour in ((0.15, "C0"), (0.35, "C1"), (0.5, "C2")):
@@ -83,7 +83,7 @@ def passage() -> None:
 
 
 def online() -> None:
-    """Replanning from noisy states until the end, and with the last plan kept for the last 100 ms."""
+    """Draw replanning from noisy states until the end, and with the last plan kept for the last 100 ms."""
     figure, (positions, jerks) = plt.subplots(1, 2, figsize=(9, 3.0))
     step, arrival, goal = 0.01, 0.8, np.array([0.3])
     smooth = point_to_point(np.zeros(1), goal, arrival)

@@ -1,4 +1,4 @@
-"""The pictures of the documentation, rendered by the program: `python docs/figures/rendered.py`."""
+"""Rendered pictures and animations of the documentation: `python docs/figures/rendered.py`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from viapoint.training.planners.baselines import agent_method
 from viapoint.training.scene_sets.scene_set import load
 
 SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
-"""Scenes that show what a task is about."""
+"""Seeds of scenes that are typical of a task."""
 FILES = {
     "PlanarReach": "planar_reach.png",
     "PlanarObstacles": "planar_obstacles.png",
@@ -27,39 +27,41 @@ FILES = {
 }
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 PASSAGES = {IN_PLANE: (29, 4, 10, 37), IN_SPACE: (14, 21)}
-"""Scenes of their sets `test` that the shipped agents are shown in; in space a slot, and a shelf among spheres."""
+"""Scenes of `test` in which the shipped agents are shown; in space a slot, and a shelf among spheres."""
+REPLANNING = {"viapoint/PlanarMovingObstacles-v0": (2, 45), "viapoint/PlanarTargetJump-v0": (3,)}
+"""Scenes of `validation` in which the shipped agents with replanning are shown."""
 MOMENTS = (0.3, 0.45, 0.6, 1.0)
-"""Of a movement, as parts of its duration."""
+"""Moments of a movement that are shown, as fractions of its duration."""
 ATTEMPTS = 400
-"""Random movements in a scene."""
+"""Number of random movements that are tried in a scene."""
 SCENES = 10
-"""How many scenes are tried for one that can be shown."""
+"""Number of scenes that are tried."""
 SAFE = 0.012
 """Least clearance of a movement that is shown, [m]."""
 SPEED = 0.5
-"""Of the animation, relative to real time."""
+"""Speed of the animations relative to real time."""
 GAP = 6
-"""Between frames side by side, [pixels]."""
+"""Gap between frames side by side, [pixels]."""
 PAUSE = 700
-"""After each movement of the animation, [ms]."""
+"""Pause after each movement of an animation, [ms]."""
 
 
 class Solved(NamedTuple):
-    """A movement that succeeds."""
+    """Scene with a successful action."""
 
     scene: Scenes
-    """One row."""
+    """Scene of one row."""
     action: Float
     """Shape (m,)."""
 
 
 def solve(env: gym.Env[Any, Any], seed: int) -> Solved:
-    """The smoothest of the successful movements among random ones, in the scene of a seed.
+    """Return the smoothest successful movement among random ones, in the scene of a seed.
 
     Where none succeeds, the scenes of the next seeds are tried.
 
     Raises:
-        RuntimeError: None succeeds in any of them.
+        RuntimeError: No movement succeeds in any of the scenes.
     """
     task: Any = env.unwrapped.task  # type: ignore[attr-defined]
     for scene_seed in range(seed, seed + SCENES):
@@ -81,14 +83,14 @@ def solve(env: gym.Env[Any, Any], seed: int) -> Solved:
 
 
 def perform(env: gym.Env[Any, Any], solved: Solved) -> Any:
-    """Carry a movement out; what the environment renders of it."""
+    """Execute a movement and return what the environment renders."""
     env.reset(options=solved.scene.as_options())
     env.step(solved.action)
     return env.render()
 
 
 def picture(task: str, path: Path) -> None:
-    """One movement of a task."""
+    """Render one movement of a task."""
     env = gym.make(f"viapoint.envs:viapoint/{task}-v0", render_mode="rgb_array")
     frame = perform(env, solve(env, SEEDS[task]))
     env.close()
@@ -96,15 +98,33 @@ def picture(task: str, path: Path) -> None:
 
 
 def animation(path: Path, *, size: int = 400) -> None:
-    """The shipped agent's movements in the plane, one after the other, for ever."""
+    """Save the shipped agent's movements in the plane as an endless animation."""
     env = gym.make(IN_PLANE, render_mode="rgb_array_list", width=size, height=size)
     films = [passage(env, IN_PLANE, row) for row in PASSAGES[IN_PLANE]]
     env.close()
     _animate(path, films, env.metadata["render_fps"])
 
 
+def replanning(path: Path, *, size: int = 320) -> None:
+    """Save the episodes of the shipped agents with replanning as an endless animation."""
+    films = []
+    for env_id, rows in REPLANNING.items():
+        agent, scenes = load_agent(env_id), load("validation", env_id).scenes
+        decide = agent_method("agent", agent, 0).decide
+        env: Any = gym.make(env_id, render_mode="rgb_array_list", width=size, height=size)
+        for row in rows:
+            scene, over = scenes.take([row]), False
+            observation, _ = env.reset(options=scene.as_options())
+            while not over:
+                action = decide({name: part[None] for name, part in observation.items()}, scene)[0]
+                observation, _, over, _, _ = env.step(action.astype(np.float32))
+            films.append(list(env.render()))
+        env.close()
+    _animate(path, films, env.metadata["render_fps"])
+
+
 def _animate(path: Path, films: list[list[Frame]], fps: float) -> None:
-    """Save films as one animation that never ends."""
+    """Save sequences of frames as one endless animation."""
     images = [Image.fromarray(frame) for frames in films for frame in frames]
     each = round(1000.0 / (fps * SPEED))
     durations = [time for frames in films for time in (*[each] * (len(frames) - 1), PAUSE)]
@@ -114,10 +134,10 @@ def _animate(path: Path, films: list[list[Frame]], fps: float) -> None:
 
 
 def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = False) -> list[Frame]:
-    """The frames of the shipped agent's movement in a test scene, or those of the straight one until it hits.
+    """Return the frames of the shipped agent's movement in a test scene, or of the straight one until its contact.
 
     Raises:
-        RuntimeError: The agent's does not succeed, or the straight one does.
+        RuntimeError: The agent's movement fails, or the straight one succeeds.
     """
     scene, agent = load("test", env_id).scenes.take([row]), load_agent(env_id)
     observation, _ = env.reset(options=scene.as_options())
@@ -136,13 +156,13 @@ def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = F
 
 
 def side_by_side(frames: Sequence[Frame]) -> Frame:
-    """Frames in one line with white gaps between them."""
+    """Return frames in one row with white gaps between them."""
     gap = np.full((len(frames[0]), GAP, 3), 255, np.uint8)
     return np.concatenate([part for frame in frames for part in (gap, frame)][1:], axis=1)
 
 
 def passages(strip: Path, pair: Path, film: Path) -> None:
-    """The shipped agent of an arm in space: moments of a movement, the straight one beside them, and a film."""
+    """Render the shipped agent in space: moments of a movement beside the straight one, and an animation."""
     sides = {strip: 300, pair: 480, film: 300}
     for path, side in sides.items():
         env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
@@ -160,7 +180,7 @@ def passages(strip: Path, pair: Path, film: Path) -> None:
 
 
 def flow(path: Path) -> None:
-    """The flow from action to observation, in real numbers."""
+    """Draw the flow from action to observation with the data of one movement."""
     env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0", render_mode="rgb_array")
     solved = solve(env, SEEDS["PlanarObstacles"])
     observation, _ = env.reset(options=solved.scene.as_options())
@@ -170,7 +190,7 @@ def flow(path: Path) -> None:
 
 
 def main() -> None:
-    """Make all pictures."""
+    """Render all pictures."""
     parser = argparse.ArgumentParser(description="Render the pictures of the documentation.")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
     out: Path = parser.parse_args().out
@@ -178,6 +198,7 @@ def main() -> None:
     for task, name in FILES.items():
         picture(task, out / name)
     animation(out / "reaching.webp")
+    replanning(out / "revising.webp")
     passages(out / "panda_agent.png", out / "panda_obstacles.png", out / "panda.webp")
     flow(out / "flow.png")
     for path in sorted(out.iterdir()):
