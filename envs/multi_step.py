@@ -1,4 +1,4 @@
-"""Episodes of many steps, which end at different times in one batch."""
+"""Base classes of environments whose episodes are several steps."""
 
 from __future__ import annotations
 
@@ -8,24 +8,36 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.types import Bool, Float, Observation
+from viapoint.envs.sim.episode_state import Episodes
+from viapoint.envs.sim.executor import Rollout
 from viapoint.envs.single_env import ReachEnv
 from viapoint.envs.vector_env import ReachVectorEnv
 
 
-class ManyStepVectorEnv(ReachVectorEnv):
-    """Where an episode ends, the next one begins in the same step; the others go on.
+class MultiStepVectorEnv(ReachVectorEnv):
+    """Environments whose episodes end at different times; where one ends, the next begins in the same step.
 
-    What a step is, :meth:`execute_actions` says: it sets `terminated` and `truncated`.
+    A subclass defines one step in `execute_actions`, which sets `terminated` and `truncated`.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    terminated: Bool
+    """True where the last step terminated the episode, shape (num_envs,)."""
+    truncated: Bool
+    """True where the last step truncated the episode, shape (num_envs,)."""
+    _episodes: Episodes
+
+    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
+        super().__init__(num_envs, **kwargs)
         self.terminated, self.truncated = np.zeros((2, self.num_envs), dtype=bool)
-        """Which episodes ended in the last step, shape (num_envs,)."""
+
+    @property
+    def last_rollout(self) -> tuple[Rollout, ...]:
+        """Running episodes so far at every physics step; empty before the first reset."""
+        return () if self.scenes is None else tuple(self._rollout(row) for row in range(self.num_envs))
 
     def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Make one step in each environment; where an episode ended, start the next.
+        """Make one step in each environment; where an episode ends, start the next.
 
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
@@ -44,15 +56,34 @@ class ManyStepVectorEnv(ReachVectorEnv):
             masks = {f"_{name}": ended.copy() for name in info}
             infos |= {"final_obs": final, "_final_obs": ended.copy()}
             infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
-            self._start(rows, self._draw(self._generators, rows, {}))
+            self._start(rows, self._draw(self.generators, rows, {}))
             observation = self._observe_start()
         return observation, reward, terminated.copy(), truncated.copy(), infos
 
+    def episodes_state(self) -> dict[str, Any]:
+        """Return the state of the running episodes, without their scenes, as arrays for :meth:`restore_episodes`."""
+        return {**self._episodes.state(), "physics": self._simulator.batch.state.copy()}
 
-class ManyStepEnv(ReachEnv):
-    """A batch of one of a :class:`ManyStepVectorEnv`."""
+    def restore_episodes(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`episodes_state` returned, after a reset to the same scenes."""
+        self._episodes.restore(state)
+        self._simulator.batch.state[:] = state["physics"]
 
-    batch: ManyStepVectorEnv
+    def _rollout(self, row: int) -> Rollout:
+        """Return the running episode of one environment so far."""
+        assert self.scenes is not None
+        scene = self.scenes.take([row])
+        return self._episodes.rollout(row, lambda *movement: self._clearance(scene, *movement))
+
+    def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
+        """Return the clearance in one scene at each time, shape (T,), [m]."""
+        raise NotImplementedError
+
+
+class MultiStepEnv(ReachEnv):
+    """One environment of a :class:`MultiStepVectorEnv`."""
+
+    batch: MultiStepVectorEnv
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -61,7 +92,7 @@ class ManyStepEnv(ReachEnv):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode; see :meth:`~viapoint.envs.single_env.ReachVectorEnv.reset`."""
+        """Start a new episode; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`."""
         result = super().reset(seed=seed, options=options)
         self._over = False
         return result

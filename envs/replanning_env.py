@@ -1,36 +1,48 @@
-"""Tasks in which something happens on the way, and plans are revised."""
+"""Environments in which targets jump and obstacles move, and plans are revised during the movement."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from gymnasium.utils import EzPickle
-from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Reviser
-from viapoint.envs.actions.via_points import Plan, Timing, checked_plan
-from viapoint.envs.arms import ADULT, Arm
-from viapoint.envs.common.types import Bool, Observation
-from viapoint.envs.common.validation import as_given, checked_actions, fewest_and_most, refuse_unknown
+from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, Plan, checked_plan
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float, Int, Observation
+from viapoint.envs.common.validation import checked_actions, fewest_and_most
+from viapoint.envs.config import ReplanningConfig
+from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import OnlineObservationLayout
-from viapoint.envs.mdp.rewards import OnlineRewardWeights, online_rewards
-from viapoint.envs.multi_step import ManyStepEnv, ManyStepVectorEnv
+from viapoint.envs.mdp.rewards import online_rewards
+from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import EpisodeRenderer, History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
 from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
-from viapoint.envs.sim.executor import SETTLING, Rollout
-from viapoint.envs.sim.replan_triggers import TRIGGERS, DecisionEnds, Event, Trigger
-from viapoint.envs.sim.replanning_episodes import OnlineEpisodes
-from viapoint.envs.sim.replanning_executor import OnlineExecutor
+from viapoint.envs.sim.episode_state import Episodes
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome, straight_jerk_cost
+from viapoint.envs.sim.replan_triggers import DecisionEnds, Event
+from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
 from viapoint.envs.vector_env import METADATA, Decision, ReachVectorEnv
 
+HISTORY_NAMES = ("time", *MovingPlan._fields)
+"""Columns of a stored history of plans."""
 
-class OnlineReachVectorEnv(ManyStepVectorEnv):
+
+class PlanStart(NamedTuple):
+    """Beginnings of the N plans under way."""
+
+    step: Int
+    """Physics step of the episode at which the plan began, shape (N,)."""
+    begun: Bool
+    """True if there is a plan, shape (N,)."""
+
+
+class OnlineReachVectorEnv(MultiStepVectorEnv):
     """Reaching for targets that jump among obstacles that move, by plans that are revised on the way, many at once.
 
     Arm, physics and success are those of :class:`ReachVectorEnv`. An episode is several decisions;
@@ -59,196 +71,195 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
     """
 
-    weights_kind = OnlineRewardWeights
+    config_kind = ReplanningConfig
+    __signature__ = ReplanningConfig.signature()
     scenes: ChangingScenes | None  # type: ignore[assignment]
     observation_layout: OnlineObservationLayout
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        arm: Arm | str = ADULT,
-        whole_arm: bool = False,
-        n_via: int = 1,
-        n_obstacles: int | tuple[int, int] = 0,
-        moving_obstacles: bool = False,
-        n_jumps: int | tuple[int, int] = 0,
-        decide_at: Sequence[Trigger] = TRIGGERS,
-        horizon: float = 0.3,
-        margin: float = 0.02,
-        timing: Timing = "optimal",
-        duration_range: tuple[float, float] = (0.6, 1.2),
-        reward_weights: OnlineRewardWeights | Mapping[str, float] | None = None,
-        render_mode: str | None = None,
-        width: int = 480,
-        height: int = 480,
-        threads: int = 0,
-        **unknown: Any,
-    ) -> None:
-        refuse_unknown(unknown, type(self).__init__.__annotations__)
-        kwargs: dict[str, Any] = {
-            "arm": arm, "whole_arm": whole_arm, "n_via": n_via, "n_obstacles": n_obstacles, "timing": timing,
-            "duration_range": duration_range, "render_mode": render_mode, "width": width, "height": height,
-            "threads": threads,
-        }  # fmt: skip
-        super().__init__(num_envs, reward_weights=reward_weights, **kwargs)
-        kwargs |= {
-            "moving_obstacles": moving_obstacles, "n_jumps": n_jumps, "decide_at": decide_at, "horizon": horizon,
-            "margin": margin, "reward_weights": reward_weights,
-        }  # fmt: skip
-        EzPickle.__init__(self, num_envs, **as_given(kwargs))
-        if timing != "optimal":
-            raise ValueError(f"timing must be optimal where plans are revised, got {timing!r}")
-        if not isinstance(moving_obstacles, bool | np.bool_):
-            raise TypeError(f"moving_obstacles must be True or False, got {moving_obstacles!r}")
-        self.changes = ChangeDistribution(
-            n_jumps=fewest_and_most(n_jumps, "n_jumps"), moving=bool(moving_obstacles)
-        )
-        """What becomes of scenes."""
-        self.reviser = Reviser(self.action_layout)
-        """What the components of an action mean on the way."""
-        limit = (2 + self.changes.n_jumps[1]) * self.action_layout.duration_range[1] + SETTLING
-        self._ends = DecisionEnds(
-            self.task.collision_model, timestep=self._simulator.timestep, triggers=decide_at,
-            horizon=horizon, margin=margin, time_limit=limit,
-        )  # fmt: skip
-        self.time_limit = float(self._ends.limit * self._simulator.timestep)
-        """Of an episode, [s]."""
-        self._renderer: EpisodeRenderer = EpisodeRenderer(
-            self._simulator, self.render_mode, width, height, METADATA["render_fps"]
-        )
-        self._build()
+    _renderer: EpisodeRenderer
 
     def _build(self) -> None:
-        """Make what follows from the arguments: the observation, and what draws and carries out episodes."""
-        base, action, collision_model = self.observation_layout, self.action_layout, self.task.collision_model
+        """Create the layouts, the sampler of changes, the stages and the episodes."""
+        config, task, timestep = self.config, self.task, self._simulator.timestep
+        assert isinstance(config, ReplanningConfig)
+        action, base, model = task.action, task.observation, task.collision_model
+        shortest, longest = action.duration_range
+        self.changes = ChangeDistribution(
+            n_jumps=fewest_and_most(config.n_jumps, "n_jumps"), moving=bool(config.moving_obstacles)
+        )
+        """Distribution of the changes of scenes."""
+        self.reviser = Reviser(action)
+        """Meaning of the components of an action during a movement."""
+        self._ends = DecisionEnds(
+            model, timestep=timestep, triggers=config.decide_at, horizon=config.horizon, margin=config.margin,
+            time_limit=(2 + self.changes.n_jumps[1]) * longest + SETTLING,
+        )  # fmt: skip
+        self.time_limit = float(self._ends.limit * timestep)
+        """Time limit of an episode, [s]."""
         self.observation_layout = OnlineObservationLayout(
             dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, n_via=action.n_via,
             time_limit=self.time_limit,
         )  # fmt: skip
-        self.single_observation_space = self.observation_layout.space()
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        shortest, longest = action.duration_range
         self._change_sampler = ChangeSampler(
-            collision_model, self.changes, durations=(shortest, action.centre_duration, longest)
+            model, self.changes, durations=(shortest, action.centre_duration, longest)
         )
-        self._online = OnlineExecutor(self._simulator, self._beside)
-        self._episodes = OnlineEpisodes(
-            collision_model, self.num_envs, n_via=action.n_via, timestep=self._simulator.timestep,
-            most=self._ends.limit + 1,
+        self._stages = ReplanningExecutor(self._simulator)
+        n, d = self.num_envs, task.arm.dimension
+        self._plan = MovingPlan(
+            np.zeros((n, action.n_via + 2, d)), np.ones((n, action.n_via + 1)), *np.zeros((2, n, d))
+        )
+        self._plan_start = PlanStart(np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool))
+        self._history: list[History] = [[] for _ in range(n)]
+        self._episodes = Episodes(
+            task.arm, n, timestep=timestep, max_steps=self._ends.limit + 1,
+            records={"plan": self._plan, "start": self._plan_start},
         )  # fmt: skip
 
-    @property
-    def last_rollout(self) -> tuple[Rollout, ...]:
-        """The running episodes so far at every physics step; empty before the first reset."""
-        if self.scenes is None:
-            return ()
-        return tuple(self._episodes.rollout(row, self.scenes.take([row])) for row in range(self.num_envs))
+    def _make_renderer(self) -> EpisodeRenderer:
+        config, fps = self.config, METADATA["render_fps"]
+        return EpisodeRenderer(self._simulator, self.render_mode, config.width, config.height, fps)
 
     @property
     def last_plan(self) -> Plan | None:
-        """The plans under way as via-points [m] and durations [s]; None before the first decision."""
-        if self.scenes is None or not self._episodes.running.begun.any():
+        """Plans under way as via-points [m] and durations [s]; None before the first decision."""
+        if self.scenes is None or not self._plan_start.begun.any():
             return None
-        return Plan(*(part.copy() for part in self._episodes.plan.plan))
+        return Plan(*(part.copy() for part in self._plan.plan))
 
     @property
     def last_plans(self) -> tuple[History, ...]:
-        """Every plan of the running episodes and when it began, [s]."""
-        return tuple(list(history) for history in self._episodes.history)
+        """All plans of the running episodes with the times at which they began, [s]."""
+        return tuple(list(history) for history in self._history)
 
     @property
     def default(self) -> NominalPlan:
-        """What a zero action leads to, and what is commanded at present."""
+        """Plans that a zero action leads to, and the present commands."""
         self._check_running()
         assert self.scenes is not None
-        now = self._episodes
-        goal = self.scenes.goals(now.time)
-        return self.reviser.default(now.plan, now.plan_time, now.running.begun, self.scenes.start, goal)
+        start, episodes = self._plan_start, self._episodes
+        plan_time = np.asarray((episodes.now.steps - start.step) * self._simulator.timestep)
+        goal = self.scenes.goals(episodes.time)
+        return self.reviser.default(self._plan, plan_time, start.begun, self.scenes.start, goal)
 
     def execute_actions(self, actions: Any) -> Decision:
-        """Make one decision in each environment and carry it out until it ends, without a reset.
+        """Make one decision in each environment and execute it until it ends, without a reset.
 
-        `terminated` tells which episodes ended; these must not be moved on.
+        `terminated` tells which episodes ended; these must not be continued.
 
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
         self._check_running()
-        actions = checked_actions(actions, self.num_envs, self.action_layout.names)
-        plan, kept = self.reviser.revise(self.default, self._episodes.plan, actions)
-        return self._carry_out(plan, ~kept)
+        actions = checked_actions(actions, self.num_envs, self._action_names)
+        plan, kept = self.reviser.revise(self.default, self._plan, actions)
+        return self._execute_decision(plan, ~kept)
 
     def execute_plan(self, plan: Plan) -> Decision:
-        """Revise every plan to this one, which begins where the hands are commanded to be, without a reset.
+        """Replace every plan by this one, which begins at the commanded hand position, without a reset.
 
         Args:
-            plan: Of num_envs movements with as many via-points as those of an action.
+            plan: Movements of all environments with as many via-points as those of an action.
         """
-        state, shape = self.default.state, self._episodes.plan.waypoints.shape
+        state, shape = self.default.state, self._plan.waypoints.shape
         plan = checked_plan(plan, state.position)
         if plan.waypoints.shape != shape:
             raise ValueError(f"plan must have waypoints of shape {shape}, got {plan.waypoints.shape}")
         waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
         moving = MovingPlan(waypoints, plan.durations.copy(), state.velocity, state.acceleration)
-        return self._carry_out(moving, np.ones(self.num_envs, dtype=bool))
+        return self._execute_decision(moving, np.ones(self.num_envs, dtype=bool))
 
-    def _carry_out(self, plan: MovingPlan, revised: Bool) -> Decision:
+    def episodes_state(self) -> dict[str, Any]:
+        """See :meth:`MultiStepVectorEnv.episodes_state`."""
+        every = [each for history in self._history for each in history]
+        columns = [np.array([time for time, _ in every])]
+        for k, mine in enumerate(self._plan):
+            columns.append(np.concatenate([np.empty((0, *mine.shape[1:])), *(plan[k] for _, plan in every)]))
+        history = {f"history_{name}": part for name, part in zip(HISTORY_NAMES, columns, strict=True)}
+        history["history_number"] = np.array([len(each) for each in self._history])
+        return {**super().episodes_state(), **history}
+
+    def restore_episodes(self, state: Mapping[str, Any]) -> None:
+        """See :meth:`MultiStepVectorEnv.restore_episodes`."""
+        super().restore_episodes(state)
+        first = 0
+        for row, number in enumerate(np.asarray(state["history_number"])):
+            part = slice(first, first + int(number))
+            time, *parts = (np.asarray(state[f"history_{name}"])[part] for name in HISTORY_NAMES)
+            plans = (MovingPlan(*(each[k : k + 1].copy() for each in parts)) for k in range(number))
+            self._history[row] = [(float(began), plan) for began, plan in zip(time, plans, strict=True)]
+            first += int(number)
+
+    def _execute_decision(self, plan: MovingPlan, revised: Bool) -> Decision:
+        """Run the stages after decoding: scale time, build references, simulate, measure, score and observe."""
         assert self.scenes is not None
-        scenes, episodes, now = self.scenes, self._episodes, self._episodes.running
-        nowhere = np.zeros(self.num_envs, dtype=bool)
-        before, begun, steps = episodes.outcome(scenes, nowhere), now.begun.copy(), now.steps.copy()
-        self._take_up(plan, revised)
-        ends = self._ends(episodes.plan, now.began, steps, scenes)
-        until = np.where(now.reachable, ends.step, steps)
-        for carried in self._online(episodes.plan, now.began, steps, until, scenes):
-            episodes.add(scenes.take(carried.rows), carried)
-        event = np.where(now.first_contact >= 0, Event.CONTACT, ends.event)
+        scenes, episodes, now, start = self.scenes, self._episodes, self._episodes.now, self._plan_start
+        steps, first = now.steps.copy(), ~start.begun
+        before = self._outcome(scenes, np.zeros(self.num_envs, dtype=bool))
+        self._adopt(plan, revised)
+        ends = self._ends(self._plan, start.step, steps, scenes)
+        duration = np.where(now.reachable, ends.step - steps, 0)
+        decisions = Decisions(
+            np.arange(self.num_envs), self._plan, steps - start.step, steps, duration, scenes
+        )
+        stages = self._stages
+        segments, _ = self._scheduler.run(
+            decisions.groups(), stages.build_references, stages.simulate, stages.measure
+        )
+        for segment in segments:
+            episodes.add(segment)
+        event = np.where(now.collision, Event.CONTACT, ends.event)
         event = np.where(now.unstable, Event.UNSTABLE, np.where(now.reachable, event, Event.REACH))
         final = ends.final & (event == Event.ARRIVAL)
-        after = episodes.outcome(scenes, final)
+        after = self._outcome(scenes, final)
         self.terminated = (
             final | (event == Event.TIME_LIMIT) | (event >= Event.REACH) | (event == Event.CONTACT)
         )
         elapsed = np.asarray((now.steps - steps) * self._simulator.timestep)
         terms = online_rewards(
-            before, after, elapsed, self.terminated, ~begun, scenes, self.action_layout.centre_duration,
+            before, after, elapsed, self.terminated, first, scenes, self.action_layout.centre_duration,
             self.task.weights,
         )  # fmt: skip
-        info = {
-            **after._asdict(),
-            **terms.as_info(),
-            "elapsed": elapsed,
-            "time": episodes.time,
-            "event": event,
-        }
-        if self.render_mode == "human" and self.terminated[0]:  # an episode is played when it is over
+        times = {"elapsed": elapsed, "time": episodes.time, "event": event}
+        if self.render_mode == "human" and self.terminated[0]:  # shows whole episodes
             self.render()
-        return Decision(self._observe_start(), terms.total(), info)
+        return Decision(self._observe_start(), terms.total(), {**after._asdict(), **terms.as_info(), **times})
 
-    def _take_up(self, plan: MovingPlan, revised: Bool) -> None:
-        """Begin new plans where some were made, as slow as the arm needs them, unless they leave its reach."""
-        rows, stretch = np.flatnonzero(revised), np.ones(self.num_envs)
+    def _adopt(self, plan: MovingPlan, revised: Bool) -> None:
+        """Begin new plans where they were revised, as slow as the arm needs them."""
+        rows, now = np.flatnonzero(revised), self._episodes.now
         if not rows.size:
             return
-        some, stretch[rows], within = self._online.paced(plan.take(rows))
-        plan.put(rows, some)
-        self._episodes.running.reachable[rows] &= within & self._online.reachable(some)
-        self._episodes.revise(plan, revised, stretch)
+        scaled = self._stages.scale_time(plan.take(rows))
+        now.reachable[rows] &= scaled.reachable
+        now.stretch[rows] = np.maximum(now.stretch[rows], scaled.stretch)
+        self._plan.put(rows, scaled.plan)
+        self._plan_start.step[rows], self._plan_start.begun[rows] = now.steps[rows], True
+        times = self._episodes.time
+        for row in rows:
+            one = MovingPlan(*(part[row : row + 1].copy() for part in self._plan))
+            self._history[row].append((float(times[row]), one))
 
-    def episodes_state(self) -> dict[str, Any]:
-        """Where the running episodes are, beside their scenes, as arrays for :meth:`restore_episodes`."""
-        return {**self._episodes.state(), "physics": self._simulator.batch.state.copy()}
+    def _outcome(self, scenes: ChangingScenes, final: Bool) -> Outcome:
+        """Return the metrics so far, where `final` is True for hands that have arrived at their last goal."""
+        episodes, now, start = self._episodes, self._episodes.now, self._plan_start
+        goal_error = norm(now.hand - scenes.goals(episodes.time))
+        arrived = final & (goal_error < GOAL_TOLERANCE) & (now.last_speed < REST_SPEED)
+        ends = start.step * self._simulator.timestep + self._plan.duration
+        duration = np.where(start.begun, np.minimum(episodes.time, ends), 0.0)
+        length = np.maximum(scenes.straight_length(episodes.time), MIN_GOAL_DISTANCE)
+        cost = straight_jerk_cost(length, np.maximum(duration, self._simulator.timestep))
+        return episodes.outcome(arrived & now.sound, goal_error, duration, cost)
 
-    def restore_episodes(self, state: Mapping[str, Any]) -> None:
-        """Go on where :meth:`episodes_state` was taken, after a reset to the same scenes."""
-        self._episodes.restore(state)
-        self._simulator.batch.state[:] = state["physics"]
+    def _clearance(self, scene: ChangingScenes, hand: Float, joints: Float, time: Float) -> Float:
+        """Return the clearance in one scene at each time, shape (T,), [m]."""
+        profile = self.task.collision_model.clearance_profile(
+            hand[None], scene.places(time[None]), scene.present, joints[None]
+        )
+        return np.asarray(profile[0].min(axis=-1, initial=MAX_CLEARANCE))
 
     def _draw(  # type: ignore[override]
-        self, generators: list[np.random.Generator], rows: NDArray[np.int64], options: Mapping[str, Any]
+        self, generators: list[np.random.Generator], rows: Int, options: Mapping[str, Any]
     ) -> ChangingScenes:
-        """Scenes and what will become of them; where they are refused, the generators are as they were."""
+        """Sample or set up scenes and their changes; if one is refused, the generators are unchanged."""
         tried = [copy.deepcopy(generator) for generator in generators] if options else generators
         scene = {name: value for name, value in options.items() if name not in CHANGES}
         layout = self.task.observation
@@ -275,8 +286,8 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
             if wrong.any():
                 raise ValueError(f"scene {int(wrong.argmax())}: {reason(int(wrong.argmax()))}")
 
-    def _start(self, rows: NDArray[np.int64], scenes: ChangingScenes) -> None:  # type: ignore[override]
-        """Begin episodes: the arms at rest at the start, the obstacles where their courses begin."""
+    def _start(self, rows: Int, scenes: ChangingScenes) -> None:  # type: ignore[override]
+        """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""
         if self.scenes is None or len(rows) == self.num_envs:
             self.scenes = scenes
         else:
@@ -284,26 +295,29 @@ class OnlineReachVectorEnv(ManyStepVectorEnv):
             self.scenes.put(rows, scenes)
         joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
         self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
-        self._episodes.begin(rows, scenes, joints)
+        places = scenes.places(np.zeros((len(rows), 1)))
+        clearance = self.task.collision_model.clearance_profile(scenes.start[:, None], places, scenes.present)
+        self._episodes.begin(rows, joints, scenes.start, clearance.min(axis=(1, 2), initial=MAX_CLEARANCE))
+        number, zero = self._plan.waypoints.shape[1], np.zeros_like(scenes.start)
+        rest = np.repeat(scenes.start[:, None], number, axis=1)
+        self._plan.put(rows, MovingPlan(rest, np.ones((len(rows), number - 1)), zero, zero))
+        self._plan_start.step[rows], self._plan_start.begun[rows] = 0, False
+        for row in rows:
+            self._history[row] = []
 
     def _observe_start(self) -> Observation:
-        """What is seen now."""
+        """Return the present observations."""
         assert self.scenes is not None
         episodes = self._episodes
-        return self.observation_layout.online(
-            episodes.running.joints, self.scenes, self.default, episodes.time
-        )
+        return self.observation_layout.online(episodes.now.joints, self.scenes, self.default, episodes.time)
 
     def _render_one(self, sim: int) -> Any:
-        if self.render_mode is None or self.scenes is None or not self._episodes.running.steps[sim]:
+        if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
             return super()._render_one(sim)
-        scene = self.scenes.take([sim])
-        return self._renderer.episode(
-            sim, scene, self._episodes.history[sim], self._episodes.rollout(sim, scene)
-        )
+        return self._renderer.episode(sim, self.scenes.take([sim]), self._history[sim], self._rollout(sim))
 
 
-class OnlineReachEnv(ManyStepEnv):
+class OnlineReachEnv(MultiStepEnv):
     """A batch of one of :class:`OnlineReachVectorEnv`, with the same keyword arguments."""
 
     batch_kind: ClassVar[type[ReachVectorEnv]] = OnlineReachVectorEnv

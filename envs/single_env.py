@@ -1,4 +1,4 @@
-"""The environment: one decision, one movement."""
+"""Environment in which one decision is one movement."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "a
 
 
 class ReachEnv(gym.Env[Any, Any], EzPickle):
-    """A batch of one of :class:`ReachVectorEnv`, with the same keyword arguments."""
+    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments."""
 
     metadata = SINGLE_METADATA
     batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
-    """What it is a batch of one of."""
+    """Vector environment class that this environment wraps."""
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
         if "num_envs" in kwargs:
             raise TypeError("num_envs is an argument of gym.make_vec; gym.make makes one environment")
         EzPickle.__init__(self, threads=threads, **as_given(kwargs))
         self.batch = self.batch_kind(1, threads=threads, **kwargs)
-        """The batch of one that this environment is."""
+        """Vector environment with one environment."""
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
         self.render_mode = self.batch.render_mode
@@ -41,19 +41,19 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def last_rollout(self) -> Rollout | None:
-        """The last movement at every physics step; None before the first."""
+        """Last movement at every physics step; None before the first."""
         rollouts = self.batch.last_rollout
         return rollouts[0] if rollouts else None
 
     @property
     def last_plan(self) -> Plan | None:
-        """The last decision as via-points (K + 2, D) [m] and durations (K + 1,) [s]; None before the first."""
+        """Last decision as via-points (K + 2, D) [m] and durations (K + 1,) [s]; None before the first."""
         plan = self.batch.last_plan
         return None if plan is None else plan.take(0)
 
     @property
     def model(self) -> Any:
-        """The MuJoCo model."""
+        """MuJoCo model."""
         return self.batch.model
 
     @property
@@ -65,15 +65,15 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
-        self.batch._np_random, self.batch._np_random_seed = self._np_random, self._np_random_seed
+        self.batch.use_generator(self._np_random, self._np_random_seed)
         observation, info = self.batch.reset(seed=seed, options=options)
-        self._np_random, self._np_random_seed = self.batch._np_random, self.batch._np_random_seed
+        self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
         if self.render_mode == "human":
             self.batch.render()
         return _only(observation), info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out one movement, which ends the episode.
+        """Execute one movement, which ends the episode.
 
         Args:
             action: Shape (m,), in [-1, 1]; components beyond are clipped.
@@ -86,12 +86,12 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         return _only(observation), float(reward[0]), True, False, {k: v[0].item() for k, v in info.items()}
 
     def render(self) -> Any:
-        """The last movement as the render mode says; after a reset, the scene."""
+        """Render the last movement in the render mode; after a reset, the scene."""
         frames = self.batch.render()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Let threads and windows go."""
+        """Stop worker threads and close the render window."""
         self.batch.close()
 
 

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import EzPickle
-from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.velocity import Motion, Steering
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.arms import ADULT, Arm
-from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.common.validation import as_given, checked_actions, refuse_unknown
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Int, Observation
+from viapoint.envs.common.validation import checked_actions
+from viapoint.envs.config import VelocityConfig
 from viapoint.envs.mdp.observation import FARTHEST, ObservationLayout
 from viapoint.envs.mdp.rewards import StepRewardWeights, step_rewards
-from viapoint.envs.multi_step import ManyStepEnv, ManyStepVectorEnv
+from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import SETTLING, Rollout
+from viapoint.envs.sim.episode_state import Episodes, Segment
+from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome, straight_jerk_cost
 from viapoint.envs.sim.simulator import SimulationLog
-from viapoint.envs.sim.velocity_episodes import StepEpisodes
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
@@ -61,7 +59,27 @@ class StepObservationLayout(ObservationLayout):
         return {**observation, **{name: part.astype(np.float32) for name, part in parts.items()}}
 
 
-class StepReachVectorEnv(ManyStepVectorEnv):
+class RestingSteps(NamedTuple):
+    """Rest of N hands at their goals."""
+
+    steps: Int
+    """Last physics steps in which the hand was at rest at the goal, shape (N,)."""
+
+
+class StepReferences(NamedTuple):
+    """References of one control step for the n episodes that stay within reach."""
+
+    rows: Int
+    """Episodes, shape (n,)."""
+    motion: Motion
+    """References at the beginning and after each physics step, shape (n, S + 1, D) each."""
+    controls: Float
+    """Actuator controls, shape (n, S, U)."""
+    jerk_cost: Float
+    """Jerk cost of the references, shape (n,), [m^2/s^5]."""
+
+
+class StepReachVectorEnv(MultiStepVectorEnv):
     """Reaching around obstacles by a velocity in every control step, `num_envs` times.
 
     Arm, scenes, physics, success and reward are those of :class:`ReachVectorEnv`. An episode ends
@@ -84,62 +102,33 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
     """
 
-    weights_kind = StepRewardWeights
+    config_kind = VelocityConfig
+    __signature__ = VelocityConfig.signature()
     observation_layout: StepObservationLayout
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        arm: Arm | str = ADULT,
-        whole_arm: bool = False,
-        n_obstacles: int | tuple[int, int] = (1, 5),
-        control_step: float = 0.04,
-        duration_range: tuple[float, float] = (0.6, 1.2),
-        reward_weights: StepRewardWeights | Mapping[str, float] | None = None,
-        render_mode: str | None = None,
-        width: int = 480,
-        height: int = 480,
-        threads: int = 0,
-        **unknown: Any,
-    ) -> None:
-        refuse_unknown(unknown, type(self).__init__.__annotations__)
-        kwargs: dict[str, Any] = {
-            "arm": arm, "whole_arm": whole_arm, "n_obstacles": n_obstacles, "duration_range": duration_range,
-            "render_mode": render_mode, "width": width, "height": height, "threads": threads,
-        }  # fmt: skip
-        weights = self.weights_kind.of(reward_weights)
-        if not isinstance(weights, StepRewardWeights):
-            raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
-        super().__init__(num_envs, reward_weights=weights, **kwargs)
-        kwargs = {"control_step": control_step, "reward_weights": reward_weights, **kwargs}
-        EzPickle.__init__(self, num_envs, **as_given(kwargs))
-        arm, timestep = self.arm, self._simulator.timestep
-        self.steering = Steering(dimension=arm.dimension, control_step=control_step, timestep=timestep)
-        """What the components of an action mean."""
+    def _build(self) -> None:
+        """Create the steering, the layouts and the episodes."""
+        config, arm, timestep = self.config, self.arm, self._simulator.timestep
+        assert isinstance(config, VelocityConfig)
+        self.steering = Steering(dimension=arm.dimension, control_step=config.control_step, timestep=timestep)
+        """Meaning of the components of an action."""
         limit = self.task.action.duration_range[1] + SETTLING
         self.control_steps = int(np.ceil(limit / self.steering.control_step - 1e-9))
-        """Of an episode at most."""
+        """Control steps of an episode at most."""
         speed, acceleration = self.steering.greatest
-        twin = self.observation_layout
+        twin = self.task.observation
         self.observation_layout = StepObservationLayout(
             dimension=twin.dimension, joint_range=twin.joint_range, n_rows=twin.n_rows, speed=speed,
             acceleration=acceleration, time_limit=self.control_steps * self.steering.control_step,
         )  # fmt: skip
-        self.single_action_space = spaces.Box(-1.0, 1.0, (arm.dimension,), np.float32)
-        self.single_observation_space = self.observation_layout.space()
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        most = self.control_steps * self.steering.physics_steps
-        self._weights = weights
-        self._episodes = StepEpisodes(self.task.collision_model, self.num_envs, timestep=timestep, most=most)
-
-    @property
-    def last_rollout(self) -> tuple[Rollout, ...]:
-        """The running movements so far at every physics step; empty before the first reset."""
-        if self.scenes is None:
-            return ()
-        return tuple(self._episodes.rollout(row, self.scenes.take([row])) for row in range(self.num_envs))
+        self._action_names = self.steering.names
+        self._motion = Motion.at_rest(np.zeros((self.num_envs, arm.dimension)))
+        self._rest = RestingSteps(np.zeros(self.num_envs, dtype=np.int64))
+        self._episodes = Episodes(
+            arm, self.num_envs, timestep=timestep,
+            max_steps=self.control_steps * self.steering.physics_steps,
+            records={"motion": self._motion, "rest": self._rest},
+        )  # fmt: skip
 
     @property
     def last_plan(self) -> Plan | None:
@@ -150,10 +139,10 @@ class StepReachVectorEnv(ManyStepVectorEnv):
         return Plan(waypoints, np.full((self.num_envs, 1), self.observation_layout.time_limit))
 
     def execute_plan(self, plan: Plan) -> Decision:
-        """Refuse plans: here the hand is steered in every control step.
+        """Raise an error: here, an action steers the hand for one control step.
 
         Raises:
-            TypeError: Always; the twin whose actions are whole movements carries them out.
+            TypeError: Always; the twin whose actions are whole movements carries out plans.
         """
         raise TypeError(
             "plans are carried out by the twin of this environment whose actions are whole movements"
@@ -162,75 +151,113 @@ class StepReachVectorEnv(ManyStepVectorEnv):
     def execute_actions(self, actions: Any) -> Decision:
         """Move for one control step in each environment, without a reset.
 
-        `terminated` and `truncated` tell which episodes ended; these must not be moved on.
+        `terminated` and `truncated` tell which episodes ended; these must not be continued.
 
         Args:
             actions: Shape (num_envs, D), in [-1, 1]; components beyond are clipped.
         """
-        self._check_running()
-        assert self.scenes is not None
-        actions = checked_actions(actions, self.num_envs, self.steering.names)
-        scenes, episodes = self.scenes, self._episodes
-        before, begun = episodes.outcome(scenes), episodes.running.steps == 0
-        self._advance(self.steering.decode(actions, scenes.start, scenes.goal))
-        after = episodes.outcome(scenes)
+        scenes, episodes = self._check_running(), self._episodes
+        actions = checked_actions(actions, self.num_envs, self._action_names)
+        before, first = self._outcome(scenes), episodes.now.steps == 0
+        velocity = self.steering.decode(actions, scenes.start, scenes.goal)
+        references = self._build_references(velocity)
+        if references.rows.size:
+            self._measure(references, self._simulator.rollout(references.rows, references.controls))
+        after = self._outcome(scenes)
         self.terminated = after.is_success | after.collision | ~after.reachable | after.unstable
-        over = episodes.running.steps >= self.control_steps * self.steering.physics_steps
+        over = episodes.now.steps >= self.control_steps * self.steering.physics_steps
         self.truncated = over & ~self.terminated
+        weights = self.task.weights
+        assert isinstance(weights, StepRewardWeights)
         terms, progress = step_rewards(
-            before, after, self.terminated | over, begun, scenes, self.task.action.centre_duration, self._weights
-        )  # fmt: skip
-        if (
-            self.render_mode == "human" and (self.terminated | over)[0]
-        ):  # a movement is played when it is over
+            before, after, self.terminated | over, first, scenes, self.task.action.centre_duration, weights
+        )
+        if self.render_mode == "human" and (self.terminated | over)[0]:  # shows whole episodes
             self.render()
         info = {**after._asdict(), **terms.as_info(), "reward_progress": progress}
         return Decision(self._observe_start(), terms.total() + progress, info)
 
-    def episodes_state(self) -> dict[str, Any]:
-        """Where the running episodes are, beside their scenes, as arrays for :meth:`restore_episodes`."""
-        return {**self._episodes.state(), "physics": self._simulator.batch.state.copy()}
-
-    def restore_episodes(self, state: Mapping[str, Any]) -> None:
-        """Go on where :meth:`episodes_state` was taken, after a reset to the same scenes."""
-        self._episodes.restore(state)
-        self._simulator.batch.state[:] = state["physics"]
-
-    def _advance(self, wanted: Float) -> None:
-        """One control step at the wanted velocities; where its reference leaves the reach, the arm stays."""
-        assert self.scenes is not None
-        motion = self.steering.follow(self._episodes.motion, wanted)
-        cost = self.steering.jerk_cost(self._episodes.motion, wanted)
+    def _build_references(self, velocity: Float) -> StepReferences:
+        """Return references and controls of one control step; where they leave the reach, the arm stays."""
+        motion = self.steering.follow(self._motion, velocity)
+        cost = self.steering.jerk_cost(self._motion, velocity)
         reachable = (np.asarray(self.arm.reach_margin(motion.position)) >= 0.0).all(axis=-1)
-        self._episodes.running.reachable[:] = reachable
+        self._episodes.now.reachable[:] = reachable
         rows = np.flatnonzero(reachable)
-        if rows.size:
-            some = Motion(*(part[rows] for part in motion))
-            controls = self.arm.controls(*(part[:, :-1] for part in some))
-            record: SimulationLog = self._simulator.rollout(rows, controls)
-            self._episodes.add(rows, self.scenes.take(rows), some, cost[rows], record)
+        some = Motion(*(part[rows] for part in motion))
+        controls = self.arm.controls(*(part[:, :-1] for part in some)) if rows.size else np.zeros((0, 0, 0))
+        return StepReferences(rows, some, controls, cost[rows])
 
-    def _start(self, rows: NDArray[np.int64], scenes: Scenes) -> None:
+    def _measure(self, references: StepReferences, log: SimulationLog) -> None:
+        """Add one control step to the episodes."""
+        assert self.scenes is not None
+        rows, motion, _, cost = references
+        scenes, planned = self.scenes.take(rows), motion.position[:, 1:]
+        number = log.joints.shape[1]
+        hand = np.asarray(self.arm.hand_position(log.joints))
+        obstacles, present = scenes.obstacles, scenes.present
+        model = self.task.collision_model
+        moved = self._episodes.add(
+            Segment(
+                rows=rows,
+                steps=np.full(len(rows), number),
+                planned=planned,
+                joints=log.joints,
+                hand=hand,
+                contact=log.contact,
+                unstable=log.unstable,
+                min_clearance=model.least_clearance(hand, obstacles, present, log.joints),
+                planned_clearance=model.least_clearance(planned, obstacles, present),
+                jerk_cost=cost,
+            )
+        )
+        resting = moved < REST_SPEED * self._simulator.timestep
+        at_goal = resting & (norm(hand - scenes.goal[:, None]) < GOAL_TOLERANCE)
+        trailing = np.where(at_goal.all(axis=-1), number, np.argmin(at_goal[:, ::-1], axis=-1))
+        self._rest.steps[rows] = trailing + np.where(trailing == number, self._rest.steps[rows], 0)
+        self._motion.put(rows, Motion(*(part[:, -1] for part in motion)))
+
+    def _outcome(self, scenes: Scenes) -> Outcome:
+        """Return the metrics so far; the duration of a success is the time until the hand came to rest."""
+        now, timestep, rest = self._episodes.now, self._simulator.timestep, self._rest.steps
+        success = (rest * timestep >= SETTLING - 1e-9) & now.sound
+        duration = timestep * np.where(success, np.maximum(now.steps - rest, 1), np.maximum(now.steps, 1))
+        cost = straight_jerk_cost(norm(scenes.goal - scenes.start), duration)
+        return self._episodes.outcome(success, norm(now.hand - scenes.goal), duration, cost)
+
+    def _start(self, rows: Int, scenes: Scenes) -> None:
         super()._start(rows, scenes)
-        self._episodes.begin(rows, scenes, np.asarray(self.arm.inverse_kinematics(scenes.start)))
+        self._motion.put(rows, Motion.at_rest(scenes.start))
+        self._rest.steps[rows] = 0
+        clearance = self.task.collision_model.least_clearance(
+            scenes.start[:, None], scenes.obstacles, scenes.present
+        )
+        joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
+        self._episodes.begin(rows, joints, scenes.start, clearance)
 
     def _observe_start(self) -> Observation:
-        """What is seen now."""
+        """Return the present observations."""
         assert self.scenes is not None
-        now = self._episodes.running
+        now = self._episodes.now
         seen = self.observation_layout.observe(now.joints, now.hand, self.scenes)
-        time = np.asarray(now.steps * self._simulator.timestep)
-        return self.observation_layout.moving(seen, self.scenes, self._episodes.motion, time)
+        return self.observation_layout.moving(seen, self.scenes, self._motion, self._episodes.time)
+
+    def _clearance(self, scene: Scenes, hand: Float, joints: Float, time: Float) -> Float:
+        """Return the clearance in one scene at each time, shape (T,), [m]."""
+        obstacles = np.repeat(scene.obstacles, len(time), axis=0)
+        present = np.repeat(scene.present, len(time), axis=0)
+        return self.task.collision_model.least_clearance(hand[:, None], obstacles, present, joints[:, None])
 
     def _render_one(self, sim: int) -> Any:
-        if self.render_mode is None or self.scenes is None or not self._episodes.running.steps[sim]:
+        if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
             return super()._render_one(sim)
-        scene, plan = self.scenes.take([sim]), self.last_plan
+        plan = self.last_plan
         assert plan is not None
-        return self._renderer.movement(sim, scene, plan.take([sim]), self._episodes.rollout(sim, scene))
+        scene = self.scenes.take([sim])
+        return self._renderer.movement(sim, scene, plan.take([sim]), self._rollout(sim))
 
 
-class StepReachEnv(ManyStepEnv):
+class StepReachEnv(MultiStepEnv):
     """A batch of one of :class:`StepReachVectorEnv`, with the same keyword arguments."""
 
     batch_kind: ClassVar[type[ReachVectorEnv]] = StepReachVectorEnv

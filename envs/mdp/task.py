@@ -28,6 +28,15 @@ class Task:
     action: ActionLayout
     weights: RewardWeights
     scenes: AnyDistribution
+    replanning: bool = False
+    """True if an episode is several plans, each made while the one before is under way."""
+    stepwise: bool = False
+    """True if an action holds for one control step."""
+
+    @property
+    def spatial(self) -> bool:
+        """True if the hand moves in space, False if it moves in the plane."""
+        return self.arm.dimension == 3
 
     @functools.cached_property
     def collision_model(self) -> CollisionModel:

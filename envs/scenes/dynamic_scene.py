@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
 
@@ -98,6 +99,15 @@ class ChangingScenes(NamedTuple):
         turned = (self.turn_times <= time[:, None] + 1e-9)[..., None]
         velocity = np.where(turned, self.courses[..., d + 1 :], self.courses[..., :d])
         return np.where(self.present[..., None], velocity, 0.0)
+
+    def straight_length(self, time: Float) -> Float:
+        """Return the length of the straight lines from target to target until a time for each, shape (N,), [m]."""
+        length, before = norm(self.goal - self.start), self.goal
+        for k in range(self.jumps.shape[1]):
+            jumped = self.jump_times[:, k] <= time + 1e-9
+            length = length + np.where(jumped, norm(self.jumps[:, k, 1:] - before), 0.0)
+            before = np.where(jumped[:, None], self.jumps[:, k, 1:], before)
+        return length
 
     def at(self, time: Float) -> Scenes:
         """How they look at a time for each, shape (N,), [s]."""

@@ -1,26 +1,32 @@
-"""Carrying plans out: references, controls, physics, outcome."""
+"""Stages of whole movements: time scaling, references, physics and metrics."""
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.background_worker import BackgroundWorker
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import norm, squared_length
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.geometry.distance import MAX_CLEARANCE
+from viapoint.envs.geometry.narrow_phase import nearest_approach
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Outcome, add_terminal_metrics, empty_outcome, measure
+from viapoint.envs.sim.outcome import (
+    GOAL_TOLERANCE,
+    REST_SPEED,
+    Outcome,
+    straight_jerk_cost,
+    sum_in_order,
+    within_joint_range,
+)
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
-from viapoint.envs.sim.time_scaling import LOOK_EVERY, pace_of
+from viapoint.envs.sim.time_scaling import LOOK_EVERY, required_time_scale
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
 GROUP = 64
-"""Movements carried out together: few enough for the cache, many enough for the threads."""
+"""Movements of one group: few enough for the processor's cache, many enough for the engine's threads."""
 
 
 class Rollout(NamedTuple):
@@ -29,180 +35,322 @@ class Rollout(NamedTuple):
     time: Float
     """Shape (T,), [s]."""
     planned: Float
-    """Hand positions of the plan, shape (T, D), [m]."""
+    """Planned hand positions, shape (T, D), [m]."""
     joints: Float
-    """Shape (T, J), [rad]."""
+    """Joint angles, shape (T, J), [rad]."""
     hand: Float
-    """Shape (T, D), [m]."""
-    contact: NDArray[np.bool_]
-    """Whether the arm touched an obstacle at the state before the step, shape (T,)."""
+    """Executed hand positions, shape (T, D), [m]."""
+    contact: Bool
+    """True where the arm touched an obstacle at the state before the step, shape (T,)."""
     clearance: Float
-    """From the nearest obstacle, shape (T,), [m]."""
+    """Clearance from the nearest obstacle, shape (T,), [m]."""
+
+
+class Movements(NamedTuple):
+    """Decided movements of N simulations."""
+
+    scenes: Scenes
+    """Scenes that they take place in."""
+    plan: Plan
+    """Via-points and durations as decided."""
+
+
+class ScaledMovements(NamedTuple):
+    """Movements that are slow enough for the arm, N of them or a group."""
+
+    sims: Int
+    """Simulations in increasing order, shape (n,)."""
+    scenes: Scenes
+    """Scenes that they take place in."""
+    plan: Plan
+    """Via-points and scaled durations."""
+    stretch: Float
+    """Factor by which each movement was slowed down, shape (n,)."""
+    within: Bool
+    """False where time scaling found the plan out of reach, shape (n,)."""
+    duration: Float
+    """Scaled total duration, shape (n,), [s]."""
+    steps: Int
+    """Physics steps including the settling time, shape (n,)."""
+
+    def groups(self) -> list[ScaledMovements]:
+        """Return groups of at most GROUP movements of similar length, so that short movements take fewer steps."""
+        if len(self.sims) <= GROUP:
+            return [self]
+        order = np.argsort(self.steps, kind="stable")
+        return [self.take(np.sort(order[first : first + GROUP])) for first in range(0, len(order), GROUP)]
+
+    def take(self, rows: Int) -> ScaledMovements:
+        """Return the movements at some rows."""
+        return ScaledMovements(
+            self.sims[rows],
+            self.scenes.take(rows),
+            self.plan.take(rows),
+            self.stretch[rows],
+            self.within[rows],
+            self.duration[rows],
+            self.steps[rows],
+        )
 
 
 class TrackingReferences(NamedTuple):
-    """Plans of one group at the physics rate, ready for the arm."""
+    """References of one group at the physics rate, and the controls that track them."""
 
-    sims: NDArray[np.int64]
-    """The simulations in increasing order, shape (n,)."""
-    rows: slice | NDArray[np.int64]
-    """The same as an index; all of them are a slice, which copies nothing."""
-    steps: NDArray[np.int64]
-    """Physics steps of each, shape (n,)."""
+    movements: ScaledMovements
+    """Movements of the group."""
     planned: Float
-    """Hand position after each step, shape (n, T, D), [m]."""
+    """Planned hand position after each step, shape (n, T, D), [m]."""
     controls: Float
-    """Shape (n, T, U)."""
-    reachable: NDArray[np.bool_]
-    """Shape (n,)."""
+    """Actuator controls, shape (n, T, U)."""
+    reachable: Bool
+    """True where the whole plan is within the arm's reach, shape (n,)."""
     jerk_cost: Float
-    """Shape (n,), [m^2/s^5]."""
+    """Half the integral of the squared jerk of the plan, shape (n,), [m^2/s^5]."""
     clearance: Float
-    """Of the plan, shape (n,), [m]."""
+    """Least clearance of the plan, shape (n,), [m]."""
 
 
-class PendingExecution(NamedTuple):
-    """Plans of N movements whose references are being computed."""
+class SimulatedMovements(NamedTuple):
+    """Movements of one group after the physics."""
 
-    plan: Plan
-    """As decided."""
+    references: TrackingReferences
+    """References that the arm tracked."""
+    log: SimulationLog | None
+    """Recorded physics of the reachable movements; None if there are none."""
+
+
+class MeasuredMovements(NamedTuple):
+    """Movements of one group with their metrics."""
+
+    simulated: SimulatedMovements
+    """Movements after the physics."""
+    joints: Float
+    """Joint angles at the end, shape (n, J), [rad]."""
+    outcome: Outcome
+    """Metrics."""
+
+
+class Execution(NamedTuple):
+    """Executed movements of N simulations."""
+
     scenes: Scenes
-    """Where they take place."""
-    duration: Float
-    """Shape (N,), [s]."""
-    stretch: Float
-    """By which factor each was slowed down, shape (N,)."""
-    referred: list[Future[TrackingReferences]]
-    """Of the groups."""
-    beside: BackgroundWorker
-    """Where they are computed, and outcomes measured."""
+    """Scenes that they took place in."""
+    plan: Plan
+    """Via-points and durations as decided."""
+    groups: tuple[MeasuredMovements, ...]
+    """Groups that were simulated together."""
+    joints: Float
+    """Joint angles at the end, shape (N, J), [rad]."""
+    outcome: Outcome
+    """Metrics."""
+
+
+def join_groups(movements: Movements, groups: list[MeasuredMovements]) -> Execution:
+    """Return the executed movements of all groups, in the order of the simulations."""
+    scenes, plan = movements
+    if len(groups) == 1:
+        return Execution(scenes, plan, tuple(groups), groups[0].joints, groups[0].outcome)
+    back = np.argsort(np.concatenate([group.simulated.references.movements.sims for group in groups]))
+    outcome = Outcome(
+        *(np.concatenate(parts)[back] for parts in zip(*(g.outcome for g in groups), strict=True))
+    )
+    joints = np.concatenate([group.joints for group in groups])[back]
+    return Execution(scenes, plan, tuple(groups), joints, outcome)
 
 
 class Executor:
-    """Carries out plans in a simulator, in groups of similar length so that short movements cost less."""
+    """Stages of whole movements, each a batch function from one record to the next.
 
-    def __init__(self, simulator: Simulator, beside: BackgroundWorker) -> None:
-        self.simulator = simulator
-        self.arm = simulator.arm
-        self.collision_model = simulator.collision_model
-        self._beside = beside
-        self._groups: list[TrackingReferences] = []
-        self._records: list[SimulationLog | None] = []
-        self.final_joints = np.zeros((0, len(self.arm.joint_range)))
-        """Where the arms ended, shape (N, J), [rad]."""
+    Args:
+        simulator: Simulator that was placed at the starts of the movements.
+    """
 
-    def __call__(self, plan: Plan, scenes: Scenes) -> Outcome:
-        """Carry out one plan in each simulation, which must have been placed at its start."""
-        return self.execute(self.prepare(plan, scenes))
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator, self.arm = simulator, simulator.arm
+        self._look_steps = round(LOOK_EVERY / simulator.timestep)
+        self._settling_steps = round(SETTLING / simulator.timestep)
 
-    def prepare(self, plan: Plan, scenes: Scenes) -> PendingExecution:
-        """Stretch plans for the arm's limits and have their references computed beside what comes next."""
-        stretch, within = pace_of(self.arm, plan)
-        paced = Plan(plan.waypoints, plan.durations * stretch[:, None])
-        duration = np.asarray(paced.durations.sum(axis=-1))
+    def scale_time(self, movements: Movements) -> ScaledMovements:
+        """Slow movements down where the arm's limits require it."""
+        plan = movements.plan
+        stretch, within = required_time_scale(self.arm, plan)
+        scaled = Plan(plan.waypoints, plan.durations * stretch[:, None])
+        duration = np.asarray(scaled.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
-        order = np.argsort(steps, kind="stable")
-        groups = [np.sort(order[i : i + GROUP]) for i in range(0, len(order), GROUP)]
-        beside = self._beside if len(groups) > 1 else BackgroundWorker(threaded=False)
-        referred = [
-            beside.submit(self._compute_references, steps, paced, scenes, within, sims) for sims in groups
-        ]
-        return PendingExecution(plan, scenes, duration, stretch, referred, beside)
+        sims = np.arange(len(steps))
+        return ScaledMovements(sims, movements.scenes, scaled, stretch, within, duration, steps)
 
-    def execute(self, prepared: PendingExecution) -> Outcome:
-        """Run the physics, measuring each group of movements beside the next ones."""
-        _, scenes, duration, stretch, referred, beside = prepared
-        self._groups, self._records, measured = [], [], []
-        for reference in referred:
-            self._groups.append(reference.result())
-            self._records.append(self._simulate(self._groups[-1]))
-            measured.append(beside.submit(self._measure, len(self._groups) - 1, scenes))
-        outcomes = [outcome.result() for outcome in measured]
-        together = outcomes[0] if len(referred) == 1 else empty_outcome(len(duration))
-        for group, outcome in zip(self._groups, outcomes, strict=True) if len(referred) > 1 else ():
-            for mine, theirs in zip(together, outcome, strict=True):
-                mine[group.sims] = theirs
-        self.final_joints = self._final_joints(scenes)
-        together = add_terminal_metrics(together, self.final_joints, scenes, self.collision_model)
-        straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / duration**5  # half of 720 A^2/T^5
-        jerk_ratio = np.maximum(together.jerk_cost / straight, 1.0)
-        return together._replace(duration=duration, jerk_ratio=jerk_ratio, stretch=stretch)
-
-    def rollout(self, sim: int, scenes: Scenes) -> Rollout:
-        """The last movement of one simulation, step by step; `scenes` are those it took place in."""
-        index = next(i for i, group in enumerate(self._groups) if sim in group.sims)
-        group, record = self._groups[index], self._records[index]
-        row = int(np.flatnonzero(group.sims == sim)[0])
-        steps, scene = int(group.steps[row]), scenes.take([sim])
-        joints = np.repeat(np.asarray(self.arm.inverse_kinematics(scene.start)), steps, axis=0)
-        contact = np.zeros(steps, dtype=bool)
-        if record is not None and group.reachable[row]:
-            ran = int(group.reachable[:row].sum())
-            joints, contact = record.joints[ran, :steps].copy(), record.contact[ran, :steps].copy()
-        hand = np.asarray(self.arm.hand_position(joints))
-        each = Scenes(*(np.repeat(field, steps, axis=0) for field in scene))
-        clearance = self.collision_model.least_clearance(
-            hand[:, None], each.obstacles, each.present, joints[:, None]
-        )
-        time = np.arange(1, steps + 1) * float(self.simulator.timestep)
-        return Rollout(np.asarray(time), group.planned[row, :steps].copy(), joints, hand, contact, clearance)
-
-    def _compute_references(
-        self,
-        steps: NDArray[np.int64],
-        plan: Plan,
-        scenes: Scenes,
-        within: NDArray[np.bool_],
-        sims: NDArray[np.int64],
-    ) -> TrackingReferences:
-        """References at the physics rate, and the controls that follow them, for one group."""
-        rows = slice(None) if len(sims) == len(steps) else sims
-        trajectory = plan.take(rows).trajectory()
-        time = self.simulator.timestep * np.arange(steps[rows].max() + 1)
+    def build_references(self, movements: ScaledMovements) -> TrackingReferences:
+        """Sample one group of movements at the physics rate and compute the controls that track them."""
+        trajectory, number = movements.plan.trajectory(), int(movements.steps.max())
+        time = self.simulator.timestep * np.arange(number + 1)
         position, velocity, acceleration = trajectory.sample(time)
-        every, settling = (round(span / self.simulator.timestep) for span in (LOOK_EVERY, SETTLING))
-        seen = position[:, : steps[rows].max() - settling + every + 1 : every]  # up to where all have ended
+        # Reach and clearance are checked every few millimetres, up to where all movements have ended.
+        every, scenes = self._look_steps, movements.scenes
+        seen = position[:, : number - self._settling_steps + every + 1 : every]
         return TrackingReferences(
-            sims=sims,
-            rows=rows,
-            steps=steps[rows],
+            movements=movements,
             planned=position[:, 1:],
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
-            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & within[rows],
+            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & movements.within,
             jerk_cost=np.asarray(trajectory.cost()),
-            clearance=self.collision_model.least_clearance(
-                seen, scenes.obstacles[rows], scenes.present[rows]
-            ),
+            clearance=self.simulator.collision_model.least_clearance(seen, scenes.obstacles, scenes.present),
         )
 
-    def _final_joints(self, scenes: Scenes) -> Float:
-        joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
-        for group, record in zip(self._groups, self._records, strict=True):
-            if record is not None:
-                run = group.reachable
-                joints[group.sims[run]] = record.joints[np.arange(run.sum()), group.steps[run] - 1]
-        return joints
+    def simulate(self, references: TrackingReferences) -> SimulatedMovements:
+        """Run the physics of one group; arms whose plans leave their reach do not start."""
+        run, sims, controls = references.reachable, references.movements.sims, references.controls
+        if not run.all():
+            sims, controls = sims[run], controls[run]
+        return SimulatedMovements(references, self.simulator.rollout(sims, controls) if len(sims) else None)
 
-    def _simulate(self, group: TrackingReferences) -> SimulationLog | None:
-        run = group.reachable
-        if run.all():
-            return self.simulator.rollout(group.sims, group.controls)
-        return self.simulator.rollout(group.sims[run], group.controls[run]) if run.any() else None
+    def measure(self, simulated: SimulatedMovements) -> MeasuredMovements:
+        """Compute the metrics of one group."""
+        references, log = simulated
+        movements, run = references.movements, references.reachable
+        scenes = movements.scenes
+        if log is not None and run.all():
+            done = self._measure_log(log, movements.steps, references.planned, scenes)
+        else:
+            done = self._at_rest(scenes)
+            if log is not None:
+                some = self._measure_log(log, movements.steps[run], references.planned[run], scenes.take(run))
+                for mine, theirs in zip(done, some, strict=True):
+                    mine[run] = theirs
+        minimum_jerk_cost = straight_jerk_cost(norm(scenes.goal - scenes.start), movements.duration)
+        outcome = Outcome(
+            is_success=done.is_success,
+            collision=done.collision,
+            first_contact_time=done.first_contact_time,
+            min_clearance=self._with_terminal_clearance(done, run, scenes),
+            planned_clearance=references.clearance,
+            goal_error=done.goal_error,
+            duration=movements.duration,
+            path_length=done.path_length,
+            jerk_cost=references.jerk_cost,
+            jerk_ratio=np.maximum(references.jerk_cost / minimum_jerk_cost, 1.0),
+            peak_speed=done.peak_speed,
+            tracking_error=done.tracking_error,
+            reachable=run,
+            unstable=done.unstable,
+            stretch=movements.stretch,
+        )
+        return MeasuredMovements(simulated, done.joints, outcome)
 
-    def _measure(self, index: int, scenes: Scenes) -> Outcome:
-        """The outcome of one group, but for duration, jerk ratio and what :func:`add_terminal_metrics` adds."""
-        group, record = self._groups[index], self._records[index]
-        run: slice | NDArray[np.bool_] = slice(None) if group.reachable.all() else group.reachable
-        outcome = empty_outcome(len(group.sims))
-        if record is not None:
-            done = measure(
-                record,
-                group.steps[run],
-                group.planned[run],
-                scenes.take(group.rows).take(run),
-                self.collision_model,
-                timestep=self.simulator.timestep,
-            )
-            for mine, theirs in zip(outcome, done, strict=True):
-                mine[run] = theirs
-        return outcome._replace(jerk_cost=group.jerk_cost, planned_clearance=group.clearance)
+    def rollout(self, execution: Execution, sim: int) -> Rollout:
+        """Return the movement of one simulation, physics step by physics step."""
+        references, log = next(
+            group.simulated for group in execution.groups if sim in group.simulated.references.movements.sims
+        )
+        movements, run = references.movements, references.reachable
+        row = int(np.flatnonzero(movements.sims == sim)[0])
+        steps, scene = int(movements.steps[row]), execution.scenes.take([sim])
+        joints = np.repeat(np.asarray(self.arm.inverse_kinematics(scene.start)), steps, axis=0)
+        contact = np.zeros(steps, dtype=bool)
+        if log is not None and run[row]:
+            ran = int(run[:row].sum())
+            joints, contact = log.joints[ran, :steps].copy(), log.contact[ran, :steps].copy()
+        hand = np.asarray(self.arm.hand_position(joints))
+        obstacles = np.repeat(scene.obstacles, steps, axis=0)
+        present = np.repeat(scene.present, steps, axis=0)
+        clearance = self.simulator.collision_model.least_clearance(
+            hand[:, None], obstacles, present, joints[:, None]
+        )
+        time = np.asarray(np.arange(1, steps + 1) * self.simulator.timestep)
+        return Rollout(time, references.planned[row, :steps].copy(), joints, hand, contact, clearance)
+
+    def _measure_log(self, log: SimulationLog, steps: Int, planned: Float, scenes: Scenes) -> _Executed:
+        """Measure n movements that ran, `steps` of whose T recorded steps belong to each."""
+        after = np.arange(log.joints.shape[1]) >= steps[:, None]
+        last = np.arange(len(steps)), steps - 1
+        joints, contact = log.joints, log.contact
+        if after.any():  # past its end, a movement stays where it ended
+            joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
+        hand = self._hand(log, joints, after, last)
+        moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
+        deviation = np.where(after, 0.0, squared_length(hand - planned))
+        goal_error = norm(hand[last] - scenes.goal)
+        collision = np.asarray(contact.any(axis=-1))
+        at_rest = moved[last] < REST_SPEED * self.simulator.timestep
+        kept = within_joint_range(joints, self.arm).all(axis=(1, 2))
+        return _Executed(
+            joints=joints[last],
+            is_success=at_rest & (goal_error < GOAL_TOLERANCE) & ~collision & ~log.unstable & kept,
+            collision=collision,
+            first_contact_time=np.where(collision, contact.argmax(axis=-1) * self.simulator.timestep, -1.0),
+            min_clearance=self._recorded_clearance(log, hand, joints, last[1], scenes),
+            goal_error=goal_error,
+            path_length=sum_in_order(moved),
+            peak_speed=moved.max(axis=-1) / self.simulator.timestep,
+            tracking_error=np.sqrt(sum_in_order(deviation) / steps),
+            unstable=log.unstable,
+        )
+
+    def _at_rest(self, scenes: Scenes) -> _Executed:
+        """Return the metrics of n arms that have stayed at rest at the start."""
+        number = len(scenes.start)
+        no, zero = np.zeros((3, number), dtype=bool), np.zeros((3, number))
+        return _Executed(
+            joints=np.asarray(self.arm.inverse_kinematics(scenes.start)),
+            is_success=no[0],
+            collision=no[1],
+            first_contact_time=np.full(number, -1.0),
+            min_clearance=np.full(number, MAX_CLEARANCE),
+            goal_error=norm(scenes.goal - scenes.start),
+            path_length=zero[0],
+            peak_speed=zero[1],
+            tracking_error=zero[2],
+            unstable=no[2],
+        )
+
+    def _hand(self, log: SimulationLog, joints: Float, after: Bool, last: tuple[Int, Int]) -> Float:
+        """Return the hand positions after each step, computed or as recorded.
+
+        The physics records positions before each step, so the last one of each movement is computed.
+        """
+        if log.traced is None:
+            return np.asarray(self.arm.hand_position(joints))
+        hand = np.empty((*joints.shape[:2], 3))
+        hand[:, :-1] = log.traced.places[:, 1:, log.traced.hand]
+        hand[last] = self.arm.hand_position(joints[last])
+        return np.where(after[..., None], hand[last][:, None], hand) if after.any() else hand
+
+    def _recorded_clearance(
+        self, log: SimulationLog, hand: Float, joints: Float, last: Int, scenes: Scenes
+    ) -> Float:
+        """Return the least clearance over all steps; of recorded links, over the states before each step."""
+        model = self.simulator.collision_model
+        if log.traced is None or not model.whole_arm:
+            return model.least_clearance(hand, scenes.obstacles, scenes.present, joints)
+        return nearest_approach(log.traced, self.arm.link_radii, scenes.obstacles, scenes.present, last)
+
+    def _with_terminal_clearance(self, done: _Executed, run: Bool, scenes: Scenes) -> Float:
+        """Return the least clearance including the state at the end, which records before each step lack.
+
+        Arms whose plans leave their reach have their clearance at the start.
+        """
+        model = self.simulator.collision_model
+        rows = np.flatnonzero(~run | (model.whole_arm and len(self.arm.traced) > 0))
+        if not rows.size:
+            return done.min_clearance
+        least, scene = done.min_clearance.copy(), scenes.take(rows)
+        end = model.least_clearance(
+            scene.start[:, None], scene.obstacles, scene.present, done.joints[rows, None]
+        )
+        least[rows] = np.minimum(least[rows], end)
+        return least
+
+
+class _Executed(NamedTuple):
+    """Metrics of n movements that only the physics decides, shape (n,) each, and their last joint angles (n, J)."""
+
+    joints: Float
+    is_success: Bool
+    collision: Bool
+    first_contact_time: Float
+    min_clearance: Float
+    goal_error: Float
+    path_length: Float
+    peak_speed: Float
+    tracking_error: Float
+    unstable: Bool

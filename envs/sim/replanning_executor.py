@@ -1,31 +1,31 @@
-"""Carrying out what decisions of different length make of plans, in groups of similar length."""
+"""Stages of decisions of different length under plans in motion: time scaling, references, physics and metrics."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan, timed
 from viapoint.envs.actions.velocity import Motion
 from viapoint.envs.arms.serial_arm import CONTROL_STRIDE
-from viapoint.envs.common.background_worker import BackgroundWorker
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
+from viapoint.envs.sim.episode_state import Segment
 from viapoint.envs.sim.executor import GROUP
-from viapoint.envs.sim.replanning_episodes import DecisionRollout, jerk_cost_between
-from viapoint.envs.sim.simulator import Simulator
-from viapoint.envs.sim.time_scaling import LOOK_EVERY, pace_of
+from viapoint.envs.sim.outcome import sum_in_order
+from viapoint.envs.sim.simulator import SimulationLog, Simulator
+from viapoint.envs.sim.time_scaling import LOOK_EVERY, required_time_scale
 
 PROLONGED, ENOUGH = 6, 1.002
-"""How often the time of a plan in motion is prolonged at most, and by which factor it need not be once more."""
+"""Greatest number of times that a plan in motion is prolonged, and the remaining factor that needs no further one."""
 SIMILAR, SLACK = 1.15, 4
-"""A group's longest decision takes at most that many times the steps of its shortest, and so many more."""
+"""Bounds of a group: its longest decision takes at most SIMILAR times the steps of its shortest, plus SLACK."""
 
 
 def groups_of(steps: Int) -> list[Int]:
-    """Indices of decisions of similar length, at most GROUP each and in increasing order.
+    """Return indices of decisions of similar length, at most GROUP per group and in increasing order.
 
     Args:
         steps: Physics steps of each, shape (n,).
@@ -39,25 +39,87 @@ def groups_of(steps: Int) -> list[Int]:
     return [np.sort(np.array(group)) for group in groups]
 
 
-class OnlineExecutor:
-    """Carries out parts of plans in a simulator.
+class ScaledPlan(NamedTuple):
+    """Plans in motion that are slow enough for the arm."""
+
+    plan: MovingPlan
+    """N plans with scaled durations."""
+    stretch: Float
+    """Factor by which each was slowed down, shape (N,)."""
+    reachable: Bool
+    """True where the plan stays within the arm's reach, shape (N,)."""
+
+
+class Decisions(NamedTuple):
+    """Parts of plans that n simulations execute in one decision."""
+
+    rows: Int
+    """Simulations in increasing order, shape (n,)."""
+    plan: MovingPlan
+    """Plans under way."""
+    since: Int
+    """Physics steps since each plan began, shape (n,)."""
+    now: Int
+    """Physics steps since each episode began, shape (n,)."""
+    steps: Int
+    """Physics steps of the decision, shape (n,)."""
+    scenes: ChangingScenes
+    """Scenes of the episodes."""
+
+    def take(self, rows: Int) -> Decisions:
+        """Return the decisions at some rows."""
+        plan, scenes = self.plan.take(rows), self.scenes.take(rows)
+        return Decisions(self.rows[rows], plan, self.since[rows], self.now[rows], self.steps[rows], scenes)
+
+    def groups(self) -> list[Decisions]:
+        """Return groups of decisions of similar length; decisions without steps are left out."""
+        some = np.flatnonzero(self.steps > 0)
+        return [self.take(some[group]) for group in groups_of(self.steps[some])]
+
+
+class DecisionReferences(NamedTuple):
+    """References of one group at the physics rate."""
+
+    decisions: Decisions
+    """Decisions of the group."""
+    planned: Float
+    """Commanded hand position after each step, shape (n, T, D), [m]."""
+    controls: Float
+    """Actuator controls, shape (n, T, U)."""
+    places: Float
+    """Centres of the obstacles before each step, NaN for absent ones, shape (n, T, rows, D), [m]."""
+    clearance: Float
+    """Least clearance of the commanded path, shape (n,), [m]."""
+    jerk_cost: Float
+    """Jerk cost of the commanded path, shape (n,), [m^2/s^5]."""
+
+
+class SimulatedDecisions(NamedTuple):
+    """Decisions of one group after the physics."""
+
+    references: DecisionReferences
+    """References that the arm tracked."""
+    log: SimulationLog
+    """Recorded physics."""
+
+
+class ReplanningExecutor:
+    """Stages of decisions, each a batch function from one record to the next.
 
     Args:
-        simulator: Of the arm.
-        beside: For the work that need not wait for the physics.
+        simulator: Simulator in the present state of the episodes.
     """
 
-    def __init__(self, simulator: Simulator, beside: BackgroundWorker) -> None:
+    def __init__(self, simulator: Simulator) -> None:
         self.simulator, self.arm = simulator, simulator.arm
-        self._beside = beside
 
-    def paced(self, plan: MovingPlan) -> tuple[MovingPlan, Float, Bool]:
-        """Plans made as slow as the arm's limits ask for, by which factor, and which keep within reach, shape (N,).
+    def scale_time(self, plan: MovingPlan) -> ScaledPlan:
+        """Slow plans down where the arm's limits require it.
 
-        One that begins in motion cannot be stretched without a jump of its velocity: its whole time is prolonged, and
-        again where that is not enough.
+        Scaling the time of a plan that begins in motion would change its initial velocity. Its total duration is
+        prolonged instead, which changes its path, and prolonged again where that is not enough.
         """
-        stretch, within = pace_of(self.arm, plan)
+        stretch, within = required_time_scale(self.arm, plan)
         slower = MovingPlan(plan.waypoints, plan.durations * stretch[:, None], *plan[2:])
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         rows = np.flatnonzero(moving & (stretch > 1.0))
@@ -66,53 +128,17 @@ class OnlineExecutor:
                 break
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             slower.put(rows, timed(plan.waypoints[rows], slower.duration[rows], state))
-            again = pace_of(self.arm, slower.take(rows)).stretch
+            again = required_time_scale(self.arm, slower.take(rows)).stretch
             rows, again = rows[again > ENOUGH], again[again > ENOUGH]
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
-        return slower, stretch, within
+        return ScaledPlan(slower, stretch, within & self._reachable(slower))
 
-    def reachable(self, plan: MovingPlan) -> Bool:
-        """Which plans stay within the arm's reach, shape (N,)."""
-        every = np.arange(int(np.ceil(plan.duration.max() / LOOK_EVERY)) + 1) * LOOK_EVERY
-        return np.asarray((np.asarray(self.arm.reach_margin(plan.trajectory()(every))) >= 0.0).all(axis=-1))
-
-    def __call__(
-        self, plan: MovingPlan, began: Int, now: Int, until: Int, scenes: ChangingScenes
-    ) -> list[DecisionRollout]:
-        """Carry out plans from one physics step of the episode to another, in each of N simulations.
-
-        Those with nothing to do, `until` being `now`, are left alone.
-
-        Args:
-            plan: Under way, N of them.
-            began: Physics step at which each began, shape (N,).
-            now: Physics step at present, shape (N,).
-            until: Before which physics step the decision ends, shape (N,).
-            scenes: N of them.
-        """
-        rows = np.flatnonzero(until > now)
-        groups = [rows[group] for group in groups_of((until - now)[rows])]
-        beside = self._beside.submit if len(groups) > 1 else BackgroundWorker(threaded=False).submit
-        referred = [
-            beside(
-                self._compute_references,
-                plan.take(g),
-                (now - began)[g],
-                now[g],
-                (until - now)[g],
-                scenes.take(g),
-            )
-            for g in groups
-        ]
-        return [self._simulated(g, *each.result()) for g, each in zip(groups, referred, strict=True)]
-
-    def _compute_references(
-        self, plan: MovingPlan, since: Int, now: Int, steps: Int, scenes: ChangingScenes
-    ) -> tuple[Int, Float, Float, Float, Float, Float]:
-        """Steps, positions, controls, places of obstacles, clearance and jerk cost of one group."""
+    def build_references(self, decisions: Decisions) -> DecisionReferences:
+        """Sample one group at the physics rate and compute the controls that track the plans."""
+        _, plan, since, now, steps, scenes = decisions
         timestep, number = self.simulator.timestep, int(steps.max())
-        # A few steps more than needed, so that the controls of the last ones do not depend on the group's longest.
+        # A few steps more than needed, so that the last controls do not depend on the longest decision of the group.
         index = np.arange(number + CONTROL_STRIDE + 1)
         position, velocity, acceleration = plan.trajectory().sample(timestep * (since[:, None] + index))
         controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])[:, :number]
@@ -121,23 +147,75 @@ class OnlineExecutor:
         profile = self.simulator.collision_model.clearance_profile(
             position[:, looks], rows[:, looks], scenes.present
         ).min(axis=-1, initial=MAX_CLEARANCE)
-        clearance = np.where(looks <= steps[:, None], profile, MAX_CLEARANCE).min(axis=-1)
-        cost = jerk_cost_between(plan, np.asarray(timestep * since), np.asarray(timestep * (since + steps)))
         present = scenes.present[:, None, :, None]
-        places = np.where(present, rows[:, :number, :, : self.arm.dimension], np.nan)
-        return steps, position[:, 1 : number + 1], controls, places, clearance, cost
+        return DecisionReferences(
+            decisions=decisions,
+            planned=position[:, 1 : number + 1],
+            controls=controls,
+            places=np.where(present, rows[:, :number, :, : self.arm.dimension], np.nan),
+            clearance=np.where(looks <= steps[:, None], profile, MAX_CLEARANCE).min(axis=-1),
+            jerk_cost=jerk_cost_between(
+                plan, np.asarray(timestep * since), np.asarray(timestep * (since + steps))
+            ),
+        )
 
-    def _simulated(
-        self,
-        sims: Int,
-        steps: Int,
-        planned: Float,
-        controls: Float,
-        places: Float,
-        clearance: Float,
-        cost: Float,
-    ) -> DecisionRollout:
-        record: Any = self.simulator.rollout_among_moving(sims, controls, places, steps)
-        touched = record.contact & (np.arange(planned.shape[1]) < steps[:, None])
-        until = np.where(touched.any(axis=-1), touched.argmax(axis=-1) + 1, steps)
-        return DecisionRollout(sims, until, planned, clearance, cost, record)
+    def simulate(self, references: DecisionReferences) -> SimulatedDecisions:
+        """Run the physics of one group among moving obstacles."""
+        decisions = references.decisions
+        log = self.simulator.rollout_among_moving(
+            decisions.rows, references.controls, references.places, decisions.steps
+        )
+        return SimulatedDecisions(references, log)
+
+    def measure(self, simulated: SimulatedDecisions) -> Segment:
+        """Measure one group; a decision ends with the first contact."""
+        references, log = simulated
+        rows, _, _, now, steps, scenes = references.decisions
+        touched = log.contact & (np.arange(log.contact.shape[1]) < steps[:, None])
+        steps = np.where(touched.any(axis=-1), touched.argmax(axis=-1) + 1, steps)
+        number = int(steps.max())
+        joints = log.joints[:, :number]
+        hand = np.asarray(self.arm.hand_position(joints))
+        return Segment(
+            rows=rows,
+            steps=steps,
+            planned=references.planned[:, :number],
+            joints=joints,
+            hand=hand,
+            contact=log.contact[:, :number],
+            unstable=log.unstable,
+            min_clearance=self._clearance(scenes, now, steps, hand, joints),
+            planned_clearance=references.clearance,
+            jerk_cost=references.jerk_cost,
+        )
+
+    def _reachable(self, plan: MovingPlan) -> Bool:
+        """Return True for plans within the arm's reach, shape (N,)."""
+        every = np.arange(int(np.ceil(plan.duration.max() / LOOK_EVERY)) + 1) * LOOK_EVERY
+        return np.asarray((np.asarray(self.arm.reach_margin(plan.trajectory()(every))) >= 0.0).all(axis=-1))
+
+    def _clearance(self, scenes: ChangingScenes, now: Int, steps: Int, hand: Float, joints: Float) -> Float:
+        """Return the least clearance of the arm in one decision, shape (n,), [m]."""
+        if not scenes.obstacles.shape[1]:
+            return np.full(len(now), MAX_CLEARANCE)
+        index = np.arange(1, hand.shape[1] + 1)
+        time = np.asarray(self.simulator.timestep * (now[:, None] + index))
+        profile = self.simulator.collision_model.clearance_profile(
+            hand, scenes.places(time), scenes.present, joints
+        ).min(axis=-1)
+        return np.asarray(np.where(index <= steps[:, None], profile, MAX_CLEARANCE).min(axis=-1))
+
+
+def jerk_cost_between(plan: MovingPlan, begin: Float, end: Float) -> Float:
+    """Return half the integral of the squared jerk between two times, shape (N,), [m^2/s^5].
+
+    On each segment the jerk is a parabola of time, so its square has degree four: three Gauss-Legendre nodes are exact.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    knots = np.concatenate((np.zeros_like(begin)[:, None], np.cumsum(plan.durations, axis=-1)), axis=-1)
+    low = np.clip(begin[:, None], knots[:, :-1], knots[:, 1:])
+    half = 0.5 * (np.clip(end[:, None], knots[:, :-1], knots[:, 1:]) - low)
+    times = low[..., None] + half[..., None] * (1.0 + nodes)
+    jerk = plan.trajectory()(times.reshape(len(times), -1), 3)
+    square = (jerk * jerk).sum(axis=-1).reshape(times.shape)
+    return 0.5 * sum_in_order((square * weights * half[..., None]).reshape(len(times), -1))

@@ -43,6 +43,8 @@ class Simulator:
         """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
         self.collision_model, self.arm = collision_model, collision_model.arm
         self.model = self.arm.compile(n_obstacles, collision_model.whole_arm)
+        self.timestep = float(self.model.opt.timestep)
+        """Length of a physics step, [s]."""
         self.physics_steps = 0
         """Physics steps simulated so far, all simulations together."""
         self.batch = batch.Batch(self.model, num_envs, threads)
@@ -57,11 +59,6 @@ class Simulator:
             self._sizes = self.batch.expand("geom_size")
             self._bounds = self.batch.expand("geom_rbound")
             self._boxes = self.batch.expand("geom_aabb")
-
-    @property
-    def timestep(self) -> float:
-        """Length of a physics step, [s]."""
-        return float(self.model.opt.timestep)
 
     def place(
         self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]

@@ -21,7 +21,7 @@ TOGETHER = 256
 """Movements that are looked at together: as many steps of the inverse dynamics for many as for one."""
 
 
-class Pace(NamedTuple):
+class TimeScale(NamedTuple):
     """What the arm's limits ask of N movements."""
 
     stretch: Float
@@ -30,7 +30,7 @@ class Pace(NamedTuple):
     """Whether it stays within the reach where it was looked at, shape (N,)."""
 
 
-def pace_of(arm: Arm, plan: Any) -> Pace:
+def required_time_scale(arm: Arm, plan: Any) -> TimeScale:
     """What limits ask of plans: of an arm that has none, only how short ones keep within its reach.
 
     Args:
@@ -45,7 +45,7 @@ def pace_of(arm: Arm, plan: Any) -> Pace:
     for first in range(0, len(rows), TOGETHER):
         some = rows[first : first + TOGETHER]
         stretch[some], within[some] = _looked_at(arm, plan.take(some))
-    return Pace(stretch, within)
+    return TimeScale(stretch, within)
 
 
 def looks_of(segments: int) -> int:
@@ -53,7 +53,7 @@ def looks_of(segments: int) -> int:
     return max(-(-LOOKS // segments), LEAST)
 
 
-def _looked_at(arm: Arm, plan: Any) -> Pace:
+def _looked_at(arm: Arm, plan: Any) -> TimeScale:
     """The same of some of them, with all of their segments."""
     durations = plan.durations
     number, segments = durations.shape
@@ -65,7 +65,7 @@ def _looked_at(arm: Arm, plan: Any) -> Pace:
     position, velocity, acceleration = trajectory.sample(times.reshape(number, -1))
     within = np.all(np.asarray(arm.reach_margin(position)) >= 0.0, axis=-1)
     if not arm.velocity_limit:
-        return Pace(np.ones(number), within)
+        return TimeScale(np.ones(number), within)
     demand = _demand(arm, position, velocity, acceleration).reshape(times.shape)
     stretch = demand.max(axis=(1, 2))
     near = np.flatnonzero(within & (stretch > 1.0 / NEARLY))
@@ -74,7 +74,7 @@ def _looked_at(arm: Arm, plan: Any) -> Pace:
         again = np.clip(about + apart[near, :, None] * CLOSER, 0.0, ends[near, -1, None, None])
         closer = _demand(arm, *plan.take(near).trajectory().sample(again.reshape(len(near), -1)))
         stretch[near] = np.maximum(stretch[near], closer.max(axis=-1))
-    return Pace(np.where(within, np.maximum(stretch, 1.0), 1.0), within)
+    return TimeScale(np.where(within, np.maximum(stretch, 1.0), 1.0), within)
 
 
 def _demand(arm: Arm, position: Float, velocity: Float, acceleration: Float) -> Float:

@@ -11,8 +11,7 @@ from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.sim.replan_triggers import Event
-from viapoint.envs.sim.replanning_episodes import jerk_cost_between
-from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK, groups_of
+from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK, groups_of, jerk_cost_between
 
 
 @pytest.mark.parametrize("env_id", ONLINE_TASKS)
@@ -176,10 +175,10 @@ def test_going_on_from_a_stored_state_is_the_same(env_id):
     for action in actions[:5]:
         first.step(action)
     scenes, state = first.scenes.as_options(), first.episodes_state()
-    generators = [generator.bit_generator.state for generator in first._generators]
+    generators = [generator.bit_generator.state for generator in first.generators]
     second.reset(options=scenes)
     second.restore_episodes(state)
-    for generator, saved in zip(second._generators, generators, strict=True):
+    for generator, saved in zip(second.generators, generators, strict=True):
         generator.bit_generator.state = saved
     assert [len(plans) for plans in first.last_plans] == [len(plans) for plans in second.last_plans]
     for action in actions[5:]:

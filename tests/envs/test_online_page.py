@@ -116,7 +116,7 @@ def test_episode_end():
 
 
 def test_arguments():
-    parameters = inspect.signature(OnlineReachVectorEnv.__init__).parameters
+    parameters = inspect.signature(OnlineReachVectorEnv).parameters
     code = {n: p.default for n, p in parameters.items() if n not in ("self", "num_envs", "unknown")}
     stated = {row[0]: row[1] for row in table("## Arguments")}
     assert set(stated) == set(code)

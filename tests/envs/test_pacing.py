@@ -7,8 +7,9 @@ import pytest
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import ADULT
 from viapoint.envs.arms.panda import PANDA
+from viapoint.envs.sim import replanning_executor
 from viapoint.envs.sim.replan_triggers import Event
-from viapoint.envs.sim.time_scaling import pace_of
+from viapoint.envs.sim.time_scaling import required_time_scale
 
 REACH = "viapoint.envs:viapoint/PandaReach-v0"
 SPACE = {"dimension": 3, "duration_range": (0.6, 1.2)}
@@ -34,7 +35,7 @@ def everywhere(plan, looks=1000):
 )
 def test_limits_hold_between_the_looks_and_no_movement_is_slower_than_that_takes(n_via, timing):
     plan = plans(ActionLayout(n_via=n_via, timing=timing, **SPACE), 300, 0.4)
-    stretch, within = pace_of(PANDA, plan)
+    stretch, within = required_time_scale(PANDA, plan)
     some = np.flatnonzero(within)
     needed = PANDA.required_time_scale(*everywhere(plan.take(some)))
     assert (needed > 1.0).mean() > 0.1
@@ -43,11 +44,11 @@ def test_limits_hold_between_the_looks_and_no_movement_is_slower_than_that_takes
 
 def test_a_movement_that_is_too_fast_between_the_looks_alone_is_slowed_down():
     plan = plans(ActionLayout(**SPACE), 150, 0.4)
-    plan = plan.take(np.flatnonzero(pace_of(PANDA, plan).within))
+    plan = plan.take(np.flatnonzero(required_time_scale(PANDA, plan).within))
     faster = plan._replace(durations=plan.durations / 4.0)
     needed = PANDA.required_time_scale(*everywhere(faster)) / 1.002
     just_above = faster._replace(durations=faster.durations * needed[:, None])
-    assert (pace_of(PANDA, just_above).stretch > 1.0).all()
+    assert (required_time_scale(PANDA, just_above).stretch > 1.0).all()
 
 
 def test_a_peak_between_two_looks_does_not_make_the_arm_sag():
@@ -80,14 +81,14 @@ def test_plans_that_are_revised_in_motion_keep_to_the_limits_too():
     env = gym.make_vec("viapoint.envs:viapoint/PandaMovingObstacles-v0", num_envs=64).unwrapped
     env.reset(seed=0)
     rng, paced, moving = np.random.default_rng(0), [], 0
-    real = env._online.paced
-    env._online.paced = lambda plan: paced.append(real(plan)) or paced[-1]
+    real = env._stages.scale_time
+    env._stages.scale_time = lambda plan: paced.append(real(plan)) or paced[-1]
     for _ in range(5):
         env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
     for plan, stretch, within in paced:
         some = np.flatnonzero(within & (stretch > 1.0) & (plan.velocity != 0.0).any(axis=-1))
         moving += len(some)
-        assert (pace_of(PANDA, plan.take(some)).stretch < 1.005).all()
+        assert (required_time_scale(PANDA, plan.take(some)).stretch < 1.005).all()
     assert moving > 10
 
 
@@ -98,7 +99,7 @@ def test_of_an_arm_without_limits_only_short_plans_are_looked_at(duration):
     action = np.zeros((2, layout.size))
     action[1, :2] = 1.0, -1.0  # outwards, beyond the arm's length
     plan = layout.decode(action, start, start + np.array([0.0, 0.3]))
-    stretch, within = pace_of(ADULT, plan)
+    stretch, within = required_time_scale(ADULT, plan)
     outside = (np.asarray(ADULT.reach_margin(everywhere(plan)[0])) < 0.0).any(axis=-1)
     assert outside.tolist() == [False, True]
     assert stretch.tolist() == [1.0, 1.0]
@@ -108,9 +109,13 @@ def test_of_an_arm_without_limits_only_short_plans_are_looked_at(duration):
 def test_plans_that_leave_the_reach_between_looks_end_episodes(monkeypatch):
     env = gym.make_vec("viapoint.envs:viapoint/PandaMovingObstacles-v0", num_envs=3).unwrapped
     env.reset(seed=0)
-    real = env._online.paced
-    monkeypatch.setattr(env._online, "reachable", lambda plan: np.ones(len(plan.durations), bool))
-    monkeypatch.setattr(env._online, "paced", lambda plan: (*real(plan)[:2], np.array([True, False, True])))
+    within = np.array([True, False, True])
+    monkeypatch.setattr(env._stages, "_reachable", lambda plan: np.ones(len(plan.durations), bool))
+    monkeypatch.setattr(
+        replanning_executor,
+        "required_time_scale",
+        lambda *arguments: required_time_scale(*arguments)._replace(within=within),
+    )
     action = np.zeros(env.action_space.shape, np.float32)
     *_, info = env.step(action)
     assert (info["event"] == Event.REACH).tolist() == [False, True, False]

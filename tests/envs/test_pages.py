@@ -73,7 +73,7 @@ def test_rewards():
 
 
 def test_arguments():
-    parameters = inspect.signature(ReachVectorEnv.__init__).parameters
+    parameters = inspect.signature(ReachVectorEnv).parameters
     skipped = {"self", "num_envs", "unknown"}
     code = {name: p.default for name, p in parameters.items() if name not in skipped}
     stated = {row[0]: row[1] for row in table("## Arguments")}

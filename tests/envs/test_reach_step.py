@@ -214,7 +214,7 @@ def test_episodes_go_on_where_their_state_was_taken():
     scenes, state = first.unwrapped.scenes.as_options(), first.unwrapped.episodes_state()
     second.reset(options=scenes)
     second.unwrapped.restore_episodes(state)
-    for mine, theirs in zip(first.unwrapped._generators, second.unwrapped._generators, strict=True):
+    for mine, theirs in zip(first.unwrapped.generators, second.unwrapped.generators, strict=True):
         theirs.bit_generator.state = mine.bit_generator.state
     for action in actions[3:]:
         one, two = first.step(action), second.step(action)

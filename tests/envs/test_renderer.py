@@ -110,7 +110,7 @@ def test_the_obstacle_that_was_touched_is_named(name):
     env = gym.make(name)
     moved(env, STRAIGHT)
     inner = env.unwrapped
-    scene, plan, _ = inner.batch._last
+    scene, plan = inner.batch._last[:2]
     movement = Movement.of(
         inner.task.collision_model, scene, plan, inner.last_rollout
     )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.envs.sim.time_scaling import pace_of
+from viapoint.envs.sim.time_scaling import required_time_scale
 from viapoint.training.scene_sets.scene_set import load
 
 SCENES, CORRECTION = 40, 4.0
@@ -42,7 +42,9 @@ def test_steered_along_solutions_of_the_twin_the_hand_succeeds(name):
     env = gym.make_vec(name, num_envs=SCENES)
     layout = gym.make(twin).unwrapped.action_layout
     plan = layout.decode(frozen.solution.astype(float), frozen.scenes.start, frozen.scenes.goal)
-    plan = Plan(plan.waypoints, plan.durations * pace_of(env.unwrapped.arm, plan).stretch[:, None])
+    plan = Plan(
+        plan.waypoints, plan.durations * required_time_scale(env.unwrapped.arm, plan).stretch[:, None]
+    )
     success, jerk_ratio = steered_along(env, plan, frozen.scenes)
     assert success.all()
     assert np.median(jerk_ratio) < 15.0

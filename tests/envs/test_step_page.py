@@ -75,7 +75,7 @@ def test_rewards():
 
 
 def test_arguments():
-    parameters = inspect.signature(StepReachVectorEnv.__init__).parameters
+    parameters = inspect.signature(StepReachVectorEnv).parameters
     code = {n: p.default for n, p in parameters.items() if n not in ("self", "num_envs", "unknown")}
     stated = {row[0]: row[1] for row in table("## Arguments")}
     assert set(stated) == set(code)

@@ -92,7 +92,7 @@ def test_a_via_point_on_an_end_is_a_straight_movement(at_end):
 def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, decisions):
     env, observation, some = under_way(env_id, decisions=decisions)
     actions = random_actions(env.task, len(some))
-    plan, _ = env.reviser.revise(env.default, env._episodes.plan, actions.astype(np.float64))
+    plan, _ = env.reviser.revise(env.default, env._plan, actions.astype(np.float64))
     found = plan_movements(observation, actions[:, None], env.task, SHARES)
     commanded = plan.trajectory()(plan.duration[:, None] * SHARES)
     assert some.sum() > 4
@@ -129,7 +129,7 @@ def test_clearance_is_that_of_many_instants(env_id):
 def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
     env, observation, some = under_way("viapoint/PlanarMovingObstacles-v0", 32, 1)
     actions = random_actions(env.task, 32)
-    plan, _ = env.reviser.revise(env.default, env._episodes.plan, actions.astype(np.float64))
+    plan, _ = env.reviser.revise(env.default, env._plan, actions.astype(np.float64))
     ahead, now = plan.duration[:, None] * np.linspace(0.0, 1.0, 800), env._episodes.time
     rows = env.scenes.places(now[:, None] + ahead, unturned=now)
     hand = plan.trajectory()(ahead)

@@ -196,7 +196,7 @@ class ViaVecEnv(VecEnv):
         """Return random generators, running episodes and counters as values and arrays for :meth:`restore`."""
         env = self.venv.unwrapped
         return {
-            "generators": [generator.bit_generator.state for generator in env._generators],
+            "generators": [generator.bit_generator.state for generator in env.generators],
             "scenes": env.scenes.as_options(),
             "returns": self._returns.copy(),
             "lengths": self._lengths.copy(),
@@ -210,7 +210,7 @@ class ViaVecEnv(VecEnv):
         env.reset(options=state["scenes"])
         if state.get("episodes"):
             env.restore_episodes(state["episodes"])
-        for generator, saved in zip(env._generators, state["generators"], strict=True):
+        for generator, saved in zip(env.generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
         self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
         self._steps_before = int(state["physics_steps"]) - int(env.physics_steps)

@@ -1,0 +1,154 @@
+"""Keyword arguments of the environments, with their defaults and checks."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from viapoint.envs.actions.via_points import ActionLayout, Timing
+from viapoint.envs.arms import ADULT, Arm, arm_of
+from viapoint.envs.common.validation import fewest_and_most, refuse_unknown
+from viapoint.envs.mdp.rewards import OnlineRewardWeights, RewardWeights, StepRewardWeights
+from viapoint.envs.mdp.task import Task, distribution_of
+from viapoint.envs.sim.replan_triggers import TRIGGERS, Trigger
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """Keyword arguments that all environments share."""
+
+    weights_kind: ClassVar[type[RewardWeights]] = RewardWeights
+    """Class of the reward's weights."""
+    replanning: ClassVar[bool] = False
+    """True if an episode is several plans."""
+    stepwise: ClassVar[bool] = False
+    """True if an action holds for one control step."""
+
+    arm: Arm | str = ADULT
+    """Arm that moves, a record or its name."""
+    whole_arm: bool = False
+    """True if the links must clear the obstacles, too; False for the hand alone."""
+    n_obstacles: int | tuple[int, int] = (1, 5)
+    """Number of obstacles, or the fewest and the most."""
+    duration_range: tuple[float, float] = (0.6, 1.2)
+    """Shortest and longest movement, [s]."""
+    reward_weights: RewardWeights | Mapping[str, float] | None = None
+    """Some or all of the weights of the reward's terms."""
+    render_mode: str | None = None
+    """One of `human`, `rgb_array` and `rgb_array_list`."""
+    width: int = 480
+    """Width of a rendered frame, [pixels]."""
+    height: int = 480
+    """Height of a rendered frame, [pixels]."""
+    threads: int = 0
+    """Threads of the simulation; 0 for one per core. Results do not depend on it."""
+
+    @classmethod
+    def of(cls, kwargs: Mapping[str, Any]) -> Self:
+        """Return the record of some keyword arguments.
+
+        Raises:
+            TypeError: There is no such argument.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        refuse_unknown({name: kwargs[name] for name in kwargs if name not in known}, known)
+        return cls(**kwargs)
+
+    @classmethod
+    def signature(cls) -> inspect.Signature:
+        """Return the signature of a vector environment with these keyword arguments."""
+        kind = inspect.Parameter.KEYWORD_ONLY
+        number = inspect.Parameter("num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1)
+        fields = dataclasses.fields(cls)
+        named = [inspect.Parameter(f.name, kind, default=f.default, annotation=f.type) for f in fields]
+        return inspect.Signature([number, *named])
+
+    def task(self) -> Task:
+        """Return the task that these arguments describe.
+
+        Raises:
+            TypeError: An argument has another type.
+            ValueError: An argument has a value that is not allowed.
+        """
+        arm = arm_of(self.arm)
+        if not isinstance(self.whole_arm, bool | np.bool_):
+            raise TypeError(f"whole_arm must be True or False, got {self.whole_arm!r}")
+        return Task(
+            arm=arm,
+            whole_arm=bool(self.whole_arm),
+            action=self._action_layout(arm.dimension),
+            weights=self.weights_kind.of(self.reward_weights),
+            scenes=distribution_of(arm)(n_obstacles=fewest_and_most(self.n_obstacles)),
+            replanning=self.replanning,
+            stepwise=self.stepwise,
+        )
+
+    def _action_layout(self, dimension: int) -> ActionLayout:
+        return ActionLayout(dimension=dimension, duration_range=self.duration_range)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViaPointConfig(EnvConfig):
+    """Keyword arguments of environments whose actions are via-points and a duration."""
+
+    n_via: int = 1
+    """Number of via-points of an action."""
+    timing: Timing = "optimal"
+    """`optimal` passage times, or `learned` ones as part of the action."""
+
+    def _action_layout(self, dimension: int) -> ActionLayout:
+        return ActionLayout(
+            dimension=dimension, n_via=self.n_via, timing=self.timing, duration_range=self.duration_range
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityConfig(EnvConfig):
+    """Keyword arguments of environments whose actions are velocities."""
+
+    weights_kind = StepRewardWeights
+    stepwise = True
+
+    control_step: float = 0.04
+    """Time for which an action holds, [s]."""
+
+    def task(self) -> Task:
+        """Return the task that these arguments describe; see :meth:`EnvConfig.task`."""
+        weights = self.reward_weights
+        if isinstance(weights, RewardWeights) and not isinstance(weights, StepRewardWeights):
+            raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
+        return super().task()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplanningConfig(ViaPointConfig):
+    """Keyword arguments of environments whose plans are revised during the movement."""
+
+    weights_kind = OnlineRewardWeights
+    replanning = True
+
+    n_obstacles: int | tuple[int, int] = 0
+    moving_obstacles: bool = False
+    """True if the obstacles move."""
+    n_jumps: int | tuple[int, int] = 0
+    """Number of jumps of the target, or the fewest and the most."""
+    decide_at: Sequence[Trigger] = TRIGGERS
+    """Events that end a decision: some of `horizon`, `target`, `course`, `clearance`."""
+    horizon: float = 0.3
+    """Time after which a decision ends, [s]."""
+    margin: float = 0.02
+    """Predicted clearance below which a decision ends, [m]."""
+
+    def task(self) -> Task:
+        """Return the task that these arguments describe; see :meth:`EnvConfig.task`."""
+        task = super().task()
+        if self.timing != "optimal":
+            raise ValueError(f"timing must be optimal where plans are revised, got {self.timing!r}")
+        if not isinstance(self.moving_obstacles, bool | np.bool_):
+            raise TypeError(f"moving_obstacles must be True or False, got {self.moving_obstacles!r}")
+        return task
