@@ -102,8 +102,8 @@ def _action(axes: Axes, data: Data) -> None:
 
 
 def _vias(axes: Axes, data: Data) -> None:
-    arm = data.env.unwrapped.task.arm
-    draw_movement(axes, arm, data.scene, data.plan, arm_shown=False, view=_view(data), scale=0.9)
+    arm, view = data.env.unwrapped.task.arm, window(data.scene, data.plan.waypoints, ASPECT)
+    draw_movement(axes, arm, data.scene, data.plan, arm_shown=False, view=view, scale=0.9)
     start, *_, goal = data.plan.waypoints
     axes.plot(*np.stack((start, goal)).T, ":", color=GREY, linewidth=1.0, zorder=1)
     ends = np.concatenate(([0.0], np.cumsum(data.plan.durations)))
@@ -205,14 +205,14 @@ def _label(axes: Axes, data: Data, quantity: str) -> None:
     axes.set_ylabel(quantity, fontsize=8, color=GREY, labelpad=1)
 
 
-def _view(data: Data) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return limits around the scene with the aspect ratio of the panel."""
-    rows = data.scene.obstacles[0, data.scene.present[0]]
-    points = np.concatenate((data.plan.waypoints, rows[:, :2] + rows[:, 2:4], rows[:, :2] - rows[:, 2:4]))
+def window(scene: Scenes, points: Float, aspect: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return limits of x and y around points and the obstacles of a scene, with a given height per width, [m]."""
+    rows = scene.obstacles[0, scene.present[0]]
+    points = np.concatenate((points, rows[:, :2] + rows[:, 2:4], rows[:, :2] - rows[:, 2:4]))
     middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2.0, np.ptp(points, axis=0)
-    half = max(extent[0], extent[1] / ASPECT) / 2.0 + MARGIN
+    half = max(extent[0], extent[1] / aspect) / 2.0 + MARGIN
     x, y = (float(m) for m in middle)
-    return (x - half, x + half), (y - half * ASPECT, y + half * ASPECT)
+    return (x - half, x + half), (y - half * aspect, y + half * aspect)
 
 
 def _arrows(figure: Figure) -> None:

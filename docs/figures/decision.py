@@ -1,0 +1,165 @@
+"""Draw the steps of one decision of the shipped agent: `python docs/figures/decision.py`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from dataflow import window
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+
+from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training import load_agent
+from viapoint.training.plotting.top_view import draw_movement
+from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.search.plan_checks import check_plans
+from viapoint.training.search.planned_movements import plan_movements
+
+ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 1
+"""Environment, and row of its `validation` set."""
+CHECKS = 4
+"""Number of plans that are checked by computed geometry."""
+SIZE, WIDTH, BOTTOM, HEIGHT = (12.6, 3.3), 0.176, 0.17, 0.66
+"""Size of the figure, [inch]; width, lower edge and height of a panel in fractions of it."""
+ASPECT = HEIGHT * SIZE[1] / (WIDTH * SIZE[0])
+"""Height of a panel divided by its width."""
+GREY = (0.45, 0.47, 0.52)
+
+
+class Decision(NamedTuple):
+    """Data of one decision."""
+
+    env: Any
+    scene: Scenes
+    """Scene, one row."""
+    paths: Float
+    """Planned path of each candidate, shape (H, T, 2), [m]."""
+    margin: Float
+    """Clearance that the critic predicts, shape (H,), [m]."""
+    checked: list[int]
+    """Candidates that are checked, the most promising first."""
+    clearance: Float
+    """Their computed clearance, [m]."""
+    chosen: int
+    """Index of the candidate that is executed."""
+    info: dict[str, Any]
+
+    @property
+    def view(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Part of the plane that is shown, [m]."""
+        return window(self.scene, self.paths[self.checked].reshape(-1, 2), ASPECT)
+
+
+def decide() -> Decision:
+    """Return the data of the decision of the shipped agent in one scene."""
+    env: Any = gym.make(ENV_ID)
+    scene = load("validation", ENV_ID).scenes.take([SCENE])
+    observation, _ = env.reset(options=scene.as_options())
+    batch = {name: part[None] for name, part in observation.items()}
+    policy: Any = load_agent(ENV_ID).policy
+    policy.checks = CHECKS
+    with torch.no_grad():
+        actions, merits = policy.propose(batch)
+        margin = policy.critic(policy.inputs(batch, actions)).margin[0].numpy()
+    checked = [int(row) for row in policy._promising(merits)[0]]
+    action = policy.decide(batch)[0]
+    chosen = int(np.abs(actions[0] - action).max(axis=-1).argmin())
+    clearance = check_plans(batch, actions[:, checked], env.unwrapped.task).clearance[0]
+    paths = plan_movements(batch, actions, env.unwrapped.task, np.linspace(0.0, 1.0, 61)).path[0]
+    *_, info = env.step(action.astype(np.float32))
+    return Decision(env, scene, np.asarray(paths), margin, checked, np.asarray(clearance), chosen, info)
+
+
+def draw(path: Path, data: Decision) -> None:
+    """Draw the figure to a PNG file."""
+    figure = Figure(figsize=SIZE, dpi=110, facecolor="white")
+    FigureCanvasAgg(figure)
+    for number, (title, panel) in enumerate(PANELS):
+        left = 0.012 + number * 0.2
+        axes = figure.add_axes((left, BOTTOM, WIDTH, HEIGHT))
+        base(axes, data)
+        text = panel(axes, data)
+        figure.text(
+            left, BOTTOM + HEIGHT + 0.06, title, fontsize=12, fontweight="bold", color=PALETTE.executed
+        )
+        figure.text(left, BOTTOM - 0.04, text, fontsize=9, color=PALETTE.joint, va="top", linespacing=1.3)
+        if number:
+            ends = (left - 0.033, BOTTOM + HEIGHT + 0.085), (left - 0.008, BOTTOM + HEIGHT + 0.085)
+            arrow = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=13, lw=2, color=PALETTE.plan)
+            arrow.set_transform(figure.transFigure)
+            figure.add_artist(arrow)
+    figure.savefig(path)
+
+
+def base(axes: Axes, data: Decision) -> None:
+    """Draw the scene."""
+    draw_movement(axes, data.env.unwrapped.task.arm, data.scene, arm_shown=False, view=data.view, scale=0.9)
+
+
+def observation(axes: Axes, data: Decision) -> str:
+    """Draw the straight line, and return the caption."""
+    axes.plot(*np.concatenate((data.scene.start, data.scene.goal)).T, ":", color=GREY, lw=1.4)
+    return "hand, goal, obstacles;\nthe straight line is blocked"
+
+
+def candidates(axes: Axes, data: Decision) -> str:
+    """Draw the planned path of every candidate, and return the caption."""
+    for path in data.paths:
+        axes.plot(*path.T, color=PALETTE.plan, lw=0.6, alpha=0.35, zorder=1)
+    return f"{len(data.paths)} plans: a fixed set, and\nmore around the best of them"
+
+
+def critic(axes: Axes, data: Decision) -> str:
+    """Draw the candidates coloured by the sign of their predicted clearance, and return the caption."""
+    for row in data.margin.argsort():
+        colour = PALETTE.plan if data.margin[row] > 0.0 else PALETTE.contact
+        axes.plot(*data.paths[row].T, color=colour, lw=0.7, alpha=0.5, zorder=4)
+    return "learned: minimum over obstacles\nand times (red: contact predicted)"
+
+
+def checks(axes: Axes, data: Decision) -> str:
+    """Draw the checked candidates, and return the caption with their clearances."""
+    for row in data.checked:
+        axes.plot(*data.paths[row].T, color=PALETTE.plan, lw=1.6, zorder=4)
+    values = ", ".join(f"{1e3 * each:.0f}" for each in data.clearance)
+    return f"{CHECKS} of the best: computed clearance\n{values} mm (optional)"
+
+
+def action(axes: Axes, data: Decision) -> str:
+    """Draw the executed movement, and return the caption."""
+    inner = data.env.unwrapped
+    draw_movement(
+        axes, inner.task.arm, data.scene, inner.last_plan, inner.last_rollout, view=data.view, scale=0.9
+    )
+    result = "success" if data.info["is_success"] else "failure"
+    return f"the via-point and the duration;\nexecuted: {result}, {1e3 * data.info['min_clearance']:.0f} mm clear"
+
+
+PANELS: tuple[tuple[str, Callable[[Axes, Decision], str]], ...] = (
+    ("observation", observation),
+    ("candidates", candidates),
+    ("critic", critic),
+    ("checks", checks),
+    ("action", action),
+)
+
+
+def main() -> None:
+    """Write `decision.png`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
+    draw(parser.parse_args().out / "decision.png", decide())
+
+
+if __name__ == "__main__":
+    main()
