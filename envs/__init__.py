@@ -14,16 +14,21 @@ if TYPE_CHECKING:
     from viapoint.envs.arm_import.loader import load_arm
     from viapoint.envs.arms import register_arm
     from viapoint.envs.arms.base import Arm
+    from viapoint.envs.mdp.task import family_sampler
     from viapoint.envs.record_video import RecordMovements
     from viapoint.envs.scenes.families import register_scene_family
+    from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
         "Plan": "viapoint.envs.actions.via_points",
         "RecordMovements": "viapoint.envs.record_video",
+        "TARGETS": "viapoint.envs.scenes.scene",
+        "family_sampler": "viapoint.envs.mdp.task",
         "load_arm": "viapoint.envs.arm_import.loader",
         "register_arm": "viapoint.envs.arms",
         "register_scene_family": "viapoint.envs.scenes.families",
+        "rows_of_lights": "viapoint.envs.scenes.scene",
     }
 
     def __getattr__(name):
@@ -39,11 +44,14 @@ register_all()
 
 __all__ = [
     "ENV_IDS",
+    "TARGETS",
     "TASKS",
     "Arm",
     "Plan",
     "RecordMovements",
+    "family_sampler",
     "load_arm",
     "register_arm",
     "register_scene_family",
+    "rows_of_lights",
 ]

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from viapoint.training.algorithms.agent import Agent, load_agent
+    from viapoint.training.algorithms.extractors import SceneExtractor
+    from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback, timed
     from viapoint.training.algorithms.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
@@ -18,14 +20,17 @@ if TYPE_CHECKING:
 else:
     _MODULES = {
         "Agent": "viapoint.training.algorithms.agent",
+        "ElapsedTimeCallback": "viapoint.training.algorithms.smdp_buffers",
         "EvaluationResult": "viapoint.training.evaluation.evaluator",
         "GeometrySearch": "viapoint.training.search.geometry_search",
         "Run": "viapoint.training.runs.run_dir",
+        "SceneExtractor": "viapoint.training.algorithms.extractors",
         "TrainConfig": "viapoint.training.config.configs",
         "ViaQ": "viapoint.training.algorithms.viaq",
         "ViaVecEnv": "viapoint.training.rollouts.vec_env",
         "evaluate": "viapoint.training.evaluation.evaluator",
         "load_agent": "viapoint.training.algorithms.agent",
+        "timed": "viapoint.training.algorithms.smdp_buffers",
         "train": "viapoint.training.runs.trainer",
     }
 
@@ -40,13 +45,16 @@ else:
 
 __all__ = [
     "Agent",
+    "ElapsedTimeCallback",
     "EvaluationResult",
     "GeometrySearch",
     "Run",
+    "SceneExtractor",
     "TrainConfig",
     "ViaQ",
     "ViaVecEnv",
     "evaluate",
     "load_agent",
+    "timed",
     "train",
 ]
