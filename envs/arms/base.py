@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Bool, Box, Float
-from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, clearance_profile, hand_clearance
+from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.primitives.array_api import Array
 
@@ -145,16 +145,10 @@ class CollisionModel:
         """
         if not obstacles.shape[1]:
             return np.full(len(hand), MAX_CLEARANCE)
-        arm = self.arm
-        links: Any = None
-        if self.whole_arm:
-            links = arm.links(arm.inverse_kinematics(hand) if joints is None else joints)
-            if arm.traced:
-                return nearest_approach(ends_of(np.asarray(links)), arm.link_radii, obstacles, present)
-        each = hand_clearance(hand, arm.hand_radius, obstacles, present)
-        if links is not None:
-            each = np.minimum(each, arm_clearance(links, arm.link_radii, obstacles, present))
-        return np.asarray(each.min(axis=-1))
+        links = self._links(hand, joints)
+        if links is not None and self.arm.traced:
+            return nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present)
+        return np.asarray(self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1))
 
     def clearance_profile(
         self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
@@ -170,18 +164,25 @@ class CollisionModel:
         number, times, most = obstacles.shape[:3]
         if not obstacles.size or not present.any():
             return np.full((number, times, most), MAX_CLEARANCE)
-        arm = self.arm
-        links, radius = None, arm.hand_radius
-        if self.whole_arm:
-            radius = arm.link_radii[-1] if arm.traced else radius  # a traced arm's last link ends in the hand
-            links = np.asarray(arm.links(arm.inverse_kinematics(hand) if joints is None else joints))
+        links, radius = self._links(hand, joints), self.arm.hand_radius
+        if links is not None:
+            # The last link of a traced arm ends in the hand.
+            radius = self.arm.link_radii[-1] if self.arm.traced else radius
             links = links.reshape(-1, 1, *links.shape[2:])
-        profile = clearance_profile(
-            hand.reshape(-1, 1, hand.shape[-1]),
-            radius,
-            obstacles.reshape(-1, *obstacles.shape[2:]),
-            np.repeat(present, times, axis=0),
-            links,
-            arm.link_radii,
-        )
-        return np.asarray(profile[..., 0].reshape(number, times, most))
+        rows, shown = obstacles.reshape(-1, *obstacles.shape[2:]), np.repeat(present, times, axis=0)
+        profile = self._clearance(hand.reshape(-1, 1, hand.shape[-1]), radius, links, rows, shown)
+        return profile.reshape(number, times, most)
+
+    def _links(self, hand: Float, joints: Float | None) -> Float | None:
+        if not self.whole_arm:
+            return None
+        return np.asarray(self.arm.links(self.arm.inverse_kinematics(hand) if joints is None else joints))
+
+    def _clearance(
+        self, hand: Float, radius: float, links: Float | None, obstacles: Float, present: Bool
+    ) -> Float:
+        """Return the least clearance over time from each obstacle, shape (N, n)."""
+        least = np.asarray(hand_clearance(hand, radius, obstacles, present))
+        if links is None:
+            return least
+        return np.asarray(np.minimum(least, arm_clearance(links, self.arm.link_radii, obstacles, present)))

@@ -15,7 +15,6 @@ Clearance is negative for penetration and at most MAX_CLEARANCE.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 
 from viapoint.envs.common.arrays import clamp, dot
 from viapoint.primitives.array_api import Array, namespace_of
@@ -50,65 +49,10 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
     """
     xp, each = namespace_of(links), []
     for i, radius in enumerate(radii):
-        # 6 to 10 % faster than the least value of `links_profile`: only the least squared distance needs its root.
+        # Only the least squared distance needs its root: 6 to 10 % faster than all clearances first.
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
         each.append(_clearance(xp.min(squared, axis=-1), obstacles[..., -1] + radius, present))
     return functools.reduce(xp.minimum, each)
-
-
-def clearance_profile(
-    hand: Array,
-    hand_radius: float,
-    obstacles: Array,
-    present: Array,
-    links: Array = None,
-    link_radii: tuple[float, ...] = (),
-    drift: Array = None,
-) -> Array:
-    """Return the clearance of hand and, if given, links from each obstacle at each time, shape (..., n, T), [m].
-
-    Args:
-        hand: Hand positions, shape (..., T, D), [m].
-        hand_radius: Radius of the hand, [m].
-        obstacles: See the module.
-        present: See the module.
-        links: Both ends of the links' axes, shape (..., T, L, 2, D), [m].
-        link_radii: Radii of the links, [m].
-        drift: See the module.
-    """
-    radii, shown = obstacles[..., :, None, -1], present[..., :, None]
-    least = _clearance(point_distance_squared(hand, obstacles, drift), radii + hand_radius, shown)
-    if links is None:
-        return least
-    pairs = [(links[..., i, 0, :], links[..., i, 1, :]) for i in range(len(link_radii))]
-    return namespace_of(hand).minimum(least, links_profile(pairs, link_radii, obstacles, present, drift))
-
-
-def links_profile(
-    links: Sequence[tuple[Array, Array]],
-    radii: tuple[float, ...],
-    obstacles: Array,
-    present: Array,
-    drift: Array = None,
-) -> Array:
-    """Return the clearance of the links alone from each obstacle at each time, shape (..., n, T), [m].
-
-    Args:
-        links: Both ends of the L links' axes, shape (..., T, D) each, [m].
-        radii: Radii of the links, [m].
-        obstacles: See the module.
-        present: See the module.
-        drift: See the module.
-    """
-    each = (
-        _clearance(
-            segment_distance_squared(first, second, obstacles, drift),
-            obstacles[..., :, None, -1] + radius,
-            present[..., :, None],
-        )
-        for (first, second), radius in zip(links, radii, strict=True)
-    )
-    return functools.reduce(namespace_of(obstacles).minimum, each)
 
 
 def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:

@@ -9,9 +9,8 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import (
     MAX_CLEARANCE,
     arm_clearance,
-    clearance_profile,
     hand_clearance,
-    links_profile,
+    point_distance_squared,
     segment_distance_squared,
 )
 from viapoint.envs.sim.simulator import Simulator
@@ -67,17 +66,21 @@ def test_contact_exactly_where_clearance_is_negative(whole_arm):
     assert 0.01 < contact.mean() < 0.5
 
 
-def test_the_profile_has_the_clearance_as_its_least_value():
+@pytest.mark.parametrize("whole_arm", [False, True])
+def test_the_profile_has_the_clearance_as_its_least_value(whole_arm):
     rng = np.random.default_rng(3)
     joints = np.cumsum(rng.uniform(-0.05, 0.05, (10, 40, 2)), axis=1) + 1.0
     obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
-    hand, links = ADULT.hand_position(joints), ADULT.links(joints)
-    profile = clearance_profile(hand, ADULT.hand_radius, obstacles, present, links, ADULT.link_radii)
-    least = np.minimum(
-        hand_clearance(hand, ADULT.hand_radius, obstacles, present),
-        arm_clearance(links, ADULT.link_radii, obstacles, present),
+    model, hand = CollisionModel(ADULT, whole_arm), ADULT.hand_position(joints)
+    profile = model.clearance_profile(hand, np.repeat(obstacles[:, None], 40, axis=1), present, joints)
+    least = hand_clearance(hand, ADULT.hand_radius, obstacles, present)
+    if whole_arm:
+        links = arm_clearance(ADULT.links(joints), ADULT.link_radii, obstacles, present)
+        least = np.minimum(least, links)
+    np.testing.assert_allclose(profile.min(axis=1), least, atol=1e-12)
+    np.testing.assert_allclose(
+        model.least_clearance(hand, obstacles, present, joints), least.min(axis=-1), atol=1e-12
     )
-    np.testing.assert_allclose(profile.min(axis=-1), least, atol=1e-12)
 
 
 def test_a_hand_no_thicker_than_the_forearm_is_inside_its_end():
@@ -86,13 +89,10 @@ def test_a_hand_no_thicker_than_the_forearm_is_inside_its_end():
     joints = rng.uniform(low, high, (10, 40, 2))
     obstacles, present = rows(2, (10, 4)), rng.random((10, 4)) < 0.7
     hand, links, radii = ADULT.hand_position(joints), ADULT.links(joints), ADULT.link_radii
-    pairs = [(links[..., i, 0, :], links[..., i, 1, :]) for i in (0, 1)]
-    alone = links_profile(pairs, radii, obstacles, present)
+    alone = arm_clearance(links, radii, obstacles, present)
     for radius in (ADULT.hand_radius, radii[-1]):
-        profile = clearance_profile(hand, radius, obstacles, present, links, radii)
-        np.testing.assert_allclose(alone, profile, atol=1e-12)
-    thicker = clearance_profile(hand, radii[-1] + 0.01, obstacles, present, links, radii)
-    assert (thicker < alone - 0.009).any()
+        assert (hand_clearance(hand, radius, obstacles, present) >= alone - 1e-12).all()
+    assert (hand_clearance(hand, radii[-1] + 0.01, obstacles, present) < alone - 0.009).any()
 
 
 def test_absent_obstacles_are_far_and_order_is_irrelevant():
@@ -111,28 +111,22 @@ def test_torch_gives_the_same_and_finite_gradients_even_inside_an_obstacle():
     points[:, 0] = obstacles[:, 0, :2]  # on an axis, where the distance has a kink
     there = np.ones((5, 4), dtype=bool)
     tensor = torch.as_tensor(points).requires_grad_()
-    profile = clearance_profile(tensor, 0.015, torch.as_tensor(obstacles), torch.as_tensor(there))
+    clearance = hand_clearance(tensor, 0.015, torch.as_tensor(obstacles), torch.as_tensor(there))
     np.testing.assert_allclose(
-        profile.detach().numpy(), clearance_profile(points, 0.015, obstacles, there), atol=1e-9
+        clearance.detach().numpy(), hand_clearance(points, 0.015, obstacles, there), atol=1e-9
     )
-    profile.sum().backward()
+    clearance.sum().backward()
     assert torch.isfinite(tensor.grad).all()
 
 
 def test_what_an_obstacle_has_drifted_counts_as_if_it_stood_there():
     generator = np.random.default_rng(5)
-    hand = generator.uniform(-0.5, 0.5, (4, 7, 2))
-    links = generator.uniform(-0.5, 0.5, (4, 7, 2, 2, 2))
-    rows = generator.uniform(-0.5, 0.5, (4, 3, 5)) * [1.0, 1.0, 0.2, 0.2, 0.1] + [0.0, 0.0, 0.0, 0.0, 0.06]
-    present, drift = (
-        np.array([True, True, False]) & np.ones((4, 1), bool),
-        generator.normal(size=(4, 3, 7, 2)),
-    )
-    drifted = clearance_profile(hand, 0.015, rows, present, links, (0.03, 0.02), drift)
-    for t in range(7):
-        there = rows.copy()
-        there[..., :2] += drift[:, :, t]
-        still = clearance_profile(
-            hand[:, t : t + 1], 0.015, there, present, links[:, t : t + 1], (0.03, 0.02)
-        )
-        np.testing.assert_allclose(drifted[..., t], still[..., 0], atol=1e-12)
+    first, second = generator.uniform(-0.5, 0.5, (2, 4, 7, 2))
+    obstacles, drift = rows(2, (4, 3)), generator.normal(size=(4, 3, 7, 2))
+    for distance, ends in ((point_distance_squared, (first,)), (segment_distance_squared, (first, second))):
+        drifted = distance(*ends, obstacles, drift)
+        for t in range(7):
+            there = obstacles.copy()
+            there[..., :2] += drift[:, :, t]
+            still = distance(*(end[:, t : t + 1] for end in ends), there)
+            np.testing.assert_allclose(drifted[..., t], still[..., 0], atol=1e-12)
