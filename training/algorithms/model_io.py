@@ -66,11 +66,11 @@ NOT_STORED = frozenset(
     | {"monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
-"""Arguments of an algorithm that belong to one process, or that are not used here."""
+"""Arguments of algorithms that model files do not hold."""
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
-    """Write what is needed to decide with a model and to train it on from its weights.
+    """Write a model as JSON and safetensors, for decisions and for further training from its weights.
 
     Raises:
         ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
@@ -82,7 +82,7 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
 
 
 def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
-    """Read a model.
+    """Load a model.
 
     Args:
         folder: That :func:`save_model` wrote.
@@ -132,11 +132,11 @@ def build(
     discount_unit: float | None = None,
     seed: int | None = None,
 ) -> BaseAlgorithm:
-    """A new model from plain values.
+    """Build a new model from plain values.
 
     Args:
         algorithm: One of ALGORITHMS.
-        policy: One of the algorithm's policies.
+        policy: Name of the policy.
         env: To learn on.
         hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
             writes them.
@@ -205,7 +205,7 @@ def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
-    """Everything but the weights, as JSON can hold it."""
+    """Return everything but the weights as JSON values."""
     names = [name for name, kind in ALGORITHMS.items() if issubclass(kind, type(model))]
     if len(names) != 1:
         known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
@@ -226,12 +226,12 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def weights(model: BaseAlgorithm) -> dict[str, Any]:
-    """The policy's tensors by name, targets and critics included."""
+    """Return the policy's tensors by name, with targets and critics."""
     return {name: tensor.detach().cpu().numpy() for name, tensor in model.policy.state_dict().items()}
 
 
 def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
-    """Set the policy's tensors after checking every one of them.
+    """Set the policy's tensors after checking all of them.
 
     Raises:
         BadFileError: Names, shapes or types differ, or a value is not finite.
@@ -264,7 +264,7 @@ def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
 
 
 def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
-    """Arguments that make an algorithm discount by time."""
+    """Return arguments that make an algorithm discount by time."""
     check_discount_unit(algorithm, unit, env_arguments(env)[0])
     if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
         raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
@@ -275,7 +275,7 @@ def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: fl
 
 
 def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
-    """Arguments of an algorithm, through its bases as far as `**kwargs` hands them on."""
+    """Return the names of an algorithm's arguments, including those that `**kwargs` passes to base classes."""
     names: set[str] = set()
     for each in kind.__mro__:
         parameters = inspect.signature(vars(each).get("__init__", object.__init__)).parameters.values()
@@ -286,7 +286,7 @@ def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
 
 
 def _encode(value: Any) -> Any:
-    """A value as JSON can hold it; what is not a plain value is written as {"kind": ..., ...}."""
+    """Return a value as JSON; objects become {"kind": ..., ...}."""
     if isinstance(value, FloatSchedule):
         return _encode(value.value_schedule)
     if isinstance(value, ConstantSchedule):
@@ -317,7 +317,7 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(value: Any, size: int) -> Any:
-    """The inverse of :func:`_encode`; `size` is that of an action."""
+    """Invert :func:`_encode`; `size` is the number of components of an action."""
     if isinstance(value, Mapping):
         kind = value.get("kind")
         if kind == "linear":

@@ -1,4 +1,4 @@
-"""Throughput as ratios: what the environment and the primitives cost beyond what must be done anyway.
+"""Throughput of environments and primitives, as ratios to the unavoidable work.
 
 Ratios of measurements that alternate within one run hold on any machine; absolute speeds only stand
 beside them.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -15,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
 from viapoint import primitives
@@ -23,37 +26,39 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.training.config.configs import BenchConfig
 from viapoint.training.io.files import write_json
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
 TRAJECTORIES, SAMPLES = 4096, 200
 MIDDLE = 0.3
-"""Random actions lie within this of the straight movement, so that most are within reach."""
+"""Bound of the components of random actions, so that most movements are within reach."""
 
 
 class Ratio(NamedTuple):
-    """One thing against the least that it could take."""
+    """Measured speed or time with its bound."""
 
     name: str
     measured: float
     floor: float
     unit: str
     ratio: float
-    """Share of the floor's speed; for the primitives how many times the floor's time."""
+    """Measured value divided by the bound."""
 
 
 def bench(config: BenchConfig) -> list[Ratio]:
-    """Measure everything; takes about half a minute."""
+    """Return all ratios; takes about half a minute."""
     return [
         _simulation(config.env, config.num_envs, config.repeats),
         _single(config.env, config.repeats, resets=False),
         _single(config.env, config.repeats, resets=True),
         *(_sampling(shared, config.repeats) for shared in (True, False)),
+        _make_vec_env(config.env, min(config.num_envs, 64), config.repeats),
     ]
 
 
 def run(config: BenchConfig, console: Console | None = None) -> None:
-    """Measure, print, and write the figures where asked to."""
+    """Measure and print all ratios, and write them to a file if asked to."""
     ratios = bench(config)
     table = Table("what", "measured", "floor", "unit", "ratio")
     for ratio in ratios:
@@ -67,7 +72,7 @@ def run(config: BenchConfig, console: Console | None = None) -> None:
 
 
 def fastest(repeats: int, *calls: Callable[[], Any]) -> list[float]:
-    """Least time of each call, [s]; they take turns, so that all meet the same moods of the machine."""
+    """Return the least time of each call, [s]; calls alternate, so that load on the machine affects all of them."""
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
         for call, mine in zip(calls, times, strict=True):
@@ -78,7 +83,7 @@ def fastest(repeats: int, *calls: Callable[[], Any]) -> list[float]:
 
 
 def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
-    """Physics steps per second of `make_vec(...).step` and of the engine alone on the same model."""
+    """Return physics steps per second of `make_vec(...).step` and of the engine alone on the same model."""
     env: Any = gym.make_vec(env_id, num_envs=num_envs)
     env.reset(seed=0)
     actions = _actions(env.single_action_space, num_envs)
@@ -98,7 +103,7 @@ def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
 
 
 def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
-    """The same for one environment through `gym.make`, with or without the time to draw its scenes."""
+    """Return physics steps per second of one environment of `gym.make`, with or without the time of resets."""
     env = gym.make(env_id)
     env.reset(seed=0)
     action = _actions(env.action_space, 1)[0]
@@ -131,7 +136,7 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
 def _rates(
     env: Any, step: Callable[[], float], engine: Callable[[], Any], raw_steps: int, repeats: int
 ) -> tuple[float, float, str, float]:
-    """Steps per second of both sides; those of the environment are counted, as scenes and lengths differ.
+    """Return physics steps per second of both sides, counted in the environment, as the lengths of episodes differ.
 
     `step` returns the seconds that count.
     """
@@ -150,7 +155,7 @@ def _rates(
 def _engine(
     task: Task, scenes: Scenes, actions: NDArray[np.float32], steps: int, threads: int
 ) -> Callable[[], Any]:
-    """A rollout of the engine alone: the same controls in the same scenes, with the records the environment needs."""
+    """Return a rollout of the engine alone with the same controls, scenes and records as in the environment."""
     number = len(actions)
     simulator = Simulator(
         task.collision_model,
@@ -179,7 +184,7 @@ def _actions(space: Any, number: int) -> NDArray[np.float32]:
 
 
 def _sampling(shared: bool, repeats: int) -> Ratio:
-    """Microseconds per trajectory of position, velocity and acceleration, and of a copy of the numbers."""
+    """Return microseconds per trajectory of sampling position, velocity and acceleration, and of a copy."""
     generator = np.random.default_rng(0)
     waypoints = generator.uniform(-0.5, 0.5, (TRAJECTORIES, 3, 2))
     durations = np.full((TRAJECTORIES, 2), 0.4) if shared else generator.uniform(0.3, 0.6, (TRAJECTORIES, 2))
@@ -195,6 +200,22 @@ def _sampling(shared: bool, repeats: int) -> Ratio:
     micro = 1e6 / TRAJECTORIES
     name = f"sample {SAMPLES} x (position, velocity, acceleration), {'shared' if shared else 'own'} knots"
     return Ratio(name, micro * sampled, micro * copied, "us/trajectory", sampled / copied)
+
+
+def _make_vec_env(env_id: str, num_envs: int, repeats: int) -> Ratio:
+    """Return decisions per second of `make_vec_env` of Stable-Baselines3 and of ViaVecEnv, each on its defaults."""
+    envs: list[VecEnv] = [make_vec_env(env_id, num_envs), ViaVecEnv(env_id, num_envs)]
+    for env in envs:
+        env.reset()
+    actions = _actions(envs[0].action_space, num_envs)
+    theirs, mine = (
+        num_envs / each for each in fastest(repeats, *(partial(env.step, actions) for env in envs))
+    )
+    for env in envs:
+        env.close()
+    return Ratio(
+        f"make_vec_env against ViaVecEnv, {num_envs} environments", theirs, mine, "decisions/s", theirs / mine
+    )
 
 
 def _shown(value: float) -> str:

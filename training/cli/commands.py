@@ -1,4 +1,4 @@
-"""What `viapoint train`, `evaluate` and `play` do."""
+"""Commands `train`, `evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class EvaluationStoppedError(Exception):
     """An evaluation was stopped by Ctrl-C; what it had finished is written and marked as partial."""
 
     exit_code = 130
-    """As shells count an end by Ctrl-C."""
+    """Exit code of shells for Ctrl-C."""
 
 
 def train(config: TrainConfig) -> None:
-    """Train, and say where everything is."""
+    """Train, and print where the run is."""
     if config.resume:
         run = Run(config.folder)
         what = f"{run.config.algo} on {run.config.env}, seed {run.config.seed},"
@@ -56,7 +56,7 @@ def evaluate(config: EvaluateConfig) -> None:
     check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
     scenes = whole.take(slice(0, config.n_scenes))
-    with progress_bar() as progress, training.one_thread():
+    with progress_bar() as progress:
         result = measure(
             agent,
             env=config.env,
@@ -86,7 +86,7 @@ def evaluate(config: EvaluateConfig) -> None:
 
 
 def _kept_as(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
-    """A name for an evaluation in some scenes that replaces none in other ones, and no whole one by a part."""
+    """Return a file name that is unique to the scenes of an evaluation and to their number."""
     name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
     name += "" if number == len(whole.share) else f".first-{number}"
     return name + (".partial" if partial else "")
@@ -104,7 +104,7 @@ def _check_failures(agent: Agent | None) -> None:
 
 
 def play(config: PlayConfig) -> None:
-    """Film an agent's movements."""
+    """Record a video of an agent's movements."""
     from viapoint.training.plotting.video import record_video
 
     agent = load_agent(config.agent)
@@ -121,7 +121,7 @@ def play(config: PlayConfig) -> None:
 
 
 def spread(number: int, count: int) -> Any:
-    """At most `count` indices, evenly spread over `number`."""
+    """Return at most `count` indices, evenly spread over `number`."""
     return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
 
 

@@ -1,4 +1,4 @@
-"""The whole story in one folder: train, measure, draw, film."""
+"""Command `demo`: train an agent, evaluate it, and write table, figures and a video to one folder."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import one_thread, train
+from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
 
 BASELINES = ("search16", "search512", "straight", "random")
 PICTURES = 12
-"""In the gallery."""
+"""Number of movements in the gallery."""
 MOVEMENTS = 4
-"""In the film."""
+"""Number of movements in the video."""
 
 
 class StoredSolutions:
-    """The solutions that the planner found when the scenes were frozen; `viapoint evaluate` runs it anew."""
+    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew."""
 
     name = "planner (stored)"
     timed = False
@@ -55,9 +55,9 @@ class StoredSolutions:
 
 
 def run(config: DemoConfig) -> None:
-    """Train an agent, measure it, draw and film it, and print the table and where everything is.
+    """Train and evaluate an agent, write figures and a video, and print the table and the paths.
 
-    What a folder holds already is kept, so a second call only shows it, and an interrupted one goes on.
+    Existing results in the folder are kept, so a second call only prints them, and an interrupted call continues.
     """
     began = time.monotonic()
     folder = config.out
@@ -93,7 +93,7 @@ def run(config: DemoConfig) -> None:
 
 
 def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
-    """The agent's movements in scenes spread over all difficulties, ready to be drawn."""
+    """Return the agent's movements in scenes of all difficulties for the gallery."""
     env = gym.make(agent.env_id, **agent.env_kwargs)
     inner: Any = env.unwrapped
     by_difficulty = np.argsort(-frozen.share, kind="stable")
@@ -119,7 +119,7 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
 
 
 def _trained(config: DemoConfig) -> Run:
-    """The run in the folder, trained to its end."""
+    """Return the completed run in the folder, trained now if necessary."""
     asked = TrainConfig(env=config.env, seed=config.seed, n_timesteps=config.total_timesteps, out=config.out)
     if not (config.out / "config.json").exists():
         print(f"training for {asked.total_timesteps} decisions; Ctrl-C saves, and the same command goes on")
@@ -141,7 +141,7 @@ def _trained(config: DemoConfig) -> Run:
 
 
 def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
-    """The evaluation, from the folder where it holds one of this agent on these scenes."""
+    """Return the evaluation of the agent, from the folder if it holds one for these weights and scenes."""
     path = config.out / "table.json"
     identity = {
         "sha256": frozen.sha256,
@@ -161,7 +161,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         agent_method("untrained", untrained(agent), 0),
     ]
     methods += [*(make_method(name, config.env) for name in BASELINES), StoredSolutions(frozen)]
-    with progress_bar() as progress, one_thread():
+    with progress_bar() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
     record = {**result.to_dict(), **identity}
     report.write(record, config.out)
@@ -182,6 +182,6 @@ def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
 
 
 def _once(path: Path, source: Path, draw: Callable[[Path], Any]) -> None:
-    """Draw a file unless it is there and newer than what it shows."""
+    """Draw a file unless it exists and is newer than its source."""
     if not path.exists() or path.stat().st_mtime < source.stat().st_mtime:
         draw(path)

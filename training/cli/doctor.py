@@ -1,4 +1,4 @@
-"""What works on this machine, and what to install where something does not.
+"""Command `doctor`: check what works on this machine, and what to install where something does not.
 
 Nothing but the standard library is imported before a check asks for it, so that this runs where little else does.
 """
@@ -22,12 +22,12 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, NoReturn
 
 PATIENCE = 120.0
-"""Time that a check in a process of its own may take, [s]."""
+"""Time limit of a check in a separate process, [s]."""
 SPACE = 1 << 30
-"""Free disk space that a few trainings need, [bytes]."""
+"""Free disk space for a few trainings, [bytes]."""
 REINSTALL = "pip install --force-reinstall 'mujoco>=4'"
 OPTIONAL = {"moviepy": "gymnasium's RecordVideo", "ompl": "the baseline by a motion planner (RRT-Connect)"}
-"""Packages that only some things need, and what these are."""
+"""Packages that only some features need, and these features."""
 INSTALL_TRAINING = "pip install 'viapoint[training]'"
 REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
 
@@ -70,15 +70,15 @@ print("the shipped agent of", agent.env_id, "loads")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What one check found."""
+    """Result of one check."""
 
     name: str
     works: bool
     needed: bool
-    """Whether nothing much works without it."""
+    """Mark of a check that must pass."""
     found: str
     remedy: str = ""
-    """What to do where it does not work."""
+    """Advice if it fails."""
 
 
 def run(config: Any) -> None:
@@ -126,12 +126,12 @@ def missing_packages() -> list[str]:
 
 
 def all_works(findings: list[Finding]) -> bool:
-    """Whether everything that is needed works."""
+    """Return whether all needed checks pass."""
     return all(finding.works for finding in findings if finding.needed)
 
 
 def examine(folder: Path) -> Iterator[Finding]:
-    """Every check in turn; `folder` is where runs are to be written."""
+    """Run all checks; `folder` is the folder for runs."""
     least = "3.11"
     python = platform.python_version()
     yield Finding(
@@ -157,7 +157,7 @@ def examine(folder: Path) -> Iterator[Finding]:
 
 
 class Requirement(NamedTuple):
-    """Line of the package's metadata on a package that it needs."""
+    """Required package, as the metadata of this package state it."""
 
     name: str
     least: str
@@ -208,7 +208,7 @@ def packages(lines: Iterable[str]) -> Iterator[Finding]:
 
 
 def at_least(version: str, least: str) -> bool:
-    """Whether a version is the least one or newer."""
+    """Return whether a version is the least one or newer."""
     mine, wanted = (
         [int(part) for part in re.findall(r"\d+", each.partition("+")[0])] for each in (version, least)
     )
@@ -216,7 +216,7 @@ def at_least(version: str, least: str) -> bool:
 
 
 def mujoco_files() -> Finding:
-    """An upgrade of MuJoCo 3 in place takes files away that MuJoCo 4 has just brought."""
+    """Check the files of MuJoCo 4, some of which an upgrade of MuJoCo 3 in place removes."""
     gone, there = [], 0
     for name in ("mujoco", "mujoco-core"):
         try:
@@ -239,7 +239,7 @@ def mujoco_files() -> Finding:
 
 
 def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) -> Finding:
-    """Run a script in a process of its own: a crash or a hang in a library must not end the report."""
+    """Run a script in a separate process, so that a crash or a hang in a library does not end the report."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE
@@ -255,7 +255,7 @@ def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) ->
 
 
 def attempt(name: str, check: Callable[[], str], remedy: str) -> Finding:
-    """Run a check that returns what it found or raises."""
+    """Run a check that returns its finding or raises."""
     try:
         return Finding(name=name, works=True, needed=True, found=check())
     except Exception as error:
@@ -288,13 +288,13 @@ def torch_threads() -> str:
 
 
 def processors() -> str:
-    """How many threads the simulation gets."""
+    """Return the number of threads of the simulation."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return f"{allowed} of {os.cpu_count()} may be used"
 
 
 def disk(folder: Path) -> str:
-    """Write a file where runs are to be, or would be made."""
+    """Check that the folder for runs, or its first existing parent, is writable."""
     place = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
     if not place.is_dir():
         raise NotADirectoryError(f"{place} is no folder")

@@ -1,4 +1,4 @@
-"""Entry point of the command `viapoint`: it imports nothing of the extra `training` before it is known to be there."""
+"""Entry point of the command `viapoint`, which imports packages of the extra `training` only if they are installed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from viapoint.training.cli import doctor
 
 
 def main() -> None:
-    """Run the command; where its packages are missing, print what to install and exit with code 2."""
+    """Run the command; if packages are missing, print what to install and exit with code 2."""
     try:
         from viapoint.training.cli.main import main as run
     except ImportError as error:

@@ -26,15 +26,15 @@ TELLTALE = {
     "td3": "policy_delay",
     "ppo": "clip_range",
 }
-"""A name that is in the description of each algorithm's archives, and of none below it."""
+"""Name in the description of each algorithm's archives, and of no algorithm below it."""
 
 
 class NotTrustedError(Exception):
-    """Nobody said that the archive may be opened."""
+    """Error of an archive that the user did not allow to open."""
 
 
 def run(config: ImportConfig) -> None:
-    """Convert an archive and say where the model is.
+    """Convert an archive and print where the model is.
 
     Raises:
         NotTrustedError: Neither `--trust` was given nor the question answered with yes.
@@ -52,7 +52,7 @@ def run(config: ImportConfig) -> None:
 
 
 def algorithm_of(path: Path) -> str:
-    """The algorithm of an archive by what its description names; nothing in it is opened.
+    """Return the algorithm of an archive from the names in its description, without opening its objects.
 
     Raises:
         BadFileError: It is no archive of Stable-Baselines3, or of an algorithm that is not known here.
@@ -74,7 +74,7 @@ def algorithm_of(path: Path) -> str:
 
 
 def convert(path: Path, algo: str, env_id: str, out: Path) -> Agent:
-    """Open an archive, which runs its code, and write its model; the model as it is read back.
+    """Open an archive, which runs its code, write its model, and return the agent loaded from it.
 
     Raises:
         BadFileError: It cannot be opened, is not for the environment, or has parts of its own making.

@@ -1,4 +1,4 @@
-"""The command `viapoint`."""
+"""Command `viapoint`."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from viapoint.training.config.configs import (
 
 
 class UsageError(ValueError):
-    """A command line that is not understood; the message is one line."""
+    """Error of an invalid command line; the message is one line."""
 
 
 class Command(NamedTuple):
-    """One subcommand: what it can be told, and the function that does it, imported only when it is called."""
+    """Subcommand: its configuration and its function, which is imported when it is called."""
 
     config: type[Any]
     module: str
     function: str
 
     def __call__(self, config: Any) -> None:
-        """Do it."""
+        """Run the subcommand."""
         getattr(importlib.import_module(self.module), self.function)(config)
 
 
@@ -53,7 +53,7 @@ COMMANDS: dict[str, Command] = {
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
     "import-sb3": Command(ImportConfig, "viapoint.training.cli.import_sb3", "run"),
 }
-"""Every subcommand by its name; one line adds one."""
+"""Subcommands by name."""
 
 DESCRIPTION = (
     "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
@@ -63,7 +63,7 @@ DESCRIPTION = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a subcommand; an error is one line on the standard error output and exit code 2."""
+    """Run a subcommand; errors print one line to the standard error output and exit with code 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def parse(words: Sequence[str], usual: Any = None) -> Any:
-    """The configuration that a command line stands for.
+    """Return the configuration that a command line stands for.
 
     Args:
         words: Of the command line, without the program's name.
@@ -118,7 +118,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
-    """Refuse flags that are not those of the run to resume, also where they say what is usual otherwise."""
+    """Check that flags equal those of the run to resume, including flags with default values."""
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import check_unchanged
 
@@ -128,7 +128,7 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
 
 
 def _unboxed(text: str) -> str:
-    """The words in tyro's boxes, without the frame, its title and its rules.
+    """Return the words in tyro's boxes without frame, title and rules.
 
     Where the output knows only ASCII, there is no frame, and a rule follows the title.
     """

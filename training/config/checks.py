@@ -33,13 +33,13 @@ ELSEWHERE = {
     "vector_kwargs": "the environments are native vector environments",
     "wrappers": "the environments are trained on as they are",
 }
-"""What is no argument of a training's environment, and what is instead."""
+"""Arguments that a training's environment does not take, and what to use instead."""
 GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
-"""Of what has a limit: seeds as NumPy's old generator takes them, environments as many as may fit into memory."""
+"""Greatest values: seeds of NumPy's legacy generator, and environments that fit into memory."""
 
 
 def check_env(env: str) -> None:
-    """Refuse an id that is not one of this package's."""
+    """Check that an id is one of this package's."""
     if env not in ENV_IDS:
         raise ValueError(
             f"env must be one of {', '.join(ENV_IDS)}, which `import viapoint.envs` registers; got {env!r}"
@@ -47,7 +47,7 @@ def check_env(env: str) -> None:
 
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
-    """Refuse arguments that are given elsewhere; the others are checked by the environment."""
+    """Check that no argument has a flag of its own; the environment checks the others."""
     if not isinstance(kwargs, Mapping):
         raise ValueError(f"env_kwargs must be values by name, got {kwargs!r}")
     for name in kwargs:
@@ -56,20 +56,20 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
 
 
 def check_whole_movements(env: str) -> None:
-    """Refuse a task in which an action is less than a whole movement."""
+    """Check that an action of the task is a whole movement."""
     if env in STEP_TASKS or env in ONLINE_TASKS:
         like = STEP_TASKS.get(env, DEFAULT_ENV)
         raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
 
 
 def check_has_scenes(env: str) -> None:
-    """Refuse a task that no scenes are shipped for."""
+    """Check that scenes are shipped for a task."""
     if env in OWN_ARM_TASKS:
         raise ValueError(f"env must be one with frozen scenes, {OWN_ARM_TASKS[env]} for one, got {env!r}")
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
-    """Refuse anything but whole numbers from `least` to the greatest that makes sense."""
+    """Check that a value is a whole number from `least` to its greatest value."""
     most = GREATEST.get(name)
     known = isinstance(value, int) and not isinstance(value, bool)
     if not known or value < least or (most is not None and value > most):
@@ -87,7 +87,7 @@ def check_baselines(names: tuple[str, ...]) -> None:
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:
-    """Refuse a file that cannot be written, before there is anything to write."""
+    """Check that a file can be written."""
     if path is None:
         return
     if suffix and path.suffix.lower() != suffix:
@@ -100,13 +100,13 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
 
 
 def check_folder(name: str, path: Path | None) -> None:
-    """Refuse a folder that cannot be written to, before there is anything to write."""
+    """Check that a folder can be written to."""
     if path is not None:
         _check_place(name, path, path)
 
 
 def _check_place(name: str, path: Path, folder: Path) -> None:
-    """Whether a folder is there or can be made, and can be written to."""
+    """Check that a folder exists or can be created, and can be written to."""
     there = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.exists(each))
     if not os.path.isdir(there):
         raise ValueError(f"{name} {path} cannot be written: {there} is no folder")
@@ -115,10 +115,10 @@ def _check_place(name: str, path: Path, folder: Path) -> None:
 
 
 class Allowed(NamedTuple):
-    """Values of one hyperparameter."""
+    """Allowed values of one hyperparameter."""
 
     words: str
-    """As an error says it, behind "must be"."""
+    """Words of error messages after "must be"."""
     fits: Callable[[Any], bool]
 
 
@@ -227,7 +227,7 @@ HYPERPARAMETERS: dict[str, Allowed] = {
     "explore_candidates": _whole(2),
     "next_candidates": _whole(1),
 }
-"""By name, for every algorithm; the comments and units are those of Stable-Baselines3 and of ViaQ."""
+"""Allowed values by name, for every algorithm; Stable-Baselines3 and ViaQ document them."""
 
 PARTICULAR: dict[str, dict[str, Allowed]] = {
     "ppo": {"ent_coef": NOT_NEGATIVE, "batch_size": _whole(2)},
@@ -238,7 +238,7 @@ PARTICULAR: dict[str, dict[str, Allowed]] = {
         "use_sde": Allowed("false", lambda value: value is False),
     },
 }
-"""What is narrower for one algorithm."""
+"""Allowed values that are narrower for one algorithm."""
 
 VIA_POLICY: dict[str, Allowed] = {
     "form": Allowed("places or action", lambda value: value in ("places", "action")),
@@ -252,11 +252,11 @@ VIA_POLICY: dict[str, Allowed] = {
     "checks": _whole(0),
     "optimizer_kwargs": _or(SETTINGS, NONE),
 }
-"""Allowed `policy_kwargs` of ViaQ, by name; the task is taken from the environment."""
+"""Allowed `policy_kwargs` of ViaQ by name; the environment provides the task."""
 
 
 def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
-    """Refuse values that make no sense; names that there are not are refused by whoever builds the model.
+    """Check the values of hyperparameters; building the model checks their names.
 
     Raises:
         ValueError: A value is not allowed.
@@ -276,7 +276,7 @@ def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
 
 
 def check_via_policy(values: Mapping[str, Any]) -> None:
-    """Refuse `policy_kwargs` of ViaQ that make no sense; names that are not in the table are passed over.
+    """Check the values of `policy_kwargs` of ViaQ; unknown names are ignored.
 
     Raises:
         ValueError: A value is not allowed.

@@ -1,4 +1,4 @@
-"""How much counts what comes after a decision of so many seconds."""
+"""Discounts that depend on the duration of decisions, as in semi-Markov decision processes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from viapoint.envs.registration import ONLINE_TASKS
 
 ELAPSED = "elapsed"
-"""Where an info tells how long its decision took, [s]."""
+"""Name of the duration of a decision in infos, [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimeDiscount:
-    """How much counts what comes after a decision.
+    """Discount that depends on the duration of a decision.
 
     Raises:
         ValueError: gamma is not in (0, 1], or the unit is not positive.
@@ -27,18 +27,18 @@ class TimeDiscount:
     gamma: float
     """Discount of one unit of time."""
     unit: float
-    """[s]."""
+    """Unit of time, [s]."""
     key: str = ELAPSED
-    """Of the infos, where they tell the elapsed time [s]."""
+    """Name of the duration of a decision in infos, [s]."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+        """Check the values."""
         if not 0.0 < self.gamma <= 1.0:
             raise ValueError(f"gamma must be in (0, 1] to be a discount by time, got {self.gamma!r}")
         _check_unit("unit", self.unit)
 
     def of(self, infos: Sequence[Mapping[str, Any]]) -> NDArray[np.float32]:
-        """gamma^(elapsed / unit) for N infos, shape (N,).
+        """Return gamma^(elapsed / unit) for N infos, shape (N,).
 
         Raises:
             ValueError: An info does not tell the elapsed time, or tells one that is negative or not finite.
@@ -57,7 +57,7 @@ class TimeDiscount:
 
 
 def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
-    """Refuse what cannot be a setting of an algorithm by its name on the command line.
+    """Check the unit of time for an algorithm in an environment.
 
     Raises:
         ValueError: The unit is no positive number, or the algorithm's episodes are one decision there.

@@ -1,4 +1,4 @@
-"""NAME=VALUE ... on the command line: names with values in JSON, or words."""
+"""Command-line arguments NAME=VALUE, with values in JSON or words."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import tyro
 
 
 def from_words(words: list[str]) -> dict[str, Any]:
-    """NAME=VALUE ... as a dictionary; values are JSON where they can be, otherwise words.
+    """Return NAME=VALUE words as a dictionary; values are JSON if possible, otherwise words.
 
     Raises:
         ValueError: A word has no name, a name is there twice, or a value is neither JSON nor a plain word.
@@ -38,7 +38,7 @@ def _value(name: str, text: str) -> Any:
 
 
 def _is_number(text: str) -> bool:
-    """Whether Python reads a number, such as nan and Infinity, which are none in JSON."""
+    """Return whether Python reads a number, including nan and Infinity, which JSON lacks."""
     try:
         float(text)
     except ValueError:
@@ -47,7 +47,7 @@ def _is_number(text: str) -> bool:
 
 
 def _as_json(text: str) -> str | None:
-    """JSON for what is a value in Python only, such as True and (1, 8)."""
+    """Return JSON for Python values such as True and (1, 8)."""
     try:
         return json.dumps(ast.literal_eval(text), allow_nan=False, separators=(",", ":"))
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
@@ -66,4 +66,4 @@ _NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(
     str_from_instance=lambda value: [f"{name}={json.dumps(each)}" for name, each in value.items()],
 )
 NamedValues = Annotated[dict[str, Any], _NAMED_VALUES]
-"""On the command line: NAME=VALUE NAME=VALUE ..."""
+"""Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""

@@ -1,4 +1,4 @@
-"""Tuned settings of the learning algorithms, in one table."""
+"""Tuned settings of the learning algorithms."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """How an algorithm is run unless one says otherwise."""
+    """Default settings of an algorithm."""
 
     policy: str
-    """One of the algorithm's policies."""
+    """Name of the policy."""
     n_envs: int
     """Environments that are stepped together."""
     n_timesteps: int
-    """Decisions in all."""
+    """Decisions in total."""
     eval_every: int = 1_000
     """Decisions between two evaluations on the validation scenes."""
     checkpoint_every: int = 5_000
     """Decisions between two checkpoints."""
     discount_unit: float | None = None
-    """Seconds that count gamma; None where each decision does, whatever it takes."""
+    """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
     hyperparameters: tuple[tuple[str, Any], ...]
-    """Arguments of the algorithm; schedules and noise as :mod:`viapoint.training.algorithms.model_io` writes them."""
+    """Hyperparameters; schedules and noise as :mod:`viapoint.training.algorithms.model_io` writes them."""
 
     def arguments(self) -> dict[str, Any]:
-        """The hyperparameters as a fresh dictionary."""
+        """Return the hyperparameters as a new dictionary."""
         return copy.deepcopy(dict(self.hyperparameters))
 
 
@@ -73,7 +73,7 @@ _OFF_POLICY: dict[str, Any] = {
     "policy_kwargs": _NETWORK,
 }
 _LITTLE_ENTROPY = "auto_0.02"
-"""Rewards are of size one: begun at 1, as it is otherwise, entropy outweighs them for ten thousand decisions."""
+"""Initial entropy coefficient; rewards are of order one, so the usual 1 outweighs them for 10,000 decisions."""
 _STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
@@ -101,7 +101,7 @@ PRESETS: dict[str, Preset] = {
         policy_kwargs=_NETWORK,
     ),
 }
-"""By the name the command line knows them by; the comments and units are those of Stable-Baselines3."""
+"""Presets by the names of algorithms on the command line."""
 
 STEP_PRESETS: dict[str, Preset] = {
     "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
@@ -121,12 +121,12 @@ STEP_PRESETS: dict[str, Preset] = {
         policy_kwargs=_NETWORK,
     ),
 }
-"""The same where an action lasts one control step, which then counts as a decision."""
+"""Presets of tasks in which an action lasts one control step, which counts as a decision."""
 
 REACH_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000),
 }
-"""Where nothing is in the way, less will do."""
+"""Presets of tasks without obstacles, which need fewer decisions."""
 
 ONLINE_PRESETS: dict[str, Preset] = {
     name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
@@ -144,7 +144,7 @@ ONLINE_PRESETS: dict[str, Preset] = {
 
 
 def preset_of(env_id: str, algo: Algorithm) -> Preset:
-    """What holds for an algorithm on an environment unless one says otherwise."""
+    """Return the default settings of an algorithm in an environment."""
     if env_id in STEP_TASKS:
         return STEP_PRESETS[algo]
     if env_id in ONLINE_TASKS:

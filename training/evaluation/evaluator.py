@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -29,45 +30,45 @@ from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
 Progress = Callable[[str, int, int], None]
-"""Is told the method's name, the scenes that are done and the scenes that there are."""
+"""Function of the method's name, the number of finished scenes and the number of all scenes."""
 
 TIMED_DECISIONS = 200
-"""Single decisions that are timed, at most."""
+"""Greatest number of single decisions that are timed."""
 TIMING_BUDGET = 3.0
-"""Time after which no more are timed, [s]."""
+"""Wall time after which no further decision is timed, [s]."""
 SLOW_DECISION = 0.1
-"""A method whose single decisions take longer than this is timed by the batch, [s]."""
+"""Decision time above which a method is timed in batches, [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodResult:
-    """What one method did in n of the N scenes, from the first on."""
+    """Outcomes of one method in the first n of N scenes."""
 
     name: str
     outcomes: Mapping[str, NDArray[Any]]
-    """Every scalar of the environment's info, shape (n,) each."""
+    """Scalars of the environment's info by name, shape (n,) each."""
     actions: Float
-    """Shape (n, m)."""
+    """Actions, shape (n, m)."""
     decision_times: Float
-    """Of single decisions, [s]; one number, the mean of a batch, for a slow method."""
+    """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
     band: NDArray[np.int64]
-    """Index into BANDS of each scene, -1 where the share is unknown, shape (n,)."""
+    """Index into BANDS of each scene, -1 if the share is unknown, shape (n,)."""
     family: NDArray[np.str_]
-    """Of each scene, '' for drawn ones, shape (n,)."""
+    """Scene family of each scene, '' for the training distribution, shape (n,)."""
     distance: Float
-    """From start to goal, shape (n,), [m]; NaN where the target jumps, of which the shortest path is not known."""
+    """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
     partial: bool
-    """Whether it was interrupted before the last scene."""
+    """Mark of an evaluation that was interrupted before the last scene."""
     interrupted: bool = False
-    """Whether it was interrupted at all, so that no method follows."""
+    """Mark of an evaluation that was interrupted, so that no further method follows."""
 
     @property
     def success(self) -> NDArray[np.bool_]:
-        """Which of the scenes it succeeded in, shape (n,)."""
+        """Success in each scene, shape (n,)."""
         return np.asarray(self.outcomes["is_success"], dtype=bool)
 
     def summary(self) -> dict[str, Any]:
-        """The metrics, by name; those of successes only are None where there is none."""
+        """Return the metrics by name; those of successes are None without successes."""
         success, median = self.success, _median
         return {
             "scenes": len(success),
@@ -149,7 +150,7 @@ class EvaluationResult:
 
     @property
     def partial(self) -> bool:
-        """Whether it was interrupted before the end."""
+        """Mark of an evaluation that was interrupted before the end."""
         return self.missing or any(result.partial for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
@@ -307,7 +308,7 @@ def evaluate_methods(
     time_decisions: bool = True,
     progress: Progress | None = None,
 ) -> EvaluationResult:
-    """Let each method decide in each scene, and simulate its decisions, or let it do so itself where it can.
+    """Evaluate methods in the same scenes.
 
     Args:
         methods: Methods to evaluate, one or more.
@@ -321,7 +322,7 @@ def evaluate_methods(
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
-    with _trial(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as trial:
+    with one_thread(), _trial(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as trial:
         for method in methods:
             result = _evaluate_one(method, frozen, trial, batch, time_decisions, progress)
             results.append(result)
@@ -384,7 +385,7 @@ def _distances(scenes: Scenes | ChangingScenes) -> Float:
 
 
 def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: float) -> Float:
-    """Seconds of single decisions; for a slow method only its mean in the batch."""
+    """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch."""
     times: list[float] = []
     began = time.perf_counter()
     for row in range(min(TIMED_DECISIONS + 1, len(scenes.start))):
@@ -399,6 +400,17 @@ def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: floa
         if time.perf_counter() - began > TIMING_BUDGET:
             break
     return np.array(times[1:] or times)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread, which is fastest for small networks and gives the same numbers on any machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager
@@ -421,7 +433,7 @@ def _compare(first: MethodResult, second: MethodResult) -> dict[str, Any] | None
 
 
 def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
-    """A rate with its 95 % Wilson interval."""
+    """Return a rate with its 95 % Wilson interval."""
     interval = wilson(int(values.sum()), len(values))
     return {
         "rate": interval.estimate if len(values) else None,
@@ -441,6 +453,6 @@ def _quantile(values: NDArray[Any], share: float) -> float | None:
 
 
 def _rounded(values: NDArray[Any]) -> list[Any]:
-    """Values to a millionth of their unit: short, and finer than any of them is known."""
+    """Return values rounded to a millionth of their unit, which is finer than their accuracy."""
     listed: list[Any] = (np.round(values, 6) if values.dtype.kind == "f" else values).tolist()
     return listed

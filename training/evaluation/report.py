@@ -1,4 +1,4 @@
-"""An evaluation as a table: for the terminal, for a document, for a program."""
+"""Tables of evaluations for terminals, documents and programs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from viapoint.training.scene_sets.scene_set import BANDS
 
 Summary = Mapping[str, Any]
 Record = Mapping[str, Any]
-"""What :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict` returns, or a file that holds it."""
+"""Result of :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict`, or the content of its file."""
 
 
 class Column(NamedTuple):
-    """One column of the table."""
+    """Column of the table."""
 
     heading: str
     cell: Callable[[Summary], str]
@@ -75,11 +75,11 @@ NOTES = (
 
 
 HEADINGS, COLUMN = 21, 11
-"""Widths in the terminal: of the column of headings, and the least of a method's column, [characters]."""
+"""Width of the column of headings, and least width of a method's column, [characters]."""
 
 
 def rows(record: Record) -> list[list[str]]:
-    """Headings, then the cells of each method; columns in which no method has a value are left out."""
+    """Return headings and the cells of each method, without columns in which no method has a value."""
     columns = _columns(record)
     heads = ["method", *(column.heading for column in columns)]
     table = [
@@ -91,7 +91,7 @@ def rows(record: Record) -> list[list[str]]:
 
 
 def _columns(record: Record) -> list[Column]:
-    """Those of every table, and behind the bands one for each family that there is."""
+    """Return the columns of every table and, after the bands, one for each scene family."""
     summaries = record["methods"].values()
     names = dict.fromkeys(name for summary in summaries for name in summary.get("success_by_family", {}))
     behind = 2 + len(BANDS)
@@ -99,13 +99,13 @@ def _columns(record: Record) -> list[Column]:
 
 
 def title(record: Record) -> str:
-    """What was measured on what."""
+    """Return environment, scene set and hash in one line."""
     number = max(summary["scenes"] for summary in record["methods"].values())
     return f"{record['env']}, scenes {record['scenes']} ({number}, sha256 {record['sha256'][:12]})"
 
 
 def markdown(record: Record) -> str:
-    """The table as a document."""
+    """Return the table as a Markdown document."""
     head, *body = rows(record)
     lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -113,7 +113,7 @@ def markdown(record: Record) -> str:
 
 
 def show(record: Record, console: Console | None = None) -> None:
-    """Print the table, turned on its side: one column for each method, in several tables where they are too many."""
+    """Print the table with one column for each method, split into several tables if it is too wide."""
     console = console or Console()
     heads, *body = rows(record)
     fitting = max((console.width - HEADINGS) // COLUMN, 1)
@@ -130,7 +130,7 @@ def show(record: Record, console: Console | None = None) -> None:
 
 
 def write(record: Record, folder: Path, stem: str = "table") -> tuple[Path, Path]:
-    """Write the table as Markdown and as JSON; the JSON holds every outcome of every scene, too."""
+    """Write the table as Markdown, and with the outcomes of every scene as JSON."""
     folder.mkdir(parents=True, exist_ok=True)
     document, data = folder / f"{stem}.md", folder / f"{stem}.json"
     write_bytes(document, markdown(record).encode())

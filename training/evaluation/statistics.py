@@ -14,7 +14,7 @@ from viapoint.envs.common.types import Float
 
 
 class Interval(NamedTuple):
-    """A confidence interval and the estimate in it."""
+    """Estimate with its confidence interval."""
 
     estimate: float
     low: float
@@ -22,7 +22,7 @@ class Interval(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Two methods on the same scenes."""
+    """Comparison of two methods on the same scenes."""
 
     difference: float
     """Success rate of the first minus that of the second."""

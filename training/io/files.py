@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files and folders that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from safetensors.numpy import save as save_arrays
 Arrays = dict[str, NDArray[Any]]
 
 LARGEST_JSON = 64 << 20
-"""Size that a JSON file may have, [bytes]."""
+"""Greatest size of a JSON file, [bytes]."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
-"""Names of what :func:`write_bytes` and :func:`write_folder` are at work on; a crash leaves them behind."""
+"""Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 
 
 class BadFileError(ValueError):
-    """A file or folder that is not what it should be; the message names it and the reason."""
+    """Error of a file or folder; the message names it and the reason."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
@@ -35,7 +35,7 @@ class BadFileError(ValueError):
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a run after a crash, sees the old content or the new, never a part.
+    """Write a file atomically, so that readers see the old content or the new, even after a crash.
 
     Raises:
         OSError: For example of a full disk; what was there is still there.
@@ -56,7 +56,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
-    """Make or replace a folder whose content `fill` writes, as atomically as :func:`write_bytes`."""
+    """Create or replace a folder atomically; `fill` writes its content."""
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     temporary.mkdir(parents=True)
     try:
@@ -76,7 +76,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON; NaN and infinity are refused, as JSON has none."""
+    """Write JSON; NaN and infinity raise ValueError."""
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
@@ -99,7 +99,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
 
 
 def read_bytes(path: Path, largest: int | None = None) -> bytes:
-    """The content of a regular file.
+    """Return the content of a regular file.
 
     Raises:
         BadFileError: It is missing, no regular file, larger than `largest` bytes, or cannot be read.
@@ -120,7 +120,7 @@ def read_bytes(path: Path, largest: int | None = None) -> bytes:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays as safetensors: numbers, no code."""
+    """Write named arrays as safetensors, which hold no code."""
     write_bytes(path, save_arrays({name: np.asarray(array, order="C") for name, array in arrays.items()}))
 
 
@@ -149,7 +149,7 @@ def _finite(digits: str) -> float:
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Readers differ in which of two equal names they take."""
+    """Return pairs as a dictionary; repeated names raise ValueError, as readers differ in which one they take."""
     result = dict(pairs)
     if len(result) < len(pairs):
         names = [name for name, _ in pairs]
@@ -158,7 +158,7 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make renames in a folder last through a power cut, where the system can."""
+    """Make renames in a folder durable, if the operating system can."""
     if os.name == "nt":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -169,7 +169,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Undo what a crash amid :func:`write_folder` or :func:`write_bytes` left behind in a folder."""
+    """Remove or restore files that a crash during :func:`write_folder` or :func:`write_bytes` left behind."""
     for left in sorted(folder.glob(".*")):
         found = UNFINISHED.fullmatch(left.name)
         if found is None:

@@ -1,4 +1,4 @@
-"""What a model file may ask for: no more memory than its own weights account for."""
+"""Limits of the memory that model files may request."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from viapoint.envs.actions.via_points import MOST_VIAS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
 
 LARGEST_MODEL_JSON = 1 << 20
-"""Size of `model.json` at most, [bytes]."""
+"""Greatest size of `model.json`, [bytes]."""
 LARGEST_WEIGHTS = 1 << 30
-"""Size of `weights.safetensors` at most, [bytes]."""
+"""Greatest size of `weights.safetensors`, [bytes]."""
 LARGEST_ARGUMENTS = {
     "n_via": MOST_VIAS,
     "n_obstacles": MOST_OBSTACLES,
@@ -24,14 +24,14 @@ LARGEST_ARGUMENTS = {
     "height": 8192,
     "threads": 1024,
 }
-"""Arguments of an environment that memory and time grow with, and how large a file may make them."""
+"""Greatest values in a file of those arguments of an environment that memory and time grow with."""
 
 SPARE_PARAMETERS = 100_000
-"""How many parameters more than its weights a model may describe before the difference is named tensor by tensor."""
+"""Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
 
 def check_env_arguments(kwargs: Mapping[str, Any]) -> None:
-    """Refuse an environment that would not fit into memory.
+    """Check that an environment fits into memory.
 
     Raises:
         ValueError: An argument is over its limit.
@@ -45,7 +45,7 @@ def check_env_arguments(kwargs: Mapping[str, Any]) -> None:
 
 @contextmanager
 def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
-    """Inside, networks may have no more parameters than these weights can fill, but for a few.
+    """Limit the parameters of new networks to the number in the weights, plus a few.
 
     Torch reserves memory for a layer before it touches it, and the check comes between the two.
 

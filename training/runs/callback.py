@@ -1,4 +1,4 @@
-"""What happens besides learning: watching, validating, keeping."""
+"""Callback of training runs: validation, checkpoints, logs and progress."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OUTCOMES = {
     "rollout/jerk_ratio": "jerk_ratio",
     "rollout/duration": "duration",
 }
-"""Tags of the TensorBoard log besides SB3's own, and what of the outcomes of training they average."""
+"""Tags of the TensorBoard log besides those of Stable-Baselines3, and the metrics that they average."""
 VALIDATED = {
     "validation/success_rate": "success",
     "validation/collision_rate": "collision",
@@ -45,34 +45,34 @@ VALIDATED = {
     "validation/duration": "duration",
     "validation/decision_time": "decision_time",
 }
-"""Tags, and what of a record of the learning curve they show; medians in m and s."""
+"""Tags of validation, and the entries of a learning-curve record that they show; medians in [m] and [s]."""
 BAND_TAGS = {
     band: f"validation/success_rate_share_{words}"
     for band, words in zip(BANDS, ("above_20", "5_to_20", "1_to_5", "below_1"), strict=True)
 }
-"""Tags of the success by band."""
+"""Tags of the success rate in each difficulty band."""
 
 
 class TrainingStoppedError(Exception):
     """Training was stopped by Ctrl-C after its state was saved."""
 
     exit_code = 130
-    """As shells count an end by Ctrl-C."""
+    """Exit code of shells for Ctrl-C."""
 
 
 class Monitor(BaseCallback):
-    """Validates, keeps the best model, writes checkpoints, logs, and shows progress.
+    """Callback that validates, keeps the best model, writes checkpoints and logs, and shows progress.
 
-    All of it happens between two collections of experience, when the state of a run is whole. None of it
-    draws from the learner's random generators, so a run is the same with it and without. It is entered as a
-    context around `learn`: inside, the first Ctrl-C saves and leaves, the second leaves at once.
+    It acts between two collections of experience, when the state of a run is complete. It draws no random numbers of
+    the learner, so it does not change the result. Use it as a context around `learn`: inside, the first Ctrl-C saves
+    and stops, the second stops at once.
     """
 
     def __init__(self, run: Run) -> None:
         super().__init__()
         self.run, self.config = run, run.config
         self.curve: list[dict[str, Any]] = []
-        """One record for each evaluation so far."""
+        """Learning curve: one record for each evaluation so far."""
         self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
         self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_interval, "evaluation": 0}
@@ -86,7 +86,7 @@ class Monitor(BaseCallback):
         self._stop = False
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs, as plain values."""
+        """Return the state as plain values for :meth:`restore`."""
         return {
             "curve": self.curve,
             "best": list(self._best),
@@ -95,14 +95,14 @@ class Monitor(BaseCallback):
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state` was taken."""
+        """Continue from a state that :meth:`state` returned."""
         self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
         self._best = (float(state["best"][0]), float(state["best"][1]))
         self._next = {name: int(state["next"][name]) for name in self._next}
 
     @property
     def seconds(self) -> float:
-        """Trained so far, earlier parts of the run included, validation excluded, [s]."""
+        """Wall time of training, with earlier parts of the run and without validation, [s]."""
         return self._seconds_before + time.monotonic() - self._began
 
     @property
@@ -111,7 +111,7 @@ class Monitor(BaseCallback):
 
     @contextmanager
     def _showing(self, work: str) -> Iterator[None]:
-        """Show in the progress bar what learning waits for."""
+        """Show the current work in the progress bar."""
         self._bar.set_description(work)
         try:
             yield
@@ -179,7 +179,7 @@ class Monitor(BaseCallback):
             self._keep()
 
     def _due(self, what: str) -> bool:
-        """Whether it is time; if so, when the next time comes."""
+        """Return whether an action is due, and schedule the next one if so."""
         if self.num_timesteps < self._next[what]:
             return False
         self._next[what] = (self.num_timesteps // self._every[what] + 1) * self._every[what]
@@ -190,7 +190,7 @@ class Monitor(BaseCallback):
             self.run.checkpoint(self.model, self.state())
 
     def _validate(self, frozen: FrozenScenes) -> None:
-        """Measure the policy alone, add to the learning curve, keep the model if it is the best so far."""
+        """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
             return
         seconds, began = self.seconds, time.monotonic()
@@ -234,7 +234,7 @@ class Monitor(BaseCallback):
         return record
 
     def _decision_time(self) -> float:
-        """Median time of single decisions, of which the first does not count, [s]."""
+        """Return the median wall time of single decisions without the first one, [s]."""
         observation: Any = self.model._last_obs
         one = {name: part[:1] for name, part in observation.items()}
         times = []
@@ -245,7 +245,7 @@ class Monitor(BaseCallback):
         return float(np.median(times[1:]))
 
     def _note(self, tag: str, value: Any) -> None:
-        """Log a number, or a rate; a median of successes is None where there is none."""
+        """Log a number or a rate; None, the median of no values, is skipped."""
         number = value["rate"] if isinstance(value, dict) else value
         if number is not None:
             self.logger.record(tag, number)
@@ -272,12 +272,12 @@ class Monitor(BaseCallback):
 
 
 def _timestep(env: Any) -> float:
-    """Of the physics, [s]."""
+    """Return the timestep of the physics, [s]."""
     return float(env.get_attr("model", [0])[0].opt.timestep)
 
 
 def validation_scenes(run: Run) -> FrozenScenes:
-    """The shipped validation scenes of a run's environment; drawn ones, always the same, where none fit."""
+    """Return the shipped validation scenes of a run's environment, or reproducibly sampled ones if none fit."""
     config = run.config
     env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
     if frozen_fit("validation", env_id, env_kwargs):

@@ -1,4 +1,4 @@
-"""Everything that training needs to go on as if it had never stopped.
+"""Checkpoints, from which training continues to the same result as without interruption.
 
 A checkpoint is taken between the collection of experience and the next, when SB3 holds nothing in local
 variables. It is a folder of `state.json` and `tensors.safetensors`, written whole or not at all, and like a
@@ -34,7 +34,7 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 FORMAT = 2
 READABLE = (1, 2)
-"""Formats that can be read; the first did not vouch for the numbers in `state.json`."""
+"""Readable formats; the first has no hash of the numbers in `state.json`."""
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -43,13 +43,13 @@ COUNTERS = (
     "_n_updates",
     "_current_progress_remaining",
 )
-"""Numbers of SB3's algorithms that training continues from."""
+"""Counters of Stable-Baselines3's algorithms."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 
 
 def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any]) -> None:
-    """Write the whole state of a training run; `extra` comes back from :func:`read_checkpoint`."""
+    """Write the complete state of a training run; :func:`read_checkpoint` returns `extra`."""
     tensors: dict[str, Any] = {}
     state = {
         "format": FORMAT,
@@ -75,7 +75,7 @@ def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any
 
 
 def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
-    """Put a newly built model of the same kind and its environment into the state of a checkpoint.
+    """Set a newly built model of the same kind and its environment to the state of a checkpoint.
 
     Returns:
         What `extra` was.
@@ -99,7 +99,7 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
 
 
 def _whole(folder: Path) -> dict[str, Any]:
-    """What `state.json` says, after both files were found to be as they were written."""
+    """Return the content of `state.json` after checking the hashes of both files."""
     path, tensors = folder / "state.json", folder / "tensors.safetensors"
     state = read_json(path)
     if state.get("format") not in READABLE or not isinstance(state.get("model"), dict):
@@ -113,7 +113,7 @@ def _whole(folder: Path) -> dict[str, Any]:
 
 
 def _digest(state: Mapping[str, Any]) -> str:
-    """Hash of everything else in a state."""
+    """Return the hash of everything else in a state."""
     rest = {name: value for name, value in state.items() if name != "digest"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -129,7 +129,7 @@ def _file_digest(path: Path) -> str:
 
 
 def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:
-    """Set what a checkpoint holds; which attributes these are is said here, never by the file."""
+    """Set the attributes that a checkpoint holds; the code determines which ones, never the file."""
     model.set_parameters(_torch(_put(state["parameters"], tensors)), exact_match=True)
     variables, arrays = _put(state["variables"], tensors), _put(state["arrays"], tensors)
     for name in _variables(model):
@@ -146,17 +146,17 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any
 
 
 def _variables(model: BaseAlgorithm) -> dict[str, Any]:
-    """Tensors outside of modules and optimisers, such as SAC's entropy coefficient."""
+    """Return tensors outside of modules and optimisers, such as SAC's entropy coefficient."""
     return {name: recursive_getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
 
 
 def _buffer(model: BaseAlgorithm) -> BaseBuffer | None:
-    """The replay buffer; a rollout buffer is empty between two collections."""
+    """Return the replay buffer; a rollout buffer is empty between two collections."""
     return getattr(model, "replay_buffer", None)
 
 
 def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """The filled part of the replay buffer's arrays."""
+    """Return the filled part of the replay buffer's arrays."""
     buffer = _buffer(model)
     if buffer is None:
         return {}
@@ -219,7 +219,7 @@ def _env(model: BaseAlgorithm) -> ViaVecEnv:
 
 
 def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
-    """A copy of nested values whose arrays went into `tensors` and left {"tensor": name} behind."""
+    """Return a copy of nested values in which {"tensor": name} replaces each array, and add the arrays to `tensors`."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
@@ -235,7 +235,7 @@ def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
 
 
 def _put(value: Any, tensors: Mapping[str, Any]) -> Any:
-    """The inverse of :func:`_take`, but for arrays in place of torch's tensors."""
+    """Invert :func:`_take`, with arrays in place of torch tensors."""
     if isinstance(value, list):
         return [_put(each, tensors) for each in value]
     if not isinstance(value, dict):
@@ -256,7 +256,7 @@ def _torch(value: Any) -> Any:
 
 
 def _difference(saved: Any, mine: Any, name: str = "the model") -> str:
-    """The first thing that differs between two descriptions, in words; empty where nothing does."""
+    """Return the first difference between two descriptions in words, or an empty string."""
     if isinstance(saved, dict) and isinstance(mine, dict):
         names = [each for each in sorted({*saved, *mine}) if each not in ("num_timesteps", "viapoint")]
         return next(filter(None, (_difference(saved.get(each), mine.get(each), each) for each in names)), "")

@@ -1,4 +1,4 @@
-"""A run folder: everything about one training, in files that outlive it.
+"""Run folders: all files of one training.
 
 config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
 learning_curve.jsonl              one line for each evaluation on the validation scenes
@@ -95,7 +95,7 @@ class Run:
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
-        """Make the folder of a new run.
+        """Create the folder of a new run.
 
         Raises:
             BadFileError: There is a run in it already, or something else.
@@ -111,19 +111,19 @@ class Run:
 
     @property
     def versions(self) -> dict[str, Any]:
-        """Versions that the run began with; empty where they cannot be read."""
+        """Versions of packages at the start of the run; empty if the file is unreadable."""
         try:
             return read_json(self.folder / "versions.json")
         except BadFileError:
             return {}
 
     def write_config(self) -> None:
-        """Write the configuration as it is now."""
+        """Write the current configuration."""
         _write_config(self.folder, self.config)
 
     @property
     def curve(self) -> list[dict[str, Any]]:
-        """The learning curve: one record for each evaluation; a torn last line is left out."""
+        """Learning curve: one record for each evaluation; an incomplete last line is left out."""
         path = self.folder / "learning_curve.jsonl"
         records = []
         for line in path.read_text().splitlines() if path.exists() else []:
@@ -140,13 +140,13 @@ class Run:
 
     @property
     def decisions(self) -> int:
-        """Decisions that the newest checkpoint was trained for; 0 without one."""
+        """Number of decisions at the newest checkpoint; 0 without one."""
         checkpoints = self.checkpoints()
         return int(checkpoints[-1].name) if checkpoints else 0
 
     @property
     def best(self) -> Path:
-        """Folder of the best model on the validation scenes; of the last model where training did not validate.
+        """Folder of the best model on the validation scenes, or of the last model if training did not validate.
 
         Raises:
             BadFileError: There is no model yet.
@@ -155,7 +155,7 @@ class Run:
 
     @property
     def final(self) -> Path:
-        """Folder of the last model, which is there once training has ended."""
+        """Folder of the last model, which exists once training has ended."""
         return self.folder / "final"
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
@@ -163,7 +163,7 @@ class Run:
         write_folder(self.folder / name, lambda temporary: save_model(model, temporary))
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
-        """Write a checkpoint and remove those that are outdated."""
+        """Write a checkpoint and remove outdated ones."""
         write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
             shutil.rmtree(outdated)
@@ -173,7 +173,7 @@ class Run:
         return sorted(path for path in self._checkpoints.glob("[0-9]*") if path.is_dir())
 
     def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
-        """Put a model into the state of the newest checkpoint that is whole.
+        """Set a model to the state of the newest intact checkpoint.
 
         Returns:
             What the checkpoint carried besides, None where there is no checkpoint at all; and why newer ones
@@ -193,7 +193,7 @@ class Run:
         return None, []
 
     def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
-        """Keep the result of an evaluation under a name."""
+        """Write the result of an evaluation under a name."""
         path = self.folder / "evaluations" / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
         write_json(path, record)
@@ -201,7 +201,7 @@ class Run:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder for this process; the system lets go when the process ends, however it ends.
+        """Lock the folder for this process; the operating system unlocks it when the process ends.
 
         Raises:
             BadFileError: Another process trains in the folder.
@@ -218,7 +218,7 @@ class Run:
 
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process; see :meth:`Run.locked`."""
+    """Lock a folder for this process; see :meth:`Run.locked`."""
     lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
     try:
         lock.acquire(timeout=0)
@@ -234,7 +234,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder that cannot take a new run.
+    """Check that a folder can hold a new run.
 
     Raises:
         BadFileError: It holds more than a start left that got no further, or is a file.
@@ -250,12 +250,12 @@ def check_free(folder: Path) -> None:
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:
-    """The last file to be written: a folder is a run from then on. What is of one call only is left out."""
+    """Write the configuration, which makes a folder a run, without the arguments of one call."""
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
 def versions() -> dict[str, str]:
-    """Versions of what results depend on."""
+    """Return the versions of Python and of the packages that results depend on."""
     return {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in PACKAGES},

@@ -1,4 +1,4 @@
-"""Training an agent, from a configuration to a run folder."""
+"""Training of an agent, from a configuration to a run folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
@@ -20,6 +19,7 @@ from viapoint.training.algorithms.model_io import build
 from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.discount import ELAPSED
+from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import Monitor, TrainingStoppedError
@@ -32,15 +32,15 @@ __all__ = [
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
 MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
-"""What a call that resumes a run may tell anew."""
+"""Fields that may differ when a run is resumed."""
 UNFIT = (
     ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
 )  # fmt: skip
-"""What libraries raise where a network or a buffer cannot be as it was asked for."""
+"""Errors of libraries for networks or buffers that cannot be built."""
 
 
 class TrainingFailedError(Exception):
-    """Training could not go on, for example for want of disk space; what was saved before is whole."""
+    """Training could not continue, for example because the disk is full; files saved before are intact."""
 
 
 def train(config: TrainConfig, callback: Callbacks = None) -> Run:
@@ -96,7 +96,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
 
 
 def resolved(config: TrainConfig) -> TrainConfig:
-    """A configuration with everything that it left to the preset written out, as a run keeps it."""
+    """Return a configuration in which the values of the preset replace None, as a run stores it."""
     return dataclasses.replace(
         config,
         n_timesteps=config.total_timesteps,
@@ -109,7 +109,7 @@ def resolved(config: TrainConfig) -> TrainConfig:
 
 
 def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
-    """The untrained model that a resolved configuration asks for."""
+    """Return the untrained model of a resolved configuration."""
     return build(
         config.algo,
         config.preset.policy,
@@ -121,7 +121,7 @@ def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
-    """Refuse to resume a run with settings that are not its own.
+    """Check that a run is resumed with its own settings.
 
     Args:
         run: To be resumed.
@@ -149,19 +149,8 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread: fastest for small networks, and the same numbers on any number of cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
 def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
-    """The untrained model that a resolved configuration asks for, on environments of its own.
+    """Build the untrained model of a resolved configuration with its own environments, and close them at the end.
 
     Raises:
         ValueError: There is no such environment or model.
@@ -188,7 +177,7 @@ def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 
 
 def _check_tells_time(config: TrainConfig) -> None:
-    """Refuse discounts by time where the first decision does not tell how long it took."""
+    """Check that decisions report their duration if discounts depend on time."""
     if config.discount_unit is None:
         return
     env = ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)
@@ -221,13 +210,13 @@ def _carry_on(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
 
 
 def _told(record: dict[str, Any], field: str, name: str) -> str:
-    """A setting as it is said: a field, or one name in a field of several."""
+    """Return a setting in words: a field, or one name in a field with several."""
     values = record if field == name else record[field]
     return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
 
 
 def _take_up(run: Run, config: TrainConfig) -> None:
-    """Go on with a run's own configuration but for what this call may change.
+    """Take over a run's own configuration, except for fields that may change.
 
     Raises:
         BadFileError: The call asks for something else, or for fewer decisions than there are.
