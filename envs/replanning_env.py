@@ -314,7 +314,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
             return super()._render_one(sim)
-        return self._renderer.episode(sim, self.scenes.take([sim]), self._history[sim], self._rollout(sim))
+        return self._renderer.episode(self.scenes.take([sim]), self._history[sim], self._rollout(sim))
 
 
 class OnlineReachEnv(MultiStepEnv):

@@ -272,9 +272,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
             assert self.scenes is not None
-            return self._renderer.still(sim, self.scenes.take([sim]))
+            return self._renderer.still(self.scenes.take([sim]))
         scenes, plan = self._last.scenes.take([sim]), self._last.plan.take([sim])
-        return self._renderer.movement(sim, scenes, plan, self._executor.rollout(self._last, sim))
+        return self._renderer.movement(scenes, plan, self._executor.rollout(self._last, sim))
 
     def _check_running(self) -> Scenes:
         if self.scenes is None:

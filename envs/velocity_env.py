@@ -254,7 +254,7 @@ class StepReachVectorEnv(MultiStepVectorEnv):
         plan = self.last_plan
         assert plan is not None
         scene = self.scenes.take([sim])
-        return self._renderer.movement(sim, scene, plan.take([sim]), self._rollout(sim))
+        return self._renderer.movement(scene, plan.take([sim]), self._rollout(sim))
 
 
 class StepReachEnv(MultiStepEnv):

@@ -12,7 +12,7 @@ from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float, Frame, Int
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.overlay import Movement
@@ -70,24 +70,21 @@ class MovementRenderer:
         self._canvas: Canvas | None = None
         self._window: Window | None = None
 
-    def still(self, sim: int, scene: Scenes) -> Any:
+    def still(self, scene: Scenes) -> Any:
         """Render the scene before the movement."""
-        view = self._ready()
-        view.set(scene, self._simulator.arm.inverse_kinematics(scene.start)[0])
-        return self._shown(view)
+        picture = self._draw(scene, self._simulator.arm.inverse_kinematics(scene.start)[0])
+        return {"human": None, "rgb_array_list": [picture]}.get(str(self.mode), picture)
 
-    def movement(self, sim: int, scene: Scenes, plan: Plan, rollout: Rollout) -> Any:
+    def movement(self, scene: Scenes, plan: Plan, rollout: Rollout) -> Any:
         """Render a movement."""
-        view = self._ready()
         movement = Movement.of(self._simulator.collision_model, scene, plan, rollout)
-        steps = frame_steps(rollout.time, self._fps)
-        if self.mode == "human":
-            return self._play(view, scene, movement, steps)
         if self.mode == "rgb_array":
             step = len(rollout.time) if movement.contact is None else movement.contact.step
-            view.set(scene, movement.joints[step], movement, step)
-            return self._shown(view)
-        return [self._frame(view, scene, movement, step) for step in steps]
+            return self._draw(scene, movement.joints[step], movement, step)
+        steps = frame_steps(rollout.time, self._fps)
+        if self.mode == "human":
+            return self._play(scene, movement, steps)
+        return [self._draw(scene, movement.joints[step], movement, step) for step in steps]
 
     def close(self) -> None:
         """Close window and OpenGL context; the next picture opens them again."""
@@ -108,23 +105,16 @@ class MovementRenderer:
             self._view = view
         return self._view
 
-    def _shown(self, view: SceneView) -> Any:
-        """Return or show the scene in the form of the render mode."""
-        if self._window is not None:
-            self._window.show(view.scene)
-            return None
-        assert self._canvas is not None
-        frame = self._canvas.draw(view.scene)
-        return [frame] if self.mode == "rgb_array_list" else frame
+    def _draw(self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0) -> Any:
+        """Return a picture, or show it in the window and return False after the window has been closed."""
+        view = self._ready()
+        view.set(scene, joints, movement, step)
+        screen = self._window or self._canvas
+        assert screen is not None
+        return screen.show(view.scene) if isinstance(screen, Window) else screen.draw(view.scene)
 
-    def _frame(self, view: SceneView, scene: Scenes, movement: Movement, step: int) -> Frame:
-        assert self._canvas is not None
-        view.set(scene, movement.joints[step], movement, step)
-        return self._canvas.draw(view.scene)
-
-    def _play(self, view: SceneView, scene: Scenes, movement: Movement, steps: Int) -> None:
+    def _play(self, scene: Scenes, movement: Movement, steps: Int) -> None:
         """Play the film in the window in real time; late frames are left out."""
-        assert self._window is not None
         begin = time.monotonic()
         for number, step in enumerate(steps):
             late = time.monotonic() - begin - number / self._fps
@@ -132,8 +122,7 @@ class MovementRenderer:
                 continue
             if late < 0.0:
                 time.sleep(-late)
-            view.set(scene, movement.joints[step], movement, step)
-            if not self._window.show(view.scene):
+            if not self._draw(scene, movement.joints[step], movement, step):
                 return
 
 
@@ -176,14 +165,14 @@ class EpisodeRenderer(MovementRenderer):
 
     view_class = ReplanningSceneView
 
-    def episode(self, sim: int, changing: ChangingScenes, history: History, rollout: Rollout) -> Any:
+    def episode(self, changing: ChangingScenes, history: History, rollout: Rollout) -> Any:
         """Render the episode so far."""
         view = self._ready()
         assert isinstance(view, ReplanningSceneView)
         view.changing, view.history = changing, history
         touched = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
         scene = changing.at(np.array([touched * float(view.model.opt.timestep)]))
-        return self.movement(sim, scene, history[-1][1].plan, rollout)
+        return self.movement(scene, history[-1][1].plan, rollout)
 
 
 def _path(plan: MovingPlan) -> Float:
