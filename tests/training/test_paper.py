@@ -1,4 +1,4 @@
-"""The paper reproduced: every number of the table against its promise, and the command from words to files."""
+"""The paper reproduced: every number of the table against its expected range, and the command with its files."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from viapoint.training.paper.passage_polynomial import count_roots, passage_poly
 from viapoint.training.paper.profiles import Profile
 from viapoint.training.paper.reference_movements import construction, via_waypoints
 from viapoint.training.paper.rows import obstacles
-from viapoint.training.paper.rows.double_step import double_step, excess
+from viapoint.training.paper.rows.double_step import double_step, excess_cost
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
 GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"
@@ -38,7 +38,7 @@ def claims_of(folder):
     return json.loads((folder / "table.json").read_text())["claims"]
 
 
-def kept(value, ends):
+def is_within(value, ends):
     low, high = ends
     return (low is None or value >= low) and (high is None or value <= high)
 
@@ -48,7 +48,7 @@ def test_every_number_is_as_promised(made):
         numbers = [name for name in ("model", "arm") if claim[name] is not None]
         assert numbers, claim["claim"]
         for name in numbers:
-            assert kept(claim[name], claim[f"{name}_promised"]), claim
+            assert is_within(claim[name], claim[f"{name}_expected"]), claim
         assert claim["verdict"] == "holds"
         assert (claim["arm"] is None) == (claim["deviation_mm"] is None)
 
@@ -94,7 +94,7 @@ def test_the_files_are_complete(made):
     table = (made / "table.md").read_text()
     assert table.count("| holds |") == len(claims_of(made))
     small = list((made / "guide").glob("paper_*.png"))
-    assert {path.stem for path in small} == {f"paper_{name}" for name in run.IN_THE_GUIDE}
+    assert {path.stem for path in small} == {f"paper_{name}" for name in run.GUIDE_FIGURES}
     assert sum(path.stat().st_size for path in small) < 600_000
 
 
@@ -114,7 +114,7 @@ def test_the_guide_says_what_the_command_computes(made):
 
 def test_the_pictures_of_the_guide_are_there_and_small():
     shown = re.findall(r"!\[.+?\]\((images/paper_\w+\.png)\)", GUIDE.read_text())
-    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in run.IN_THE_GUIDE}
+    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in run.GUIDE_FIGURES}
     assert sum((GUIDE.parent / path).stat().st_size for path in shown) < 600_000
 
 
@@ -127,11 +127,11 @@ def test_row_12_has_at_least_200_scenes():
 
 
 def test_a_claim_fails_where_a_number_is_not_as_promised():
-    holds = Claim(row=1, claim="x", model=1.0, promise=near(1.0, 0.1), arm=2.0, arm_promise=at_least(2.0))
+    holds = Claim(row=1, claim="x", model=1.0, expected=near(1.0, 0.1), arm=2.0, arm_expected=at_least(2.0))
     assert holds.verdict == "holds"
     for model, arm in ((1.2, 2.0), (1.0, 1.9), (np.nan, 2.0), (1.0, np.nan)):
         claim = Claim(
-            row=1, claim="x", model=model, promise=near(1.0, 0.1), arm=arm, arm_promise=at_least(2.0)
+            row=1, claim="x", model=model, expected=near(1.0, 0.1), arm=arm, arm_expected=at_least(2.0)
         )
         assert claim.verdict == "FAILS"
     with pytest.raises(ValueError, match="belong together"):
@@ -141,7 +141,7 @@ def test_a_claim_fails_where_a_number_is_not_as_promised():
 
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
-    claims = [Claim(row=1, claim="too much", model=2.0, promise=at_most(1.0))]
+    claims = [Claim(row=1, claim="too much", model=2.0, expected=at_most(1.0))]
     monkeypatch.setattr(run, "reproduce", lambda *_: run.Reproduction(claims, []))
     with pytest.raises(SystemExit) as end:
         cli.main(["paper", "--out", str(tmp_path)])
@@ -193,7 +193,9 @@ def test_a_sum_of_two_movements_costs_more_than_the_plan_by_the_closed_form(mome
     movement = double_step(moment, remaining=remaining)
     more = movement.cost("superposed") - movement.cost("planned")
     assert more > 0.0
-    assert more == pytest.approx(excess(0.4, moment, 0.7, remaining), rel=1e-9)  # T1 and T4 are 40 cm apart
+    assert more == pytest.approx(
+        excess_cost(0.4, moment, 0.7, remaining), rel=1e-9
+    )  # T1 and T4 are 40 cm apart
 
 
 def test_sum_and_plan_are_the_same_where_the_arrival_stays():

@@ -1,1 +1,1 @@
-"""Flash & Hogan 1985 reproduced: every claim of the paper as a number, on the model and on the simulated arm."""
+"""Reproduction of Flash & Hogan 1985: every claim as a number, on the model and on the simulated arm."""

@@ -1,4 +1,4 @@
-"""One line of the table: what the paper says, what comes out, and whether it holds."""
+"""Claims of the paper with their computed numbers and expected ranges."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
-class Promise:
-    """The values that a number may have: everything from `low` to `high`."""
+class ExpectedRange:
+    """Range of values that a number may have, from `low` to `high`."""
 
     low: float = -np.inf
     high: float = np.inf
 
-    def kept(self, value: float) -> bool:
-        """Whether a value is among them; one that is not a number never is."""
+    def contains(self, value: float) -> bool:
+        """Return whether a value is in the range; NaN never is."""
         return bool(self.low <= value <= self.high)
 
     def __str__(self) -> str:
@@ -26,72 +26,76 @@ class Promise:
         return f"at most {self.high:.4g}" if np.isfinite(self.high) else f"at least {self.low:.4g}"
 
 
-def near(value: float, tolerance: float) -> Promise:
-    """A value and how far off it may be."""
-    return Promise(low=value - tolerance, high=value + tolerance)
+def near(value: float, tolerance: float) -> ExpectedRange:
+    """Return the range around a value."""
+    return ExpectedRange(low=value - tolerance, high=value + tolerance)
 
 
-def at_most(value: float) -> Promise:
-    """Everything up to a value."""
-    return Promise(high=value)
+def at_most(value: float) -> ExpectedRange:
+    """Return the range up to a value."""
+    return ExpectedRange(high=value)
 
 
-def at_least(value: float) -> Promise:
-    """Everything from a value on."""
-    return Promise(low=value)
+def at_least(value: float) -> ExpectedRange:
+    """Return the range from a value on."""
+    return ExpectedRange(low=value)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """A statement with its number on the model and, where it can be carried out, on the simulated arm."""
+    """Statement with its number on the model and, where it can be simulated, on the arm."""
 
     row: int
-    """Which of the subjects it belongs to."""
+    """Number of its subject in SUBJECTS."""
     claim: str
-    """Worded so that it is exact, or says what it holds approximately."""
+    """Text of the statement; it says where the statement is only approximate."""
     figure: str = "-"
-    """Of the paper."""
+    """Figure of the paper."""
     paper: str = "-"
-    """What the paper says or measured."""
+    """Statement or measurement of the paper."""
     unit: str = ""
-    """Of the numbers."""
+    """Unit of the numbers."""
     model: float | None
-    """On the model; None where there is nothing to compute without an arm."""
-    promise: Promise | None = None
-    """What the model's number must be."""
+    """Number on the model; None where it needs an arm."""
+    expected: ExpectedRange | None = None
+    """Expected range of the model's number."""
     arm: float | None = None
-    """On the simulated arm; None where it is a statement about the mathematics alone."""
-    arm_promise: Promise | None = None
-    """What the arm's number must be."""
+    """Number on the simulated arm; None for statements about the mathematics alone."""
+    arm_expected: ExpectedRange | None = None
+    """Expected range of the arm's number."""
     deviation: float | None = None
     """Greatest distance of the simulated hand from the plan, [mm]."""
 
     @property
     def holds(self) -> bool:
-        """Whether every number is as promised; a number without a promise, or the reverse, is an error."""
-        pairs = ((self.model, self.promise), (self.arm, self.arm_promise))
+        """Truth of the claim: every number is in its expected range.
+
+        Raises:
+            ValueError: There is no number, or a number without an expected range or the reverse.
+        """
+        pairs = ((self.model, self.expected), (self.arm, self.arm_expected))
         if all(value is None for value, _ in pairs):
             raise ValueError(f"claim without a number: {self.claim}")
-        if any((value is None) != (promise is None) for value, promise in pairs):
-            raise ValueError(f"a number and its promise belong together: {self.claim}")
-        return all(promise.kept(value) for value, promise in pairs if promise and value is not None)
+        if any((value is None) != (expected is None) for value, expected in pairs):
+            raise ValueError(f"a number and its expected range belong together: {self.claim}")
+        return all(expected.contains(value) for value, expected in pairs if expected and value is not None)
 
     @property
     def verdict(self) -> str:
-        """In a word."""
+        """Verdict in one word."""
         return "holds" if self.holds else "FAILS"
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; open ends of a promise are null."""
+        """Return plain values for JSON; open ends of a range are null."""
         record: dict[str, Any] = {
             name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")
         }
-        for name, value, promise in (
-            ("model", self.model, self.promise),
-            ("arm", self.arm, self.arm_promise),
+        for name, value, expected in (
+            ("model", self.model, self.expected),
+            ("arm", self.arm, self.arm_expected),
         ):
             record[name] = None if value is None else float(value)
-            record[f"{name}_promised"] = None if promise is None else _ends(promise)
+            record[f"{name}_expected"] = None if expected is None else _ends(expected)
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
 
@@ -111,20 +115,20 @@ SUBJECTS = {
     12: "Obstacle avoidance",
     13: "A target that jumps on the way (Flash & Henis 1991)",
 }
-"""Twelve rows of Flash & Hogan 1985, and one of what followed from it."""
+"""Titles of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
 
 
-def _ends(promise: Promise) -> list[float | None]:
-    return [end if np.isfinite(end) else None for end in (promise.low, promise.high)]
+def _ends(expected: ExpectedRange) -> list[float | None]:
+    return [end if np.isfinite(end) else None for end in (expected.low, expected.high)]
 
 
 class Reproduction(NamedTuple):
-    """All claims, and the pictures (PNG) with their captions."""
+    """Claims, and pictures (PNG) with their captions."""
 
     claims: list[Claim]
     pictures: list[tuple[Path, str]]
 
     @property
     def failed(self) -> list[Claim]:
-        """Those that do not hold."""
+        """Claims that do not hold."""
         return [claim for claim in self.claims if not claim.holds]

@@ -1,4 +1,4 @@
-"""Eq. C16 as a polynomial: the passage time t1, with exact arithmetic, and the paper's solution in closed form."""
+"""Passage time t1 as a root of Eq. C16 in exact arithmetic, and the paper's solution in closed form."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Polynomial = list[Fraction]
 
 
 def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Polynomial:
-    """Coefficients of 1, tau1, ..., tau1^9 whose root in (0, 1) is t1 / tf; start at the origin.
+    """Return the coefficients of 1, tau1, ..., tau1^9 of Eq. C16; its root in (0, 1) is t1 / tf, the start the origin.
 
     With E = x1 - x0, D = xf - x0, a = E.D, b = D.D, c = E.E, Eq. C16 (pi . u = 0) is, but for a factor that never
     vanishes, F(tau1) = c - 2 c tau1 - 8 a tau1^3 + 34 a tau1^4 - 36 a tau1^5 + (12 a - 20 b) tau1^6 + 40 b tau1^7
@@ -27,7 +27,7 @@ def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Pol
 
 
 def count_roots(polynomial: Polynomial) -> int:
-    """How many different roots lie in (0, 1): Sturm's theorem, exact. Neither end may be a root."""
+    """Return the number of different roots in (0, 1) by Sturm's theorem, exactly. Neither end may be a root."""
     chain = [_trimmed(polynomial), _trimmed([k * each for k, each in enumerate(polynomial)][1:])]
     while len(chain[-1]) > 1:
         rest = _remainder(chain[-2], chain[-1])
@@ -39,7 +39,7 @@ def count_roots(polynomial: Polynomial) -> int:
 
 
 def root_of(polynomial: Polynomial, bits: int = 60) -> float:
-    """The root in (0, 1) by bisection in exact arithmetic; the polynomial is positive at 0 and negative at 1."""
+    """Return the root in (0, 1) by exact bisection; the polynomial is positive at 0 and negative at 1."""
     low, high = Fraction(0), Fraction(1)
     for _ in range(bits):
         middle = (low + high) / 2
@@ -51,7 +51,7 @@ def root_of(polynomial: Polynomial, bits: int = 60) -> float:
 
 
 def closed_form(waypoints: Float, share: float, time: Float) -> Float:
-    """Hand position by the paper's Eqs. 4, 5 and C13 to C15 with their misprints put right.
+    """Return the hand position by the paper's Eqs. 4, 5 and C13 to C15 with their misprints corrected.
 
     Args:
         waypoints: Start, via-point and goal, shape (3, 2), [m].
@@ -77,7 +77,7 @@ def closed_form(waypoints: Float, share: float, time: Float) -> Float:
 
 
 def _trimmed(polynomial: Polynomial) -> Polynomial:
-    """Without leading zeros, scaled to the leading coefficient 1 in size: signs stay, numbers stay short."""
+    """Remove leading zeros and scale the leading coefficient to size 1, which keeps signs and short numbers."""
     last = max((k for k, each in enumerate(polynomial) if each), default=-1)
     return [each / abs(polynomial[last]) for each in polynomial[: last + 1]]
 

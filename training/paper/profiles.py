@@ -1,4 +1,4 @@
-"""What can be read off a speed and a curvature profile, sampled from the model or from the simulated arm."""
+"""Speed and curvature profiles of the model and of the simulated arm."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory
-from viapoint.training.paper.simulated import Performed
+from viapoint.training.paper.simulated import SimulatedMovements
 
 EDGE = 0.08
-"""Part of the duration left out at both ends: there the curvature of a movement from rest has no bound
-(it grows as t^-2), so its greatest value is a local maximum inside."""
+"""Fraction of the duration left out at both ends, where the curvature of a movement from rest has no bound.
+
+It grows as t^-2, so the curvature peak is the greatest local maximum inside.
+"""
 SAMPLES = 2001
 
 
@@ -20,7 +22,7 @@ class Profile(NamedTuple):
     """Speed and curvature of one movement at T instants."""
 
     time: Float
-    """As parts of the duration, shape (T,)."""
+    """Instants as fractions of the duration, shape (T,)."""
     speed: Float
     """[m/s]"""
     curvature: Float
@@ -30,7 +32,10 @@ class Profile(NamedTuple):
 
     @classmethod
     def of(cls, time: Float, position: Float, velocity: Float, acceleration: Float) -> Profile:
-        """From hand position, velocity and acceleration, shape (T, 2), at parts of the duration."""
+        """Return the profile of hand position, velocity and acceleration, shape (T, 2), at fractions of the duration.
+
+        kappa = |x' y'' - y' x''| / |v|^3
+        """
         speed = np.linalg.norm(velocity, axis=-1)
         turn = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
         safe = np.maximum(speed, 1e-9)
@@ -38,7 +43,7 @@ class Profile(NamedTuple):
 
     @property
     def valley(self) -> float:
-        """When the speed is least between its peaks, as a part of the duration; NaN without a valley."""
+        """Time of the least speed between two peaks, as a fraction of the duration; NaN without a valley."""
         places = _peaks(self.time, -self.speed)
         return places[0][0] if places else np.nan
 
@@ -55,30 +60,30 @@ class Profile(NamedTuple):
 
     @property
     def bend(self) -> tuple[float, float]:
-        """When the curvature has its greatest local maximum, and how great it is [1/m]; NaN without one."""
+        """Time and height [1/m] of the greatest local maximum of the curvature; NaN without one."""
         places = _peaks(self.time, self.curvature)
         return places[0] if places else (np.nan, np.nan)
 
     def place(self, time: float) -> Float:
-        """Hand position at a part of the duration, shape (2,), [m]."""
+        """Return the hand position at a fraction of the duration, shape (2,), [m]."""
         return np.array([np.interp(time, self.time, self.position[:, i]) for i in (0, 1)])
 
 
 def model_profile(movement: Trajectory) -> Profile:
-    """Of a single movement of the model."""
+    """Return the profile of a single movement of the model."""
     position, velocity, acceleration = movement.sample(SAMPLES)
     return Profile.of(np.linspace(0.0, 1.0, SAMPLES), position, velocity, acceleration)
 
 
-def arm_profile(done: Performed, row: int = 0) -> Profile:
-    """Of one movement of the simulated arm."""
-    within = done.time <= done.duration[row] + 1e-9
-    fields = (part[row, within] for part in (done.hand, done.velocity(), done.acceleration()))
-    return Profile.of(done.time[within] / done.duration[row], *fields)
+def arm_profile(motion: SimulatedMovements, row: int = 0) -> Profile:
+    """Return the profile of one movement of the simulated arm."""
+    within = motion.time <= motion.duration[row] + 1e-9
+    fields = (part[row, within] for part in (motion.hand, motion.velocity(), motion.acceleration()))
+    return Profile.of(motion.time[within] / motion.duration[row], *fields)
 
 
 def _peaks(time: Float, value: Float) -> list[tuple[float, float]]:
-    """Local maxima away from the ends, the highest first; a parabola through three samples places them."""
+    """Return time and height of local maxima away from the ends, the highest first, by parabolas through samples."""
     inner = (time > EDGE) & (time < 1.0 - EDGE)
     index = np.flatnonzero(inner[1:-1] & (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])) + 1
     found = []

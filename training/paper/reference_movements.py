@@ -1,4 +1,4 @@
-"""The movements of the paper: between its targets, straight or through a via-point."""
+"""Movements of the paper between its targets, straight or through a via-point."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from viapoint.primitives import Trajectory, passage_durations, point_to_point, t
 
 
 def target(name: str) -> Float:
-    """Place of one of the paper's targets T1 to T6, shape (2,), [m]."""
+    """Return the position of one of the paper's targets T1 to T6, shape (2,), [m]."""
     return np.asarray(TARGETS[name], dtype=np.float64)
 
 
 def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
-    """The unconstrained movement between two targets (Eq. 2); order 2, 3, 4 = least acceleration, jerk, snap."""
+    """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
     return point_to_point(target(first), target(last), duration, order=order)
 
 
 def via_waypoints(start: ArrayLike, goal: ArrayLike, along: ArrayLike, height: ArrayLike) -> Float:
-    """Start, via-point and goal from the construction in Fig. 1B.
+    """Return start, via-point and goal by the construction of Fig. 1B.
 
     Args:
         start: Shape (2,), [m].
@@ -44,7 +44,7 @@ def via_waypoints(start: ArrayLike, goal: ArrayLike, along: ArrayLike, height: A
 
 
 def construction(waypoints: Float) -> tuple[Float, Float]:
-    """d1 / (d1 + d2) and d3 / (d1 + d2), unsigned, of waypoints (..., 3, 2): the inverse of `via_waypoints`."""
+    """Return d1 / (d1 + d2) and unsigned d3 / (d1 + d2) of waypoints (..., 3, 2), the inverse of `via_waypoints`."""
     line = waypoints[..., 2, :] - waypoints[..., 0, :]
     offset = waypoints[..., 1, :] - waypoints[..., 0, :]
     square = (line * line).sum(axis=-1)
@@ -52,16 +52,16 @@ def construction(waypoints: Float) -> tuple[Float, Float]:
     return (line * offset).sum(axis=-1) / square, np.abs(turn) / square
 
 
-def smoothest(waypoints: ArrayLike, duration: Any = 1.0) -> Trajectory:
-    """The movement through (..., K + 2, 2) waypoints [m] with free passage times (Eqs. 4, 5 and C16)."""
+def minimum_jerk_through(waypoints: ArrayLike, duration: Any = 1.0) -> Trajectory:
+    """Return the movement through (..., K + 2, 2) waypoints [m] with free passage times (Eqs. 4, 5 and C16)."""
     return through(waypoints, passage_durations(waypoints, duration))
 
 
 def curved(first: str, last: str, along: ArrayLike, height: ArrayLike, duration: Any = 1.0) -> Trajectory:
-    """The movement between two targets through a via-point, see :func:`via_waypoints`."""
-    return smoothest(via_waypoints(target(first), target(last), along, height), duration)
+    """Return the movement between two targets through a via-point, see :func:`via_waypoints`."""
+    return minimum_jerk_through(via_waypoints(target(first), target(last), along, height), duration)
 
 
 def passage_share(movement: Trajectory) -> Float:
-    """t1 / (t1 + t2) of movements through one via-point, shape (...,)."""
+    """Return t1 / (t1 + t2) of movements through one via-point, shape (...,)."""
     return np.asarray(movement.knots[..., 1] / movement.knots[..., 2])

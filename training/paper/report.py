@@ -1,4 +1,4 @@
-"""The table as Markdown, JSON and a page of HTML that needs no other file."""
+"""Table of claims as Markdown, as JSON and as a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 
 TITLE = "Flash & Hogan 1985, reproduced"
 HEADINGS = (
-    "row", "claim", "paper's figure", "paper", "model", "promised", "simulated arm", "promised", "hand off plan [mm]",
+    "row", "claim", "paper's figure", "paper", "model", "expected", "simulated arm", "expected", "hand off plan [mm]",
     "verdict",
 )  # fmt: skip
 NOTE = (
     "Model: the minimum-jerk movement, in closed form. Simulated arm: a two-joint arm in MuJoCo that tracks it; "
     "“hand off plan” is the greatest distance of its hand from the plan. A claim holds if every number of its line "
-    "is as promised. Where a statement of the paper is only approximate, the claim says so and its number "
+    "is in its expected range. Where a statement of the paper is only approximate, the claim says so and its number "
     "says by how much."
 )
 STYLE = """
@@ -44,23 +44,23 @@ def write(reproduction: Reproduction, out: Path) -> list[Path]:
 
 
 def cells(claim: Claim) -> list[str]:
-    """The cells of one line."""
+    """Return the cells of one line."""
     return [
         str(claim.row),
         claim.claim,
         claim.figure,
         claim.paper,
         _number(claim.model, claim.unit),
-        _or_dash(claim.promise),
+        _or_dash(claim.expected),
         _number(claim.arm, claim.unit),
-        _or_dash(claim.arm_promise),
+        _or_dash(claim.arm_expected),
         "-" if claim.deviation is None else f"{claim.deviation:.2f}",
         claim.verdict,
     ]
 
 
 def markdown(claims: list[Claim]) -> str:
-    """The table as a document."""
+    """Return the table as a Markdown document."""
     lines = [list(HEADINGS), ["---"] * 4 + ["---:"] * 5 + ["---"]]
     lines += [[cell.replace("|", "\\|") for cell in cells(claim)] for claim in claims]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
@@ -68,12 +68,12 @@ def markdown(claims: list[Claim]) -> str:
 
 
 def summary(claims: list[Claim]) -> str:
-    """How many hold."""
+    """Return a sentence with the number of claims that hold."""
     return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
 
 
 def page(reproduction: Reproduction) -> str:
-    """A page of HTML with the pictures inside."""
+    """Return an HTML page with embedded pictures."""
     rows, subject = [], 0
     for claim in reproduction.claims:
         if claim.row != subject:

@@ -25,11 +25,10 @@ from viapoint.training.paper.rows import (
     double_step,
     limits,
     obstacles,
-    online,
     straight,
     timing,
 )
-from viapoint.training.paper.rows.obstacles import Decided, check_agent
+from viapoint.training.paper.rows.obstacles import ObstacleMovements, check_agent
 from viapoint.training.runs import trainer as training
 
 ROWS: dict[int, Callable[[], list[Claim]]] = {
@@ -43,22 +42,22 @@ ROWS: dict[int, Callable[[], list[Claim]]] = {
     8: timing.scaling_claims,
     9: alternatives.alternative_claims,
     10: limits.limit_claims,
-    11: online.online_claims,
+    11: double_step.online_claims,
     13: double_step.double_step_claims,
 }
-"""The rows that need no agent; row 12 comes with its movements."""
+"""Functions of the rows without an agent; row 12 needs its movements."""
 
 
 class Drawing(NamedTuple):
-    """A figure by its file name, with its caption."""
+    """Figure with its file name and caption."""
 
     name: str
     caption: str
-    draw: Callable[[Decided], Figure]
+    draw: Callable[[ObstacleMovements], Figure]
 
 
-def _plain(draw: Callable[[], Figure]) -> Callable[[Decided], Figure]:
-    return lambda decided: draw()
+def _plain(draw: Callable[[], Figure]) -> Callable[[ObstacleMovements], Figure]:
+    return lambda avoidance: draw()
 
 
 DRAWINGS = (
@@ -86,8 +85,6 @@ DRAWINGS = (
             "(D).", _plain(other.alternatives)),
     Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
             "the torques of both (C, D; limits dotted).", _plain(other.limits)),
-    Drawing("online", "The target jumps on the way (dot) and the movement follows without a jerk.",
-            _plain(other.online)),
     Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
             "after its start: by a second movement that is added, or by one new plan with the same arrival.",
             _plain(double.paths_and_speeds)),
@@ -95,30 +92,30 @@ DRAWINGS = (
             "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
             _plain(double.comparison)),
 )  # fmt: skip
-"""Every figure, in the order of the paper."""
+"""Figures in the order of the paper."""
 
 
-def reproduce(out: Path, agent: Path | None, tell: Callable[[str], None]) -> Reproduction:
+def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
     """Compute every row and draw every figure.
 
     Args:
         out: Folder for the figures.
         agent: Run folder of the agent of row 12.
-        tell: Called with the name of each step when it begins; there are `STEPS` of them.
+        report_step: Function that is called with the name of each of the `STEPS` steps when it begins.
     """
     claims: list[Claim] = []
     for row, compute in ROWS.items():
-        tell(f"row {row}")
+        report_step(f"row {row}")
         claims += compute()
-    tell("row 12")
-    decided = obstacles.decide(agent)
-    claims += obstacles.obstacle_claims(decided)
+    report_step("row 12")
+    avoidance = obstacles.decide(agent)
+    claims += obstacles.obstacle_claims(avoidance)
     claims.sort(key=lambda claim: claim.row)
     pictures = []
     for drawing in DRAWINGS:
-        tell(drawing.name)
+        report_step(drawing.name)
         with mpl.rc_context(STYLE):
-            picture, _ = save(drawing.draw(decided), out, drawing.name)
+            picture, _ = save(drawing.draw(avoidance), out, drawing.name)
         pictures.append((picture, drawing.caption))
     return Reproduction(claims, pictures)
 
@@ -126,35 +123,35 @@ def reproduce(out: Path, agent: Path | None, tell: Callable[[str], None]) -> Rep
 STEPS = len(ROWS) + 1 + len(DRAWINGS)
 
 
-IN_THE_GUIDE = (
+GUIDE_FIGURES = (
     "fig01_model", "fig03_straight", "fig04_joints", "fig05_height", "fig06_place", "fig08_obstacles",
     "fig10_isochrony", "valleys", "alternatives", "limits", "double_step", "double_step_jerk",
 )  # fmt: skip
-"""The figures that docs/flash-hogan.md shows."""
+"""Figures of docs/flash-hogan.md."""
 
 
 class ClaimsFailedError(Exception):
-    """Some claims do not hold; what was computed is written all the same."""
+    """Error after a run in which some claims do not hold; all results are written."""
 
     exit_code = 1
 
 
 def run(config: PaperConfig) -> None:
-    """Compute, draw, write, and end with an error if a verdict fails.
+    """Compute the claims, draw and write them, and raise an error if a claim does not hold.
 
     Raises:
-        ValueError: There is no such agent, or it cannot move around the paper's lights; nothing is computed.
+        ValueError: The agent does not exist or its task is unsuitable; nothing is computed.
         ClaimsFailedError: A claim does not hold.
     """
     if config.agent is not None:
         check_agent(config.agent)
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, training.one_thread():
 
-        def tell(name: str) -> None:
+        def report_step(name: str) -> None:
             bar.set_description(name)
             bar.update()
 
-        result = reproduce(config.out, config.agent, tell)
+        result = reproduce(config.out, config.agent, report_step)
     pages = write(result, config.out)
     if config.guide is not None:
         write_guide(result, config.guide)
@@ -165,9 +162,9 @@ def run(config: PaperConfig) -> None:
 
 
 def write_guide(result: Reproduction, folder: Path) -> None:
-    """Small versions of the figures for the guide: paper_*.png with few colours."""
+    """Write small versions of the figures for the guide, paper_*.png with few colours."""
     folder.mkdir(parents=True, exist_ok=True)
     for path, _ in result.pictures:
-        if path.stem in IN_THE_GUIDE:
+        if path.stem in GUIDE_FIGURES:
             small = Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE)
             small.save(folder / f"paper_{path.name}", optimize=True)

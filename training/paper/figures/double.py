@@ -1,4 +1,4 @@
-"""Targets that jump on the way: the sum of two movements beside the plan revised."""
+"""Figures of targets that jump: the sum of two movements beside the revised plan."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from viapoint.training.paper.rows.double_step import (
     MOMENTS,
     NAMES,
     DoubleStep,
-    apart,
     double_step,
+    greatest_distance,
     peak_speed,
-    perform_double,
+    simulate_double,
 )
-from viapoint.training.paper.simulated import Performed
+from viapoint.training.paper.simulated import SimulatedMovements
 
 SUM: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 1.1}
-"""The superposition."""
+"""Style of the superposition."""
 PART: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 0.6, "linestyle": ":"}
-"""One of the two movements that it is made of."""
+"""Style of its two parts."""
 NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}
-"""The moment of revision."""
+"""Style of the moment of revision."""
 SECONDS = (0.7, 0.85, 1.0)
 """Durations of the second movement, [s]."""
 
 
 def paths_and_speeds() -> Figure:
-    """Hand paths and speeds for four moments of revision."""
+    """Draw hand paths and speeds for four moments of revision."""
     figure, axes = sheet(len(MOMENTS), 2, 12.0, width_ratios=(1.25, 1.0), sharex="col", sharey="col")
     for row, moment in zip(axes, MOMENTS, strict=True):
         movement = double_step(moment)
-        done = perform_double(movement)
-        _paths(row[0], movement, done)
-        _speeds(row[1], movement, done)
+        motion = simulate_double(movement)
+        _paths(row[0], movement, motion)
+        _speeds(row[1], movement, motion)
         row[0].annotate(f"{1e3 * moment:.0f} ms", (-33.5, 52.5), color=THIRD, fontweight="bold")
     for ax in axes[:-1].flat:
         ax.set_xlabel("")
@@ -49,24 +49,24 @@ def paths_and_speeds() -> Figure:
     return figure
 
 
-def _paths(ax: Axes, movement: DoubleStep, done: Performed) -> None:
+def _paths(ax: Axes, movement: DoubleStep, motion: SimulatedMovements) -> None:
     plane(ax, names=NAMES)
     time = np.linspace(0.0, movement.arrival, 401)
     path(ax, movement.planned(time), **MODEL)
-    path(ax, done.hand[1], **ARM)
+    path(ax, motion.hand[1], **ARM)
     path(ax, movement.superposed(time), **SUM)
     dot(ax, np.asarray(movement.first(movement.moment)))
     ax.set(xlim=(-36.0, 13.0), ylim=(36.0, 63.0), yticks=[40, 50, 60])
 
 
-def _speeds(ax: Axes, movement: DoubleStep, done: Performed) -> None:
+def _speeds(ax: Axes, movement: DoubleStep, motion: SimulatedMovements) -> None:
     time = np.linspace(0.0, movement.arrival, 601)
 
     def speed(velocity: Any) -> Any:
         return np.linalg.norm(velocity, axis=-1)
 
     ax.plot(time, speed(movement.planned(time, 1)), label="plan revised", **MODEL)
-    ax.plot(done.time, speed(done.velocity()[1]), label="simulated arm", **ARM)
+    ax.plot(motion.time, speed(motion.velocity()[1]), label="simulated arm", **ARM)
     ax.plot(time, speed(movement.superposed(time, 1)), label="sum", **SUM)
     for begins, each in ((0.0, movement.first), (movement.moment, movement.second)):
         own = np.linspace(0.0, float(each.duration), 201)
@@ -83,7 +83,7 @@ def _speeds(ax: Axes, movement: DoubleStep, done: Performed) -> None:
 
 
 def comparison() -> Figure:
-    """What the sum costs, and how far it is from the plan, against the moment of revision."""
+    """Draw the cost of the sum and its distance from the plan against the moment of revision."""
     figure, axes = sheet(2, 2, 8.4)
     _jerk(axes[0, 0], double_step(0.2))
     moments = np.linspace(0.005, DURATION - 0.02, 60)
@@ -91,7 +91,7 @@ def comparison() -> Figure:
         every = [double_step(float(moment), remaining=remaining) for moment in moments]
         style = {"color": PALETTE.contact, "linewidth": width, "label": f"{remaining:g} s"}
         axes[0, 1].plot(moments, [each.ratio for each in every], **style)
-        axes[1, 0].plot(moments, [100.0 * apart(each) for each in every], **style)
+        axes[1, 0].plot(moments, [100.0 * greatest_distance(each) for each in every], **style)
         if remaining == DURATION:
             _peaks(axes[1, 1], moments, every)
     axes[0, 1].axhline(1.0, color="0.6", linewidth=0.6, linestyle=":", zorder=0)
@@ -105,7 +105,7 @@ def comparison() -> Figure:
 
 
 def _jerk(ax: Axes, movement: DoubleStep) -> None:
-    """Along the first movement, where all the difference is."""
+    """Draw the jerk along the first movement, which has all of the difference."""
     time = np.linspace(0.0, movement.arrival, 1_801)
     ax.axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
     ax.plot(time, movement.planned(time, 3)[:, 0], **MODEL, label="plan revised")

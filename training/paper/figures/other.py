@@ -1,4 +1,4 @@
-"""Figure 10, and those of what the paper says in words: alternatives, limits, movements that change on the way."""
+"""Figure 10, and figures of statements in the text: alternatives and limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from viapoint.training.paper.figures.style import (
     MODEL,
     SECOND,
     THIRD,
-    dot,
     letters,
     path,
     plane,
@@ -26,10 +25,9 @@ from viapoint.training.paper.reference_movements import curved, passage_share, s
 from viapoint.training.paper.rows.alternatives import PEAKS, diagonal_ends, joint_space
 from viapoint.training.paper.rows.curved import ENDS
 from viapoint.training.paper.rows.limits import HURRY, SWING, SWINGS, swings, torque_limited
-from viapoint.training.paper.rows.obstacles import Decided, features
-from viapoint.training.paper.rows.online import ARRIVAL, SWITCH, jump, perform_jump
+from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
 from viapoint.training.paper.rows.timing import HEIGHT, LENGTHS, SHARES, TYPICAL, arm_shares
-from viapoint.training.paper.simulated import perform
+from viapoint.training.paper.simulated import simulate
 
 DOTS = {"linestyle": "none", "marker": "o", "markersize": 2.2, "color": PALETTE.executed, "zorder": 5}
 FAINT = {
@@ -45,16 +43,16 @@ SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))
 """Mean and standard deviation of the residuals in the paper's Figs. 10B and 10D."""
 
 
-def isochrony(decided: Decided) -> Figure:
-    """Fig. 10: passage times and how far the simulated arm is off them."""
+def isochrony(avoidance: ObstacleMovements) -> Figure:
+    """Draw Fig. 10: passage times and their residuals on the simulated arm."""
     figure, axes = sheet(2, 2, 8.4)
-    found = features(decided.executed, decided.scenes)
+    found = features(avoidance.executed, avoidance.scenes)
     along = np.linspace(0.001, 0.999, 400)
     for height, width in ((0.1, 0.6), (-HEIGHT, 2.2), (1.0, 1.1)):
         share = passage_share(curved(*ENDS, along, height))
         axes[0, 0].plot(along, share, color=PALETTE.plan, linewidth=width, label=f"{height:g}")
     axes[0, 0].plot(found.via[:, 0], found.bend, **FAINT)
-    axes[0, 1].plot(found.via[:, 0], found.residual, label=decided.name, **FAINT)
+    axes[0, 1].plot(found.via[:, 0], found.residual, label=avoidance.name, **FAINT)
     arm, _ = arm_shares(SHARES, np.array(HEIGHT))
     axes[0, 0].plot(SHARES, arm, **DOTS)
     axes[0, 1].plot(
@@ -99,7 +97,7 @@ def _label_isochrony(axes: Float) -> None:
 
 
 def alternatives() -> Figure:
-    """Speed and acceleration of the three orders, and hand paths of least joint jerk."""
+    """Draw speed and acceleration of the three orders, and hand paths of minimum joint jerk."""
     figure, axes = sheet(2, 2, 8.4)
     time = np.linspace(0.0, 1.0, 401)
     styles = {2: (THIRD, 1.2), 3: (PALETTE.plan, 2.2), 4: (SECOND, 1.2)}
@@ -115,26 +113,28 @@ def alternatives() -> Figure:
     axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 19))
     axes[0, 1].axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
-    for ax, done in ((axes[1, 0], None), (axes[1, 1], joint_space(diagonal_ends()))):
+    for ax, motion in ((axes[1, 0], None), (axes[1, 1], joint_space(diagonal_ends()))):
         plane(ax)
         for row, (start, goal) in enumerate(diagonal_ends()):
-            line = np.stack((start, goal)) if done is None else done.planned[row]
+            line = np.stack((start, goal)) if motion is None else motion.planned[row]
             path(ax, line, **MODEL)
-            executed = perform(point_to_point(start, goal, 0.8)).hand[0] if done is None else done.hand[row]
+            executed = (
+                simulate(point_to_point(start, goal, 0.8)).hand[0] if motion is None else motion.hand[row]
+            )
             path(ax, executed, **ARM)
     letters(axes, "ABCD")
     return figure
 
 
 def limits() -> Figure:
-    """A repetitive movement, and torques at the limit and beyond."""
+    """Draw a repetitive movement, and torques at the limit and beyond."""
     figure, axes = sheet(2, 2, 8.0)
     movement = swings()
-    done = perform(movement)
-    _repetitive(axes[0, 0], done.time, np.linalg.norm(done.velocity()[0], axis=-1))
+    motion = simulate(movement)
+    _repetitive(axes[0, 0], motion.time, np.linalg.norm(motion.velocity()[0], axis=-1))
     fastest = torque_limited()
     for column, (ax, factor) in enumerate(((axes[1, 0], 1.0), (axes[1, 1], HURRY))):
-        each = perform(fastest.stretched(factor * fastest.duration))
+        each = simulate(fastest.stretched(factor * fastest.duration))
         for joint, (name, colour) in enumerate((("shoulder $S$", SECOND), ("elbow $E$", THIRD))):
             limit = ADULT.torque_limit[joint]
             ax.plot(1e3 * each.time[:-1], each.torque[0, :, joint], color=colour, label=name)
@@ -161,28 +161,3 @@ def _repetitive(ax: Axes, time: Float, speed: Float) -> None:
     ax.plot(inner, np.pi / 2 * np.abs(np.sin(np.pi * inner)), label="sinusoid", **ARM)
     ax.set(xlabel="half cycles", ylabel=r"$T\;t_f/A$", xlim=(0, SWINGS), ylim=(0, 2.5))
     ax.legend(loc="upper right", ncols=1)
-
-
-def online() -> Figure:
-    """A target that jumps on the way."""
-    figure, axes = sheet(1, 2, 4.6)
-    movement = jump()
-    done = perform_jump(movement)
-    time = np.linspace(0.0, ARRIVAL, 501)
-    position, velocity, _ = movement.at(time)
-    plane(axes[0, 0], names=("T1", "T4", "T5"))
-    path(axes[0, 0], movement.old.sample(101, 0)[0], color="0.75", linewidth=1.0)
-    path(axes[0, 0], position, **MODEL)
-    path(axes[0, 0], done.hand[0], **ARM)
-    dot(axes[0, 0], np.asarray(movement.old(SWITCH)))
-    old = np.linspace(0.0, 0.8, 201)
-    axes[0, 1].plot(
-        old, np.linalg.norm(movement.old(old, 1), axis=-1), color="0.75", linewidth=1.0, label="before"
-    )
-    axes[0, 1].plot(time, np.linalg.norm(velocity, axis=-1), label="model", **MODEL)
-    axes[0, 1].plot(done.time, np.linalg.norm(done.velocity()[0], axis=-1), label="simulated arm", **ARM)
-    axes[0, 1].axvline(SWITCH, color=THIRD, linewidth=0.7, linestyle=":")
-    axes[0, 1].set(xlabel="$t$ [s]", ylabel="$T$ [m/s]", xlim=(0, ARRIVAL), ylim=(0, 1.6))
-    axes[0, 1].legend(loc="upper right")
-    letters(axes)
-    return figure

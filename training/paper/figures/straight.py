@@ -16,11 +16,11 @@ from viapoint.training.paper.profiles import EDGE, model_profile
 from viapoint.training.paper.reference_movements import curved, straight
 from viapoint.training.paper.rows.curved import ENDS, EXAMPLE
 from viapoint.training.paper.rows.straight import DURATION
-from viapoint.training.paper.simulated import Performed, joint_velocity, perform, required_torque
+from viapoint.training.paper.simulated import SimulatedMovements, joint_velocity, required_torque, simulate
 
 
 def model() -> Figure:
-    """Fig. 1: a straight and a curved movement of the model."""
+    """Draw Fig. 1: a straight and a curved movement of the model."""
     figure, axes = sheet(3, 2, 10.5)
     first, second = straight("T2", "T5", 1.0), curved(*ENDS, *EXAMPLE)
     via = np.asarray(second(float(second.knots[1])))
@@ -50,7 +50,7 @@ def model() -> Figure:
 
 
 def _construction(ax: Axes, movement: Trajectory, via: Float) -> None:
-    """d1, d2 and d3."""
+    """Draw the construction of d1, d2 and d3."""
     start, goal = 100.0 * np.asarray(movement.sample(2, 0)[0])
     x, y = 100.0 * via
     thin: Any = {"color": "0.45", "linewidth": 0.6}
@@ -77,22 +77,22 @@ def _time(ax: Axes) -> None:
 
 
 def straight_movements() -> Figure:
-    """Fig. 3: two straight movements on the model and on the simulated arm."""
+    """Draw Fig. 3: two straight movements on the model and on the simulated arm."""
     figure, axes = sheet(4, 2, 12.5)
     for column, (a, b) in enumerate((("T3", "T6"), ("T1", "T4"))):
         movement = straight(a, b, DURATION)
-        done = perform(movement)
+        motion = simulate(movement)
         ax = axes[:, column]
         plane(ax[0])
         path(ax[0], movement.sample(101, 0)[0], **MODEL)
-        path(ax[0], done.hand[0], **ARM)
+        path(ax[0], motion.hand[0], **ARM)
         planned = movement.sample(401)
         time = np.linspace(0.0, DURATION, 401)
         ax[1].plot(time, np.linalg.norm(planned[1], axis=-1), label="model", **MODEL)
-        ax[1].plot(done.time, np.linalg.norm(done.velocity()[0], axis=-1), label="simulated arm", **ARM)
+        ax[1].plot(motion.time, np.linalg.norm(motion.velocity()[0], axis=-1), label="simulated arm", **ARM)
         for row, axis in ((2, 1), (3, 0)):
             ax[row].plot(time, planned[2][:, axis], **MODEL)
-            ax[row].plot(done.time, done.acceleration()[0, :, axis], **ARM)
+            ax[row].plot(motion.time, motion.acceleration()[0, :, axis], **ARM)
             ax[row].axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
         ax[3].set_xlabel("$t$ [s]")
         ax[0].set_title(f"{'AB'[column]}   $T_{a[1]}$ to $T_{b[1]}$", loc="left", pad=3.0)
@@ -107,11 +107,11 @@ def straight_movements() -> Figure:
 
 
 def joints() -> Figure:
-    """Fig. 4: joint angles, velocities and torques of two movements."""
+    """Draw Fig. 4: joint angles, velocities and torques of two movements."""
     figure, axes = sheet(3, 2, 10.0, sharex=True, sharey="row")
     for column, (a, b) in enumerate((("T3", "T6"), ("T2", "T5"))):
         movement = straight(a, b, DURATION)
-        _joint_column(axes[:, column], movement, perform(movement))
+        _joint_column(axes[:, column], movement, simulate(movement))
         axes[0, column].set_title(f"{'AB'[column]}   $T_{a[1]}$ to $T_{b[1]}$", loc="left", pad=3.0)
         axes[2, column].set(xlabel="$t$ [s]", xlim=(0, DURATION))
     for row, text in enumerate((r"$\theta$ [deg]", r"$\dot{\theta}$ [deg/s]", r"torque [N m]")):
@@ -121,17 +121,17 @@ def joints() -> Figure:
     return figure
 
 
-def _joint_column(ax: Float, movement: Trajectory, done: Performed) -> None:
+def _joint_column(ax: Float, movement: Trajectory, motion: SimulatedMovements) -> None:
     time = np.linspace(0.0, DURATION, 401)
     position, velocity = movement.sample(401, (0, 1))
     angle = np.asarray(ADULT.inverse_kinematics(position))
     planned = (angle, joint_velocity(ADULT, angle, velocity), required_torque(ADULT, movement))
-    reached = (done.joints[0], np.gradient(done.joints[0], done.time, axis=0), done.torque[0])
-    within = done.time[:-1] <= DURATION
+    reached = (motion.joints[0], np.gradient(motion.joints[0], motion.time, axis=0), motion.torque[0])
+    within = motion.time[:-1] <= DURATION
     for row in range(3):
         scale = np.degrees(1.0) if row < 2 else 1.0
         for joint, (name, colour) in enumerate((("shoulder $S$", SECOND), ("elbow $E$", THIRD))):
             ax[row].plot(time, scale * planned[row][:, joint], color=colour, linewidth=2.0, label=name)
             values = scale * reached[row][: len(within), joint]
-            ax[row].plot(done.time[:-1][within], values[within], **ARM)
+            ax[row].plot(motion.time[:-1][within], values[within], **ARM)
         ax[row].axhline(0.0, color="0.8", linewidth=0.6, zorder=0)

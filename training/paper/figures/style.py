@@ -1,4 +1,4 @@
-"""How the figures look: set for a column of 8.5 cm, one colour for each thing throughout."""
+"""Style of the figures: one column of 8.5 cm, and one colour for each quantity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import TARGETS
 
 WIDTH = 8.5 / 2.54
-"""Of a column, [inch]."""
+"""Width of a column, [inch]."""
 DOTS_PER_INCH = 200
 STYLE: Any = {
     "font.size": 7.0,
@@ -43,16 +43,16 @@ STYLE: Any = {
     "svg.fonttype": "none",
 }
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
-"""The model: a wide light line, which shows beside the arm's."""
+"""Style of the model: a wide light line that stays visible beside the arm."""
 ARM: dict[str, Any] = {"color": PALETTE.executed, "linewidth": 0.9, "linestyle": (0, (4, 1.5))}
-"""The simulated arm."""
+"""Style of the simulated arm."""
 SECOND = PALETTE.goal
 THIRD = PALETTE.via
 GREY = PALETTE.start
 
 
 def sheet(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
-    """An empty figure one column wide, `height` centimetres high, and its axes, shape (rows, columns)."""
+    """Return a figure of one column and `height` centimetres, and its axes, shape (rows, columns)."""
     layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03)
     figure = Figure(figsize=(WIDTH, height / 2.54), layout=layout)
     axes = figure.subplots(rows, columns, squeeze=False, **options)
@@ -72,7 +72,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 
 def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
-    """The horizontal plane with the paper's targets, in centimetres."""
+    """Draw the horizontal plane with the paper's targets, in centimetres."""
     for name in names:
         x, y = 100.0 * np.array(TARGETS[name])
         ax.plot(x, y, "o", color="white", markeredgecolor=GREY, markersize=5.0, markeredgewidth=0.8, zorder=1)
@@ -87,17 +87,17 @@ def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
 
 
 def path(ax: Axes, position: Float, **style: Any) -> None:
-    """A hand path, shape (T, 2), [m]."""
+    """Draw a hand path, shape (T, 2), [m]."""
     ax.plot(*(100.0 * position.T), **style)
 
 
 def dot(ax: Axes, point: Float, **style: Any) -> None:
-    """A via-point, shape (2,), [m]."""
+    """Draw a via-point, shape (2,), [m]."""
     usual = {"marker": "o", "color": PALETTE.via, "markersize": 3.6, "zorder": 5}
     ax.plot(*(100.0 * point), **{**usual, **style})
 
 
 def letters(axes: Any, text: str = "ABCDEFGH") -> None:
-    """Panel letters, upper left."""
+    """Add panel letters, upper left."""
     for ax, letter in zip(np.ravel(axes), text, strict=False):
         ax.set_title(letter, loc="left", pad=3.0)

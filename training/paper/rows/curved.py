@@ -11,20 +11,20 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import speed_valleys
-from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
+from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.passage_polynomial import closed_form, count_roots, passage_polynomial, root_of
 from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
 from viapoint.training.paper.reference_movements import (
     curved,
+    minimum_jerk_through,
     passage_share,
-    smoothest,
     target,
     via_waypoints,
 )
-from viapoint.training.paper.simulated import Performed, perform
+from viapoint.training.paper.simulated import SimulatedMovements, simulate
 
 ENDS = ("T1", "T4")
-"""Of the family of curved movements; Fig. 1B shows one between these targets."""
+"""Targets of the family of curved movements; Fig. 1B shows one of them."""
 EXAMPLE = (0.35, -0.4)
 """d1 / (d1 + d2) and d3 / (d1 + d2) of the movement of Fig. 1B, towards the body."""
 ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])
@@ -34,41 +34,41 @@ HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])
 
 
 def passage_claims(count: int = 300, seed: int = 0) -> list[Claim]:
-    """Row 4."""
+    """Return the claims of row 4: the free passage time."""
     wrong, difference = _count_and_compare(count, seed)
     waypoints = via_waypoints(target(ENDS[0]), target(ENDS[1]), *EXAMPLE)
-    movement = smoothest(waypoints)
+    movement = minimum_jerk_through(waypoints)
     share = float(passage_share(movement))
     time = np.linspace(0.0, 1.0, 401)
     formula = 1e3 * float(np.abs(closed_form(waypoints, share, time) - movement(time)).max())
-    done = perform(movement)
-    arm_share = closest_approach(done, waypoints[1])
-    passed = 1e3 * float(np.linalg.norm(done.at(0, np.array([share]))[0] - waypoints[1]))
+    motion = simulate(movement)
+    arm_share = closest_approach(motion, waypoints[1])
+    passed = 1e3 * float(np.linalg.norm(motion.at(0, np.array([share]))[0] - waypoints[1]))
     return [
         Claim(
             row=4, claim=f"Eq. C16 has one root in (0, 1): vias with another count, of {count} (exact arithmetic)",
-            figure="App. C", paper="only one acceptable root", model=float(wrong), promise=near(0.0, 0.0),
+            figure="App. C", paper="only one acceptable root", model=float(wrong), expected=near(0.0, 0.0),
         ),
         Claim(
             row=4, claim="Passage time from the exact root against the library's, the same vias: greatest difference",
-            figure="App. C", model=difference, promise=at_most(1e-12),
+            figure="App. C", model=difference, expected=at_most(1e-12),
         ),
         Claim(
             row=4, claim="Eqs. 4 and 5, misprints put right, give the same movement (arm: distance from the via-point "
-            "at t1)", figure="1B", paper="Eqs. 4, 5, C12 to C15", unit="mm", model=formula, promise=at_most(1e-9),
-            arm=passed, arm_promise=at_most(1.0), deviation=done.worst,
+            "at t1)", figure="1B", paper="Eqs. 4, 5, C12 to C15", unit="mm", model=formula, expected=at_most(1e-9),
+            arm=passed, arm_expected=at_most(1.0), deviation=motion.worst,
         ),
         Claim(
             row=4, claim=f"t1/t_f of the movement of Fig. 1B, d1/(d1+d2) = {EXAMPLE[0]}, d3/(d1+d2) = "
             f"{-EXAMPLE[1]} (arm: when nearest to the via-point)", figure="1B", paper="free, from Eq. C16",
-            model=share, promise=near(_exact_share(waypoints), 1e-12), arm=arm_share,
-            arm_promise=near(share, 0.01), deviation=done.worst,
+            model=share, expected=near(_exact_share(waypoints), 1e-12), arm=arm_share,
+            arm_expected=near(share, 0.01), deviation=motion.worst,
         ),
     ]  # fmt: skip
 
 
 def _count_and_compare(count: int, seed: int) -> tuple[int, float]:
-    """Vias with another number of roots than one, and the greatest difference to the library's passage share."""
+    """Return the number of via-points without exactly one root, and the greatest difference of passage times."""
     generator = np.random.default_rng(seed)
     wrong, difference = 0, 0.0
     goal = (Fraction(1), Fraction(0))
@@ -77,7 +77,7 @@ def _count_and_compare(count: int, seed: int) -> tuple[int, float]:
         polynomial = passage_polynomial(via, goal)
         wrong += count_roots(polynomial) != 1
         points = np.array([[0.0, 0.0], [float(via[0]), float(via[1])], [1.0, 0.0]])
-        share = float(passage_share(smoothest(points)))
+        share = float(passage_share(minimum_jerk_through(points)))
         difference = max(difference, abs(share - root_of(polynomial)))
     return wrong, difference
 
@@ -87,33 +87,33 @@ def _exact_share(waypoints: Float) -> float:
     return root_of(passage_polynomial(via, goal))
 
 
-def closest_approach(done: Performed, via: Float, row: int = 0) -> float:
-    """When the simulated hand is nearest to the via-point, as a part of the duration."""
-    distance = np.linalg.norm(done.hand[row] - via, axis=-1)
+def closest_approach(motion: SimulatedMovements, via: Float, row: int = 0) -> float:
+    """Return the time at which the simulated hand is nearest to the via-point, as a fraction of the duration."""
+    distance = np.linalg.norm(motion.hand[row] - via, axis=-1)
     i = int(np.clip(distance.argmin(), 1, len(distance) - 2))
     before, here, after = distance[i - 1 : i + 2] ** 2
     shift = 0.5 * (before - after) / (before - 2.0 * here + after)
-    return float((done.time[i] + shift * (done.time[1] - done.time[0])) / done.duration[row])
+    return float((motion.time[i] + shift * (motion.time[1] - motion.time[0])) / motion.duration[row])
 
 
-class Both(NamedTuple):
-    """A curved movement on the model and on the simulated arm."""
+class ModelAndArm(NamedTuple):
+    """Curved movement on the model and on the simulated arm."""
 
     shown: tuple[Profile, Profile]
-    """Model, arm."""
+    """Profiles of model and arm."""
     worst: float
     """Deviation of the arm from the plan, [mm]."""
 
 
-def both(along: float, height: float) -> Both:
-    """The movement through a via-point between the targets of the family."""
+def both(along: float, height: float) -> ModelAndArm:
+    """Return the movement of the family through a via-point."""
     movement = curved(*ENDS, along, height)
-    done = perform(movement)
-    return Both((model_profile(movement), arm_profile(done)), done.worst)
+    motion = simulate(movement)
+    return ModelAndArm((model_profile(movement), arm_profile(motion)), motion.worst)
 
 
 def valley_claims() -> list[Claim]:
-    """Row 5."""
+    """Return the claims of row 5: speed valley and curvature peak."""
     even, skewed = both(0.5, -0.5), both(0.28125, -0.5)
     offset = [each.bend[0] - each.valley for each in skewed.shown]
     family = [both(along, height) for along in ALONGS for height in HEIGHTS]
@@ -122,46 +122,46 @@ def valley_claims() -> list[Claim]:
     return [
         Claim(
             row=5, claim="d1 = d2: time from the speed valley to the curvature peak / t_f", figure="1B",
-            paper="at the same time", model=abs(even.shown[0].bend[0] - even.shown[0].valley), promise=at_most(1e-6),
-            arm=abs(even.shown[1].bend[0] - even.shown[1].valley), arm_promise=at_most(0.01), deviation=even.worst,
+            paper="at the same time", model=abs(even.shown[0].bend[0] - even.shown[0].valley), expected=at_most(1e-6),
+            arm=abs(even.shown[1].bend[0] - even.shown[1].valley), arm_expected=at_most(0.01), deviation=even.worst,
         ),
         Claim(
             row=5, claim="d1 = .28125, d3 = .5 of d1+d2: the same; it is not zero, the paper's statement holds nearly",
-            figure="1B", paper="at the same time", model=offset[0], promise=near(0.01073, 2e-5), arm=offset[1],
-            arm_promise=near(0.01073, 0.01), deviation=skewed.worst,
+            figure="1B", paper="at the same time", model=offset[0], expected=near(0.01073, 2e-5), arm=offset[1],
+            arm_expected=near(0.01073, 0.01), deviation=skewed.worst,
         ),
         Claim(
             row=5, claim=f"The same, greatest of {len(family)} movements, d1/(d1+d2) .25 to .75, d3/(d1+d2) .42 to .54",
-            figure="5-7", paper="at the same time", model=near_by[0], promise=at_most(0.03), arm=near_by[1],
-            arm_promise=at_most(0.04), deviation=worst,
+            figure="5-7", paper="at the same time", model=near_by[0], expected=at_most(0.03), arm=near_by[1],
+            arm_expected=at_most(0.04), deviation=worst,
         ),
         _threshold_claim(0.5, "exact: 9/32 = .28125", near(9.0 / 32.0, 1e-6)),
         _threshold_claim(0.3, "-", near(0.38115, 1e-4)),
     ]  # fmt: skip
 
 
-def _threshold_claim(along: float, exact: str, promise: Promise) -> Claim:
+def _threshold_claim(along: float, exact: str, expected: ExpectedRange) -> Claim:
     model = valley_threshold(along, functools.partial(model_has_valley, along))
     arm = valley_threshold(along, functools.partial(_arm_has_valley, along), halvings=12)
     return Claim(
         row=5, claim=f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds",
-        figure="1B", paper=f"two peaks and a valley; {exact}".removesuffix("; -"), model=model, promise=promise,
-        arm=arm, arm_promise=near((promise.low + promise.high) / 2.0, 0.01),
-        deviation=perform(curved(*ENDS, along, -arm)).worst,
+        figure="1B", paper=f"two peaks and a valley; {exact}".removesuffix("; -"), model=model, expected=expected,
+        arm=arm, arm_expected=near((expected.low + expected.high) / 2.0, 0.01),
+        deviation=simulate(curved(*ENDS, along, -arm)).worst,
     )  # fmt: skip
 
 
 def model_has_valley(along: float, height: float) -> bool:
-    """Whether the model's speed has a valley, exactly."""
+    """Return whether the model's speed has a valley, exactly."""
     return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
 
 
 def _arm_has_valley(along: float, height: float) -> bool:
-    return bool(np.isfinite(arm_profile(perform(curved(*ENDS, along, -height))).valley))
+    return bool(np.isfinite(arm_profile(simulate(curved(*ENDS, along, -height))).valley))
 
 
 def valley_threshold(along: float, has_valley: Callable[[float], bool], halvings: int = 30) -> float:
-    """Least d3 / (d1 + d2) with a speed valley at a given d1 / (d1 + d2), by bisection."""
+    """Return the least d3 / (d1 + d2) with a speed valley at a given d1 / (d1 + d2), by bisection."""
     low, high = 0.2, 0.5
     for _ in range(halvings):
         middle = 0.5 * (low + high)
@@ -170,7 +170,7 @@ def valley_threshold(along: float, has_valley: Callable[[float], bool], halvings
 
 
 def place_claims() -> list[Claim]:
-    """Row 6."""
+    """Return the claims of row 6: the position of the via-point."""
     family = {(along, height): both(along, height) for along in (*ALONGS, 0.5) for height in HEIGHTS.tolist()}
     worst = max(each.worst for each in family.values())
     higher = [
@@ -185,24 +185,24 @@ def place_claims() -> list[Claim]:
     return [
         Claim(
             row=6, claim=f"Longer side has the higher speed peak: ratio of the peaks, {text}", figure="6",
-            paper="higher", model=higher[0], promise=at_least(1.0), arm=higher[1], arm_promise=at_least(1.0),
+            paper="higher", model=higher[0], expected=at_least(1.0), arm=higher[1], arm_expected=at_least(1.0),
             deviation=worst,
         ),
         Claim(
             row=6, claim="Larger d3, deeper valley: valley / peaks falls by at least, per step of .03 in d3/(d1+d2)",
-            figure="5", paper="deeper", model=deeper[0], promise=at_least(0.001), arm=deeper[1],
-            arm_promise=at_least(0.001), deviation=worst,
+            figure="5", paper="deeper", model=deeper[0], expected=at_least(0.001), arm=deeper[1],
+            arm_expected=at_least(0.001), deviation=worst,
         ),
         Claim(
             row=6, claim="Larger d3, higher curvature peak: it rises by at least, per step of .03 in d3/(d1+d2)",
-            figure="5", paper="higher", unit="1/m", model=bent[0], promise=at_least(0.1), arm=bent[1],
-            arm_promise=at_least(0.1), deviation=worst,
+            figure="5", paper="higher", unit="1/m", model=bent[0], expected=at_least(0.1), arm=bent[1],
+            arm_expected=at_least(0.1), deviation=worst,
         ),
     ]  # fmt: skip
 
 
 def _longer_side_lead(profile: Profile, along: float) -> float:
-    """Speed peak on the longer side over that on the shorter; NaN without two peaks."""
+    """Return the ratio of the speed peak on the longer side to the other one; NaN without two peaks."""
     peaks = profile.peaks
     if len(peaks) < 2:
         return np.nan
@@ -211,11 +211,11 @@ def _longer_side_lead(profile: Profile, along: float) -> float:
 
 
 def _least_step(
-    family: dict[tuple[float, float], Both],
+    family: dict[tuple[float, float], ModelAndArm],
     along: float,
     which: int,
     quantity: Callable[[Profile], float],
 ) -> float:
-    """Least rise of a quantity from one height to the next, on the model (0) or the arm (1)."""
+    """Return the least rise of a quantity from one height to the next, on the model (0) or the arm (1)."""
     values = [quantity(family[along, height].shown[which]) for height in HEIGHTS.tolist()]
     return float(np.diff(values).min())

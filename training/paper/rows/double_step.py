@@ -1,12 +1,12 @@
-"""Row 13: the target jumps on the way; two movements superposed, or one plan revised.
+"""Rows 11 and 13: targets that jump; two superposed movements, or one revised plan.
 
 Flash & Henis (1991, *Arm trajectory modifications during planar reaching movements*, J. Cogn. Neurosci. 3(3), 220-230)
 described hand paths towards a target that jumps as a sum: the first movement goes on as planned, and from the moment
-of revision s on a second one, from the first target A to the second B, is added. Both are of least jerk:
+of revision s on a second one, from the first target A to the second B, is added. Both have minimum jerk:
 
     x(t) = x0 + (A - x0) q(t / T) + (B - A) q((t - s) / R),   q(u) = 10 u^3 - 15 u^4 + 6 u^5 in [0, 1], constant beyond
 
-The online plan is the one movement of least jerk from the state at s to B. Both have the same state at s and are at
+The online plan is the one movement of minimum jerk from the state at s to B. Both have the same state at s and are at
 rest at B at s + R. If s + R = T both are one quintic with the same six boundary values, so they are the same. If
 s + R > T, subtract the second movement from both: what remains of the sum reaches A at T and waits there, what
 remains of the plan takes the time there is. So the two differ along the first movement alone, by what neither size nor
@@ -21,51 +21,51 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.primitives import Trajectory, point_to_point, retarget
-from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
+from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
+from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.reference_movements import straight, target
-from viapoint.training.paper.simulated import Performed, follow, instants
+from viapoint.training.paper.simulated import SimulatedMovements, instants, track
 
 DURATION = 0.7
-"""Of the first movement, and of the second one, [s]."""
+"""Duration of the first movement and of the second one, [s]."""
 MOMENTS = (0.05, 0.1, 0.2, 0.3)
-"""When the plan is revised, [s]."""
+"""Moments of revision, [s]."""
 NAMES = ("T1", "T4", "T5")
 """Start, first and second target."""
+SWITCH, WHOLE_DURATION = 0.3, 0.8
+"""Moment of revision and duration of the first movement in row 11, [s]."""
 
 
 class DoubleStep(NamedTuple):
-    """A movement whose target jumps on the way, both ways."""
+    """Movement to a target that jumps, as a sum and as a revised plan."""
 
     first: Trajectory
     second: Trajectory
-    """What is added at the revision; on its own clock."""
+    """Movement that is added at the revision, on its own clock."""
     online: Trajectory
-    """The plan from the revision on; on its own clock."""
+    """Plan from the revision on, on its own clock."""
     moment: float
-    """Of the revision, [s]."""
+    """Moment of revision, [s]."""
 
     @property
     def arrival(self) -> float:
-        """At the second target, [s]."""
+        """Arrival at the second target, [s]."""
         return self.moment + float(self.second.duration)
 
     def superposed(self, time: Float, nu: int = 0) -> Float:
-        """The sum of two movements, its derivative of order `nu`, shape (T, 2)."""
+        """Return the sum of both movements, derivative of order `nu`, shape (T, 2)."""
         later = self.second(time - self.moment, nu) * (time >= self.moment)[:, None]
         return np.asarray(self.first(time, nu) + later - (self._corner(time) if nu == 0 else 0.0))
 
     def planned(self, time: Float, nu: int = 0) -> Float:
-        """The plan and its revision, likewise."""
+        """Return the plan with its revision, derivative of order `nu`, shape (T, 2)."""
         later = (time >= self.moment)[:, None]
         return np.asarray(np.where(later, self.online(time - self.moment, nu), self.first(time, nu)))
 
     def cost(self, way: str) -> float:
-        """Half the integral of the squared jerk from the revision on, `way` being superposed or planned, [m^2/s^5]."""
+        """Return half the integral of squared jerk after the revision, [m^2/s^5]; `way` is superposed or planned."""
         knots = sorted({self.moment, float(self.first.duration), self.arrival})
-        nodes, weights = np.polynomial.legendre.leggauss(
-            5
-        )  # exact: between knots squared jerk is of degree 4
+        nodes, weights = np.polynomial.legendre.leggauss(5)  # exact: squared jerk has degree 4 between knots
         total = 0.0
         for low, high in pairwise(knots):
             jerk = getattr(self, way)(low + (high - low) * (nodes + 1.0) / 2.0, 3)
@@ -78,20 +78,20 @@ class DoubleStep(NamedTuple):
         return self.cost("superposed") / self.cost("planned")
 
     def _corner(self, time: Float) -> Float:
-        """The first target, where the second movement starts, from the revision on."""
+        """Return the first target, the start of the second movement, from the revision on."""
         return np.asarray(self.second(0.0) * (time >= self.moment)[:, None])
 
 
 def double_step(
     moment: float, *, goal: Float | None = None, duration: float = DURATION, remaining: float = DURATION
 ) -> DoubleStep:
-    """From T1 towards T4, then to T5.
+    """Return a movement from T1 towards T4 whose target jumps to T5.
 
     Args:
-        moment: Of the revision, [s].
-        goal: The second target if it is not T5, shape (2,), [m].
-        duration: Of the first movement, [s].
-        remaining: Of the second movement, which ends at moment + remaining >= duration, [s].
+        moment: Moment of revision, [s].
+        goal: Second target instead of T5, shape (2,), [m].
+        duration: Duration of the first movement, [s].
+        remaining: Duration of the second movement, which ends at moment + remaining >= duration, [s].
     """
     start, corner, last = NAMES
     goal = target(last) if goal is None else goal
@@ -100,31 +100,31 @@ def double_step(
     return DoubleStep(first, second, retarget(first, moment, goal, moment + remaining), moment)
 
 
-def perform_double(movement: DoubleStep) -> Performed:
-    """Carried out by the simulated arm: the sum and the plan, in this order."""
+def simulate_double(movement: DoubleStep) -> SimulatedMovements:
+    """Simulate the sum and the plan, in this order, on the arm."""
     time = instants(movement.arrival)
     both = (movement.superposed, movement.planned)
     references = (np.stack([way(time, nu) for way in both]) for nu in (0, 1, 2))
-    return follow(np.full(2, movement.arrival), *references)
+    return track(np.full(2, movement.arrival), *references)
 
 
 def peak_speed(movement: DoubleStep, way: str) -> float:
-    """[m/s]."""
+    """Return the greatest speed, [m/s]."""
     time = np.linspace(0.0, movement.arrival, 20_001)
     return float(np.linalg.norm(getattr(movement, way)(time, 1), axis=-1).max())
 
 
-def apart(movement: DoubleStep) -> float:
-    """Greatest distance between the sum and the plan at one time, [m]."""
+def greatest_distance(movement: DoubleStep) -> float:
+    """Return the greatest distance between the sum and the plan at one time, [m]."""
     time = np.linspace(movement.moment, movement.arrival, 2_001)
     return float(np.linalg.norm(movement.superposed(time) - movement.planned(time), axis=-1).max())
 
 
-def excess(distance: float, moment: float, duration: float, remaining: float) -> float:
-    """How much more jerk the sum costs, in closed form, [m^2/s^5]; see the head of this file.
+def excess_cost(distance: float, moment: float, duration: float, remaining: float) -> float:
+    """Return the jerk cost of the sum beyond that of the plan in closed form, [m^2/s^5]; see the module.
 
-    Half the integral of the squared jerk of what is left of the first movement, less that of the quintic from its
-    state that takes the whole remaining time.
+    It is the cost of the rest of the first movement, less that of the quintic from its state over the whole remaining
+    time.
     """
     u = moment / duration
     left = (1.0 - u) * duration
@@ -136,16 +136,16 @@ def excess(distance: float, moment: float, duration: float, remaining: float) ->
 
 
 def double_step_claims(seed: int = 0) -> list[Claim]:
-    """Row 13."""
+    """Return the claims of row 13: sum and plan compared."""
     every = [double_step(moment) for moment in MOMENTS]
     same = double_step(0.3, remaining=DURATION - 0.3)
-    alike = perform_double(same)
+    alike = simulate_double(same)
     claims = [
         _claim("Both continue position, velocity and acceleration at the revision: greatest jump, relative to the "
                "peak of each", max(_jump(each) for each in every), at_most(1e-12)),
         _claim("Arrival as planned at first (revised at 300 ms, due at 700 ms): distance between sum and plan",
-               1e3 * apart(same), at_most(1e-9), unit="mm",
-               done=(_hands_apart(alike), at_most(1e-6)), worst=alike.worst),
+               1e3 * greatest_distance(same), at_most(1e-9), unit="mm",
+               arm=(_hands_apart(alike), at_most(1e-6)), worst=alike.worst),
         _claim("Revised at 200 ms towards 100 second targets: what the sum costs beyond the plan, relative spread",
                _spread(seed), at_most(1e-9)),
     ]  # fmt: skip
@@ -155,46 +155,47 @@ def double_step_claims(seed: int = 0) -> list[Claim]:
 
 
 def _claims_at(moment: float, movement: DoubleStep) -> list[Claim]:
-    """Jerk, peak speeds and distance for one moment of revision; the second movement takes as long as the first."""
+    """Return the claims of one moment of revision; the second movement takes as long as the first."""
     when = f"Revised at {1e3 * moment:.0f} ms"
-    distance = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    more = excess(distance, moment, DURATION, DURATION)
-    expected = 1.0 + more / movement.cost("planned")
+    amplitude = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
+    expected = 1.0 + excess_cost(amplitude, moment, DURATION, DURATION) / movement.cost("planned")
+    distance = greatest_distance(movement)
     found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
-    done = perform_double(movement)
-    arm = done.peak_speed()
+    motion = simulate_double(movement)
+    arm = motion.peak_speed()
     return [
         _claim(f"{when}: jerk cost of the sum / of the plan, from there on", movement.ratio, near(expected, 1e-9)),
-        _claim(f"{when}: peak speed of the sum / of the plan", found, at_least(1.0 - 1e-12), worst=done.worst,
-               done=(float(arm[0] / arm[1]), near(found, 0.01))),
-        _claim(f"{when}: greatest distance between sum and plan, the same for a jump to T2", 1e3 * apart(movement),
-               near(1e3 * apart(double_step(moment, goal=target("T2"))), 1e-9), unit="mm", worst=done.worst,
-               done=(_hands_apart(done), near(1e3 * apart(movement), 1.0))),
+        _claim(f"{when}: peak speed of the sum / of the plan", found, at_least(1.0 - 1e-12), worst=motion.worst,
+               arm=(float(arm[0] / arm[1]), near(found, 0.01))),
+        _claim(f"{when}: greatest distance between sum and plan, the same for a jump to T2", 1e3 * distance,
+               near(1e3 * greatest_distance(double_step(moment, goal=target("T2"))), 1e-9), unit="mm",
+               worst=motion.worst, arm=(_hands_apart(motion), near(1e3 * distance, 1.0))),
     ]  # fmt: skip
 
 
 def _claim(
     text: str,
     model: float,
-    promise: Promise,
+    expected: ExpectedRange,
     *,
     unit: str = "",
-    done: tuple[float, Promise] | None = None,
+    arm: tuple[float, ExpectedRange] | None = None,
     worst: float | None = None,
 ) -> Claim:
-    arm, arm_promise = done or (None, None)
+    number, arm_expected = arm or (None, None)
     return Claim(
-        row=13, claim=text, unit=unit, model=model, promise=promise, arm=arm, arm_promise=arm_promise, deviation=worst
+        row=13, claim=text, unit=unit, model=model, expected=expected, arm=number, arm_expected=arm_expected,
+        deviation=worst,
     )  # fmt: skip
 
 
-def _hands_apart(done: Performed) -> float:
-    """Greatest distance between the hands of two movements, [mm]."""
-    return float(1e3 * np.linalg.norm(done.hand[0] - done.hand[1], axis=-1).max())
+def _hands_apart(motion: SimulatedMovements) -> float:
+    """Return the greatest distance between the hands of two movements, [mm]."""
+    return float(1e3 * np.linalg.norm(motion.hand[0] - motion.hand[1], axis=-1).max())
 
 
 def _jump(movement: DoubleStep) -> float:
-    """Of position, velocity and acceleration at the revision, relative to the greatest of each."""
+    """Return the greatest jump of position, velocity and acceleration at the revision, relative to their peaks."""
     now, time = np.array([movement.moment]), np.linspace(0.0, movement.arrival, 501)
     jumps = []
     for nu in range(3):
@@ -207,10 +208,10 @@ def _jump(movement: DoubleStep) -> float:
 
 
 def _spread(seed: int) -> float:
-    """Greatest deviation of the excess from its closed form over random second targets, relative."""
+    """Return the greatest relative deviation of the excess from its closed form over random second targets."""
     generator, moment = np.random.default_rng(seed), 0.2
     distance = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    expected = excess(distance, moment, DURATION, DURATION)
+    expected = excess_cost(distance, moment, DURATION, DURATION)
     goals = target(NAMES[1]) + generator.uniform(-0.4, 0.4, (100, 2))
     movements = [double_step(moment, goal=goal) for goal in goals]
     found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
@@ -218,10 +219,86 @@ def _spread(seed: int) -> float:
 
 
 def _rest_cost(distance: float, state: Float, time: float) -> float:
-    """Half the integral of the squared jerk of the quintic from a state to rest at `distance` in `time`."""
+    """Return half the integral of squared jerk of the quintic from a state to rest at `distance` in `time`."""
     position, velocity, acceleration = state * time ** np.arange(3)
     d = distance - position - velocity - acceleration / 2.0
     e, f = -velocity - acceleration, -acceleration
     a, b, c = 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
     square = 36 * a * a + 144 * a * b + 192 * b * b + 240 * a * c + 720 * b * c + 720 * c * c
     return float(square / (2.0 * time**5))
+
+
+def online_claims(seed: int = 0) -> list[Claim]:
+    """Return the claims of row 11: the quintic of the primer, and replanning."""
+    movement = double_step(SWITCH, duration=WHOLE_DURATION)
+    state = movement.first.sample(np.array([SWITCH]))
+    fresh = _solved(state, target("T5"), DURATION)
+    apart = np.abs(fresh - movement.online.sample(201, 0)[0]).max()
+    begun = movement.online.sample(np.array([0.0]))
+    jumps = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(state, begun, strict=True)]
+    motion = simulate_double(movement)
+    missed = float(np.linalg.norm(motion.hand[1, -1] - target("T5")))
+    return [
+        Claim(
+            row=11, claim="Quintic from 1,000 random boundary values, T from 1 ms to 1000 s: greatest relative error "
+            "at the ends", figure="primer", paper="Eqs. 16 to 24", model=_boundary_error(seed), expected=at_most(1e-12),
+        ),
+        Claim(
+            row=11, claim="Replanned 200 times on the way, target unchanged: distance from the one plan",
+            figure="primer", paper="Eqs. 25 to 27", unit="mm", model=1e3 * _replanned(200), expected=at_most(1e-9),
+        ),
+        Claim(
+            row=11, claim="Target and arrival change on the way: jump of position, velocity, acceleration, relative",
+            figure="primer", paper="smooth", model=max(jumps), expected=at_most(1e-12),
+        ),
+        Claim(
+            row=11, claim="The same against a fresh solution from that state (arm: distance from the new target at the "
+            "end)", figure="primer", paper="the same", unit="mm", model=1e3 * float(apart), expected=at_most(1e-9),
+            arm=1e3 * missed, arm_expected=at_most(1.0), deviation=float(motion.deviation[1]),
+        ),
+    ]  # fmt: skip
+
+
+def _solved(state: tuple[Float, ...], goal: Float, duration: float) -> Float:
+    """Solve the six boundary equations of the primer; return positions at 201 instants from a state to rest."""
+    powers = np.arange(6)
+    u = np.linspace(0.0, 1.0, 201)[:, None] ** powers  # in unit time
+    matrix = np.zeros((6, 6))
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = 1.0, 1.0, 2.0
+    matrix[3:] = np.ones(6), powers, powers * (powers - 1)
+    given = [state[0][0], state[1][0] * duration, state[2][0] * duration**2, goal, 0.0 * goal, 0.0 * goal]
+    return np.asarray(u @ np.linalg.solve(matrix, np.array(given)))
+
+
+def _boundary_error(seed: int) -> float:
+    """Return the greatest error of x, x' T and x'' T^2 at both ends, relative to the largest boundary value."""
+    generator = np.random.default_rng(seed)
+    duration = 10.0 ** generator.uniform(-3.0, 3.0, 1000)
+    values = generator.normal(size=(6, 1000))  # x0, V0, A0, xT, VT, AT in unit time
+    scale = np.stack((np.ones_like(duration), 1.0 / duration, 1.0 / duration**2))
+    given = values * np.concatenate((scale, scale))
+    x0, dx0, ddx0, xT, dxT, ddxT = given
+    coefficients = minimum_jerk_coefficients(x0, dx0, ddx0, xT, dxT, ddxT, duration)
+    end = duration[:, None] ** np.arange(6)
+    powers = np.arange(6)
+    reached = [
+        coefficients[:, 0],
+        coefficients[:, 1],
+        2.0 * coefficients[:, 2],
+        (coefficients * end).sum(axis=-1),
+        (coefficients * end * powers).sum(axis=-1) / duration,
+        (coefficients * end * powers * (powers - 1)).sum(axis=-1) / duration**2,
+    ]
+    error = np.abs(np.stack(reached) - given) / np.concatenate((scale, scale))
+    return float((error / np.abs(values).max(axis=0)).max())
+
+
+def _replanned(times: int) -> float:
+    """Return the greatest distance between a plan and the same plan after many replannings, [m]."""
+    whole = straight("T1", "T4", 0.8)
+    plan, begun, apart = whole, 0.0, 0.0
+    for now in np.linspace(0.0, 0.75, times + 1)[1:]:
+        plan, begun = retarget(plan, now - begun, target("T4"), 0.8 - begun), now
+        ahead = np.linspace(now, 0.8, 11)
+        apart = max(apart, float(np.abs(plan(ahead - now) - whole(ahead)).max()))
+    return apart

@@ -1,4 +1,4 @@
-"""Row 12: whether an agent that goes around the paper's rows of lights moves as the paper's subjects did."""
+"""Row 12: comparison of an agent that avoids the paper's rows of lights with the paper's subjects."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
 from viapoint.training.algorithms.agent import find_model, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
-from viapoint.training.paper.claim import Claim, Promise, at_least, at_most, near
+from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
-from viapoint.training.paper.reference_movements import construction, passage_share, smoothest
+from viapoint.training.paper.reference_movements import construction, minimum_jerk_through, passage_share
 from viapoint.training.paper.rows.timing import FAST, SLOW
-from viapoint.training.paper.simulated import Performed, perform
+from viapoint.training.paper.simulated import SimulatedMovements, simulate
 from viapoint.training.planners.baselines import Method, agent_method
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.rollouts.rollout import Trial
 
 LENGTHS = (0.15, 0.2, 0.25)
-"""Of the rows of lights, [m]; the paper's were up to 25 cm."""
+"""Lengths of the rows of lights, [m]; the paper's were up to 25 cm."""
 RADII = (0.008, 0.02)
-"""[m]"""
+"""Radii of the rows of lights, [m]."""
 SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
-"""Of a row's middle from the middle of the line between the targets, along and across it, [m]."""
+"""Offsets of a row's middle from the middle of the line between the targets, along and across it, [m]."""
 BUDGET = PlannerBudget(first=32, more=512, generations=8, population=6)
 
 
-class Decided(NamedTuple):
-    """What an agent or the planner did in N scenes."""
+class ObstacleMovements(NamedTuple):
+    """Successful movements of an agent or the planner around rows of lights."""
 
     name: str
     scenes: Scenes
-    """Those in which the movement succeeded."""
+    """Scenes of the successful movements."""
     plan: Plan
-    done: Performed
-    tried: int
-    """Scenes in all."""
+    motion: SimulatedMovements
+    n_scenes: int
+    """Number of all scenes."""
     planned: list[Profile]
     executed: list[Profile]
 
 
 def light_scenes() -> Scenes:
-    """Rows of lights of several lengths, widths and places between each two targets; 252 scenes."""
+    """Return 252 scenes with rows of lights of several lengths, widths and places between each two targets."""
     parts = [_shifted(length, radius, shift) for length in LENGTHS for radius in RADII for shift in SHIFTS]
     return Scenes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
@@ -63,8 +63,8 @@ def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes
     return scenes
 
 
-def decide(agent: Path | None) -> Decided:
-    """Let the agent of a run folder, the shipped one, or else the planner, move around the rows of lights."""
+def decide(agent: Path | None) -> ObstacleMovements:
+    """Simulate the agent of a run folder, the shipped one, or else the planner, around the rows of lights."""
     scenes = light_scenes()
     method, trial = _method(agent)
     check_scenes(scenes, trial.task.collision_model)
@@ -76,18 +76,18 @@ def decide(agent: Path | None) -> Decided:
     kept = scenes.take(success)
     plan = trial.task.action.decode(action[success], kept.start, kept.goal)
     movement = plan.trajectory()
-    done = perform(movement)
+    motion = simulate(movement)
     number = range(int(success.sum()))
     planned = [model_profile(plan.take(row).trajectory()) for row in number]
-    executed = [arm_profile(done, row) for row in number]
-    return Decided(method.name, kept, plan, done, len(scenes.start), planned, executed)
+    executed = [arm_profile(motion, row) for row in number]
+    return ObstacleMovements(method.name, kept, plan, motion, len(scenes.start), planned, executed)
 
 
 def check_agent(agent: Path) -> None:
-    """Refuse agents of tasks whose scenes cannot be those of the paper.
+    """Check that the scenes of the paper are scenes of an agent's task.
 
     Raises:
-        ValueError: It moves in space, sees no obstacles, or needs several decisions for a movement.
+        ValueError: The task is spatial, has no obstacles, or needs several decisions for a movement.
     """
     found = load_agent(agent)
     (task,) = found.get_env().get_attr("task", 0)  # type: ignore[union-attr]
@@ -115,31 +115,31 @@ def _is_shipped() -> bool:
 
 
 def _padded(scenes: Scenes, trial: Trial) -> Scenes:
-    """With as many rows of obstacles as the observation has; the added ones are absent."""
+    """Return scenes with as many obstacle rows as the observation; the added ones are absent."""
     most = trial.task.scenes.n_obstacles[1]
     missing = most - scenes.obstacles.shape[1]
     return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
 
 
 class Features(NamedTuple):
-    """What the paper looks at, one value per movement; NaN where a movement has no such thing."""
+    """Features of the paper's analysis, one value for each movement; NaN where a movement lacks it."""
 
     valley: Float
-    """When the speed valley is, as a part of the duration."""
+    """Time of the speed valley as a fraction of the duration."""
     bend: Float
-    """When the curvature peak is."""
+    """Time of the curvature peak."""
     via: Float
-    """Where that is, d1 / (d1 + d2) and d3 / (d1 + d2), shape (n, 2)."""
+    """Position of the curvature peak, d1 / (d1 + d2) and d3 / (d1 + d2), shape (n, 2)."""
     residual: Float
     """t1 / (t1 + t2) minus the model's through the point of greatest curvature, as in Fig. 10B."""
     agrees: NDArray[np.bool_]
-    """Whether the movement has a speed valley exactly if the model through that point has one."""
+    """True where the movement and the model through that point both have a speed valley, or neither has."""
     apart: Float
     """Greatest distance from the model through that point / distance of the targets, as in Fig. 8."""
 
 
 def features(profiles: list[Profile], scenes: Scenes) -> Features:
-    """The paper's analysis: the via-point is where the curvature is greatest."""
+    """Compute the features of the paper's analysis, with the point of greatest curvature as via-point."""
     valley = np.array([each.valley for each in profiles])
     bend = np.array([each.bend[0] for each in profiles])
     agrees = np.zeros(len(bend), dtype=bool)
@@ -150,7 +150,7 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
     )
     for row in np.flatnonzero(np.isfinite(bend)):
         points = np.stack((scenes.start[row], profiles[row].place(bend[row]), scenes.goal[row]))
-        model = smoothest(points)
+        model = minimum_jerk_through(points)
         via[row] = construction(points)
         residual[row] = bend[row] - passage_share(model)
         agrees[row] = bool(speed_valleys(model).time.size) == bool(np.isfinite(valley[row]))
@@ -159,25 +159,25 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
     return Features(valley, bend, via, residual, agrees, apart)
 
 
-def obstacle_claims(decided: Decided) -> list[Claim]:
-    """Row 12."""
-    both = features(decided.planned, decided.scenes), features(decided.executed, decided.scenes)
-    worst = decided.done.worst
-    who = f"{decided.name}, {len(decided.executed)} movements"
+def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
+    """Return the claims of row 12."""
+    both = features(avoidance.planned, avoidance.scenes), features(avoidance.executed, avoidance.scenes)
+    worst = avoidance.motion.worst
+    who = f"{avoidance.name}, {len(avoidance.executed)} movements"
 
     def claim(
-        text: str, paper: str, value: Callable[[Features], float], promise: Promise, unit: str = ""
+        text: str, paper: str, value: Callable[[Features], float], expected: ExpectedRange, unit: str = ""
     ) -> Claim:
         return Claim(
-            row=12, claim=f"{text} ({who})", figure="8", paper=paper, unit=unit, model=value(both[0]), promise=promise,
-            arm=value(both[1]), arm_promise=promise, deviation=worst,
+            row=12, claim=f"{text} ({who})", figure="8", paper=paper, unit=unit, model=value(both[0]),
+            expected=expected, arm=value(both[1]), arm_expected=expected, deviation=worst,
         )  # fmt: skip
 
     return [
         Claim(
-            row=12, claim=f"Around rows of lights without contact, of {decided.tried} scenes ({decided.name})",
-            figure="8", unit="%", model=None, arm=100.0 * len(decided.executed) / decided.tried,
-            arm_promise=at_least(90.0), deviation=worst,
+            row=12, claim=f"Around rows of lights without contact, of {avoidance.n_scenes} scenes ({avoidance.name})",
+            figure="8", unit="%", model=None, arm=100.0 * len(avoidance.executed) / avoidance.n_scenes,
+            arm_expected=at_least(90.0), deviation=worst,
         ),
         claim("Movements with a curvature peak inside", "all", lambda f: 100 * _share(f.bend), at_least(50.0), "%"),
         claim("Movements with a speed valley: not all", "all", lambda f: 100 * _share(f.valley), at_least(10.0), "%"),
@@ -192,7 +192,7 @@ def obstacle_claims(decided: Decided) -> list[Claim]:
         claim("The same: standard deviation", ".02", lambda f: float(np.nanstd(f.residual)), at_most(0.04)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * float(np.nanmedian(f.apart)), at_most(5.0), "%"),
-        _scaling_claim(decided, who),
+        _scaling_claim(avoidance, who),
     ]  # fmt: skip
 
 
@@ -200,16 +200,16 @@ def _share(values: Float) -> float:
     return float(np.isfinite(values).mean())
 
 
-def _scaling_claim(decided: Decided, who: str) -> Claim:
-    """The same decisions in the two durations of Fig. 11."""
-    fractions, movement = np.linspace(0.0, 1.0, 101), decided.plan.trajectory()
-    both = [perform(movement.stretched(duration)) for duration in (SLOW, FAST)]
-    number = len(decided.executed)
+def _scaling_claim(avoidance: ObstacleMovements, who: str) -> Claim:
+    """Return the claim about the same decisions in the two durations of Fig. 11."""
+    fractions, movement = np.linspace(0.0, 1.0, 101), avoidance.plan.trajectory()
+    both = [simulate(movement.stretched(duration)) for duration in (SLOW, FAST)]
+    number = len(avoidance.executed)
     paths = [np.stack([each.at(row, fractions) for row in range(number)]) for each in both]
     plans = [movement.stretched(duration).sample(101, 0)[0] for duration in (SLOW, FAST)]
     apart, model = (1e3 * float(np.linalg.norm(a - b, axis=-1).max()) for a, b in (paths, plans))
     return Claim(
         row=12, claim=f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
-        figure="8, 11", paper="the same path", unit="mm", model=model, promise=at_most(1e-9), arm=apart,
-        arm_promise=at_most(1.0), deviation=max(each.worst for each in both),
+        figure="8, 11", paper="the same path", unit="mm", model=model, expected=at_most(1e-9), arm=apart,
+        arm_expected=at_most(1.0), deviation=max(each.worst for each in both),
     )  # fmt: skip
