@@ -175,13 +175,12 @@ def whole_between(bounds: tuple[int, int], u: Float) -> Float:
     return bounds[0] + np.floor((bounds[1] - bounds[0] + 1) * u)
 
 
-def shuffle_rows(rows: Float, chance: Float) -> Float:
-    """Return the first K obstacles of each scene, shape (N, K, 2 D + 1), in random order.
-
-    Args:
-        rows: Obstacles, shape (N, n, 2 D + 1); absent ones, without a radius, come last.
-        chance: Uniform numbers, shape (N, K).
-    """
-    present_first = np.argsort(rows[..., -1] <= 0.0, axis=-1, kind="stable")[:, : chance.shape[1]]
-    order = np.take_along_axis(present_first, np.argsort(chance, axis=-1, kind="stable"), axis=1)
+def present_first(rows: Float, count: int) -> Float:
+    """Return the first `count` obstacles of each scene; absent ones, without a radius, come last."""
+    order = np.argsort(rows[..., -1] <= 0.0, axis=-1, kind="stable")[:, :count]
     return np.take_along_axis(rows, order[..., None], axis=1)
+
+
+def shuffle_rows(rows: Float, chance: Float) -> Float:
+    """Return obstacles, shape (N, K, 2 D + 1), in the order of uniform numbers, shape (N, K)."""
+    return np.take_along_axis(rows, np.argsort(chance, axis=-1, kind="stable")[..., None], axis=1)

@@ -1,4 +1,4 @@
-"""Scenes that change while the hand is on its way: targets that jump, obstacles that move."""
+"""Scenes that change during an episode: targets that jump, obstacles that move."""
 
 from __future__ import annotations
 
@@ -6,59 +6,58 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
 
 MOST_JUMPS = 4
-"""Jumps of a target in one episode at most."""
+"""Greatest number of jumps in an episode."""
 FASTEST = 1.0
 """Greatest speed of an obstacle, [m/s]."""
 
 
 class ChangingScenes(NamedTuple):
-    """N scenes of up to n obstacles each, and what will become of them."""
+    """N scenes of up to n obstacles each, and their changes."""
 
     start: Float
     """Shape (N, D), [m]."""
     goal: Float
-    """The first target, shape (N, D), [m]."""
+    """First target, shape (N, D), [m]."""
     obstacles: Float
-    """Where they are at the start: rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]."""
+    """Obstacles at the start: rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]."""
     jumps: Float
     """Rows (time [s], target D [m]), in the order of time, shape (N, MOST_JUMPS, D + 1); absent rows are zero."""
     courses: Float
-    """Of each obstacle: velocity D [m/s], time of the change of course [s], velocity D after it, shape (N, n, 2 D + 1).
+    """Rows (velocity D [m/s], time of the change of course [s], velocity D after it [m/s]), shape (N, n, 2 D + 1).
 
     The course is straight before and after. Where both velocities are the same there is no change, whatever the time.
     """
 
     @property
-    def present(self) -> NDArray[np.bool_]:
-        """Whether a row is an obstacle, shape (N, n): an absent one has no radius."""
+    def present(self) -> Bool:
+        """Rows that are obstacles, shape (N, n); absent ones have no radius."""
         return self.obstacles[..., -1] > 0.0
 
     @property
-    def turns(self) -> NDArray[np.bool_]:
-        """Which obstacles change their course, shape (N, n)."""
+    def turns(self) -> Bool:
+        """Obstacles that change their course, shape (N, n)."""
         d = self.start.shape[-1]
         return np.asarray(self.present & (self.courses[..., :d] != self.courses[..., d + 1 :]).any(axis=-1))
 
     @property
     def jump_times(self) -> Float:
-        """When the target jumps, shape (N, MOST_JUMPS), [s]; infinite where it does not."""
+        """Times of the jumps, shape (N, MOST_JUMPS), [s]; infinite for none."""
         return np.where((self.jumps != 0.0).any(axis=-1), self.jumps[..., 0], np.inf)
 
     @property
     def turn_times(self) -> Float:
-        """When each obstacle changes its course, shape (N, n), [s]; infinite where it does not."""
+        """Times of the changes of course, shape (N, n), [s]; infinite for none."""
         return np.where(self.turns, self.courses[..., self.start.shape[-1]], np.inf)
 
     def take(self, rows: Any) -> ChangingScenes:
-        """The scenes at `rows`, an index, slice or mask."""
+        """Return the scenes at `rows`, an index, slice or mask."""
         return ChangingScenes(*(field[rows] for field in self))
 
     def put(self, rows: Any, scenes: ChangingScenes) -> None:
@@ -67,21 +66,21 @@ class ChangingScenes(NamedTuple):
             mine[rows] = theirs
 
     def as_options(self) -> dict[str, Float]:
-        """What `reset(options=...)` of the environments takes."""
+        """Return the scenes as options of `reset`."""
         return dict(self._asdict())
 
     def goals(self, time: Float) -> Float:
-        """The targets at a time for each, shape (N,), [s]; from the moment of a jump on it is the new one: (N, D)."""
+        """Return the targets, shape (N, D), [m], at one time for each scene, shape (N,), [s]; a jump counts at once."""
         number = (self.jump_times <= time[:, None] + 1e-9).sum(axis=-1)
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
 
     def places(self, time: Float, *, unturned: Float | None = None) -> Float:
-        """Obstacles at T times of each scene, rows of shape (N, T, n, 2 D + 1), [m].
+        """Return obstacles at T times of each scene, shape (N, T, n, 2 D + 1), [m].
 
         Args:
             time: Shape (N, T), [s].
-            unturned: As if no course changed after that time, shape (N,), [s]: what one foresees then.
+            unturned: Time after which changes of course are ignored, as they cannot be foreseen, shape (N,), [s].
         """
         d = self.start.shape[-1]
         turn = self.turn_times
@@ -94,7 +93,7 @@ class ChangingScenes(NamedTuple):
         return rows
 
     def velocities(self, time: Float) -> Float:
-        """Of the obstacles at a time for each, shape (N,), [s]: (N, n, D), [m/s]; zero where there is none."""
+        """Return velocities, shape (N, n, D), [m/s], at one time for each scene, shape (N,), [s]."""
         d = self.start.shape[-1]
         turned = (self.turn_times <= time[:, None] + 1e-9)[..., None]
         velocity = np.where(turned, self.courses[..., d + 1 :], self.courses[..., :d])
@@ -110,19 +109,19 @@ class ChangingScenes(NamedTuple):
         return length
 
     def at(self, time: Float) -> Scenes:
-        """How they look at a time for each, shape (N,), [s]."""
+        """Return the scenes at one time for each, shape (N,), [s]."""
         return Scenes(self.start, self.goals(time), self.places(time[:, None])[:, 0])
 
 
 def problems_of_changes(
     scenes: ChangingScenes, collision_model: CollisionModel, *, time_limit: float
 ) -> Iterator[Problem]:
-    """Everything that can be wrong with what will become of N scenes that are sound at the start.
+    """Yield the faults that the changes of N scenes can have; the scenes are possible at the start.
 
     Args:
-        scenes: To look at.
+        scenes: N scenes.
         collision_model: Arm that must reach the targets.
-        time_limit: After which nothing happens, [s].
+        time_limit: Time limit of an episode, [s].
     """
     d = scenes.start.shape[-1]
     given, turns = (scenes.jumps != 0.0).any(axis=-1), scenes.turns
@@ -159,8 +158,8 @@ def problems_of_changes(
         )
 
 
-def _first(wrong: NDArray[np.bool_], values: Float, what: str, why: str) -> Problem:
-    """A fault of some rows, told of the first."""
+def _first(wrong: Bool, values: Float, what: str, why: str) -> Problem:
+    """Return a fault of some rows, described for the first of them."""
     return (
         np.asarray(wrong.any(axis=-1)),
         lambda i: f"{what} {wrong[i].argmax()} at {values[i, wrong[i].argmax()]:g} {why}",

@@ -16,8 +16,6 @@ from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.scenes.draws import FeasiblePath, between, directions
 
-FIRST = 2
-"""Candidate paths that are computed before the others: mostly one of them is feasible."""
 BASE_SIDE_SHARE = 0.85
 """Share of whole-arm paths that pass between base and obstacles: few others leave room for the links."""
 Ends = tuple[Float, Float] | None
@@ -31,6 +29,8 @@ class DrawOrder(NamedTuple):
     """Candidate pairs of start and goal."""
     n_paths: int
     """Candidate paths."""
+    n_first: int
+    """Candidate paths that are computed before the others: often one of them is feasible."""
     n_times: int
     """Times at which a path is computed."""
     by_column: bool
@@ -93,11 +93,12 @@ def sample_paths(
     Returns:
         Paths, and which scenes have a feasible one, shape (N,).
     """
-    path, good = _first_feasible(u[:, :FIRST], arm, start, goal, reach_margin, steered)
+    first = DRAW_ORDER[arm.dimension].n_first
+    path, good = _first_feasible(u[:, :first], arm, start, goal, reach_margin, steered)
     rest = np.flatnonzero(~good)
-    if len(rest):
+    if len(rest) and first < u.shape[1]:
         path[rest], good[rest] = _first_feasible(
-            u[rest, FIRST:], arm, start[rest], goal[rest], reach_margin, steered[rest]
+            u[rest, first:], arm, start[rest], goal[rest], reach_margin, steered[rest]
         )
     return FeasiblePath(start, goal, path), good
 
@@ -138,12 +139,12 @@ def _spatial_via_points(u: Float, start: Float, goal: Float, steered: Bool) -> F
 
 DRAW_ORDER = {
     2: DrawOrder(
-        n_ends=16, n_paths=6, n_times=40, by_column=True, via_points=_planar_via_points,
+        n_ends=16, n_paths=6, n_first=6, n_times=40, by_column=True, via_points=_planar_via_points,
         groups=(1,) * 200, ahead=0,
     ),
     # Most scenes in space need one attempt, but a tunnel a hundred.
     3: DrawOrder(
-        n_ends=12, n_paths=8, n_times=16, by_column=False, via_points=_spatial_via_points,
+        n_ends=12, n_paths=8, n_first=2, n_times=16, by_column=False, via_points=_spatial_via_points,
         groups=(1, 2, 4, *[8] * 400), ahead=32,
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Drawing what will become of scenes: when targets jump and where to, how obstacles move."""
+"""Sampling of changes of scenes: jumps of the target and motions of obstacles."""
 
 from __future__ import annotations
 
@@ -10,62 +10,59 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.scenes.draws import Uniforms, between
+from viapoint.envs.scenes.config import check_count
+from viapoint.envs.scenes.draws import Uniforms, between, directions, whole_between
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, Scenes, rest_clearance
 
 CANDIDATES, ATTEMPTS = 8, 40
-"""Jumps and courses that are drawn at once, and how often jumps are drawn until some fit."""
+"""Candidates for a jump or a course, and attempts at the jumps of an episode."""
 REDRAWN = 100
-"""How often other scenes are drawn instead of those in which no jump fits: one in a few hundred of some tasks."""
-LOOKS = 10
-"""At how many times it is looked whether start and goal are free."""
+"""Attempts to replace a scene in which no jump fits: one in a few hundred of some tasks."""
+N_TIMES = 10
+"""Times at which the clearance of start and goal is computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChangeDistribution:
-    """What becomes of scenes. Times are relative to the centre duration of a movement."""
+    """Distribution of the changes of scenes; times are relative to the centre duration of a movement."""
 
     n_jumps: tuple[int, int] = (0, 0)
     """Fewest and most jumps of the target."""
     moving: bool = False
-    """Whether obstacles move."""
+    """Flag: obstacles move."""
     first_jump: tuple[float, float] = (0.1, 0.7)
-    """After the start."""
+    """Time of the first jump."""
     next_jump: tuple[float, float] = (0.4, 0.9)
-    """After the one before."""
+    """Time from a jump to the next."""
     jump_distance: tuple[float, float] = (0.10, 0.30)
-    """From one target to the next, [m]."""
+    """Distance from a target to the next, [m]."""
     steepness: float = 0.5
     """Greatest height gained by a jump or an obstacle in space, relative to the distance."""
     speed: tuple[float, float] = (0.05, 0.30)
-    """Of the obstacles, [m/s]."""
+    """Speed of the obstacles, [m/s]."""
     turning: float = 0.5
     """Share of the obstacles that change their course."""
     turn: tuple[float, float] = (0.2, 0.7)
-    """When they do so."""
+    """Time of the change of course."""
     meeting: tuple[float, float] = (0.25, 0.6)
-    """When an obstacle is where it would stand if it did not move: in the way of the straight movement, say."""
+    """Time at which an obstacle is where it would stand if it did not move."""
     end_margin: float = 0.015
     """Least clearance of the arm at the start, and at the goal while movements may end, [m]."""
     reach_margin: float = 0.03
-    """How far inside the arm's reach targets stay, [m]."""
+    """Least distance of targets from the border of the reach, [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be sampled."""
-        fewest, most = self.n_jumps
-        if not 0 <= fewest <= most <= MOST_JUMPS:
-            raise ValueError(
-                f"n_jumps must be (fewest, most), 0 <= fewest <= most <= {MOST_JUMPS}, got {self.n_jumps}"
-            )
+        """Check the number of jumps."""
+        check_count(self.n_jumps, "n_jumps", MOST_JUMPS)
 
 
 class ChangeSampler:
-    """Draws what will become of scenes, each from a generator of its own.
+    """Sampler of the changes of scenes, each from a random generator of its own.
 
     Args:
         collision_model: Arm that moves.
-        distribution: What becomes of scenes.
+        distribution: Distribution of the changes.
         durations: Shortest, centre and longest duration of a movement, [s].
     """
 
@@ -88,14 +85,14 @@ class ChangeSampler:
         *,
         again: Callable[[Int], Scenes] | None = None,
     ) -> ChangingScenes:
-        """What will become of N scenes.
+        """Sample the changes of N scenes.
 
         Args:
             generators: N random generators.
-            scenes: N scenes; obstacles whose courses are drawn will be there when a movement may meet them.
-            jumps: Given ones, shape (N, MOST_JUMPS, D + 1).
-            courses: Given ones, shape (N, n, 2 D + 1).
-            again: Draws other scenes instead of some, where no jump fits in; without it they are refused.
+            scenes: N scenes; obstacles whose courses are sampled get there when a movement may meet them.
+            jumps: Given jumps, shape (N, MOST_JUMPS, D + 1).
+            courses: Given courses, shape (N, n, 2 D + 1).
+            again: Function that samples other scenes instead of those in which no jump fits; by default these raise.
 
         Raises:
             RuntimeError: No jump that fits was found in many attempts.
@@ -122,7 +119,7 @@ class ChangeSampler:
         jumps: Float | None,
         courses: Float | None,
     ) -> tuple[ChangingScenes, Int]:
-        """What will become of N scenes, and those in which no jump fits."""
+        """Return N scenes with changes, and the indices of those in which no jump fits."""
         number, dimension = scenes.start.shape
         still = np.zeros((number, scenes.obstacles.shape[1], 2 * dimension + 1))
         none = np.zeros((number, MOST_JUMPS, dimension + 1))
@@ -137,22 +134,22 @@ class ChangeSampler:
         return changing, self._jump(generators, changing)
 
     def _jump(self, generators: Sequence[np.random.Generator], scenes: ChangingScenes) -> Int:
-        """Draw jumps into scenes, all of an episode at once, until all fit; which are left."""
-        fewest, most = self.distribution.n_jumps
+        """Sample the jumps of scenes, all of an episode at once, and return the scenes in which none fit."""
+        most = self.distribution.n_jumps[1]
         pending = np.arange(len(scenes.start))
         size = 1 + most * (1 + 3 * CANDIDATES)
         for _ in range(ATTEMPTS):
             if not len(pending):
                 break
             u = Uniforms(np.stack([generators[int(i)].random(size) for i in pending]))
-            number = fewest + np.floor((most - fewest + 1) * u.take(1)[:, 0])
+            number = whole_between(self.distribution.n_jumps, u.take(1)[:, 0])
             good, jumps = self._attempt(u, number, scenes.take(pending))
             scenes.jumps[pending[good]] = jumps[good]
             pending = pending[~good]
         return pending
 
     def _attempt(self, uniforms: Uniforms, number: Float, scenes: ChangingScenes) -> tuple[Bool, Float]:
-        """Which of N episodes got all their jumps, and the jumps; the hand is thought to follow without detours."""
+        """Return which of N episodes get all their jumps, and the jumps; the hand is assumed to make no detours."""
         d, centre = self.distribution, self._centre
         jumps, good = np.zeros_like(scenes.jumps), np.ones(len(number), dtype=bool)
         target, each = scenes.goal, np.arange(len(number))
@@ -167,7 +164,7 @@ class ChangeSampler:
             revised = primitives.point_to_point(
                 position, targets, centre, start_velocity=velocity, start_acceleration=acceleration
             )
-            fits = self._fits(scenes, time, targets, revised(np.linspace(0.0, centre, LOOKS)))
+            fits = self._fits(scenes, time, targets, revised(np.linspace(0.0, centre, N_TIMES)))
             chosen, some = fits.argmax(axis=-1), number > k
             target = np.where(some[:, None], targets[each, chosen], target)
             good &= fits.any(axis=-1) | ~some
@@ -179,7 +176,7 @@ class ChangeSampler:
         return good, jumps
 
     def _targets(self, uniforms: Uniforms, target: Float) -> Float:
-        """Candidates for the next target, shape (N, CANDIDATES, D)."""
+        """Return candidates for the next target, shape (N, CANDIDATES, D), [m]."""
         angle, length = 2.0 * np.pi * uniforms.take(CANDIDATES), uniforms.take(CANDIDATES)
         step = self._direction(angle, uniforms.take(CANDIDATES), target.shape[-1])
         return np.asarray(
@@ -187,7 +184,7 @@ class ChangeSampler:
         )
 
     def _fits(self, scenes: ChangingScenes, time: Float, targets: Float, paths: Float) -> Bool:
-        """Which candidates are inside the workspace, free when they appear, and reached without detours."""
+        """Return which targets are in the workspace, free when they appear, and have a direct path within reach."""
         low, high = (np.array(corner) for corner in self.arm.workspace)
         inside = ((targets >= low) & (targets <= high)).all(axis=-1)
         inside &= np.asarray(self.arm.reach_margin(targets)) > self.distribution.reach_margin
@@ -201,7 +198,7 @@ class ChangeSampler:
         return free
 
     def _courses(self, generators: Sequence[np.random.Generator], scenes: Scenes) -> tuple[Float, Float]:
-        """Where obstacles are at the start, and their courses; where none fits an obstacle stands still."""
+        """Return obstacles at the start and their courses; an obstacle stands still if no course fits."""
         d, (number, rows) = self.distribution, scenes.obstacles.shape[:2]
         size, dimension = rows * CANDIDATES, scenes.start.shape[-1]
         u = Uniforms(np.stack([generator.random(9 * size) for generator in generators]))
@@ -233,19 +230,16 @@ class ChangeSampler:
         return np.asarray(speed[..., None] * self._direction(angle, uniforms.take(size), dimension))
 
     def _direction(self, angle: Float, height: Float, dimension: int) -> Float:
-        """Unit vectors; in space they climb or fall by as much as a number from 0 to 1 says."""
-        if dimension == 2:
-            return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-        rise = self.distribution.steepness * (2.0 * height - 1.0)
-        level = np.sqrt(1.0 - rise**2)
-        return np.stack((level * np.cos(angle), level * np.sin(angle), rise), axis=-1)
+        """Return unit vectors; in space a uniform number, the height, makes them climb or fall."""
+        steepness = self.distribution.steepness if dimension == 3 else 0.0
+        return directions(angle, steepness * (2.0 * height - 1.0), dimension)
 
     def _free(self, many: ChangingScenes) -> Bool:
-        """Which obstacles leave start and goal free at first, and the goal while movements may end."""
+        """Return which obstacles leave start and goal free at first, and the goal while movements may end."""
         d, dimension = self.distribution, many.start.shape[-1]
         good = (np.abs(many.obstacles[..., :dimension]) < FARTHEST_CENTRE).all(axis=-1)
         at_first = np.linspace(0.0, 0.2 * self._centre, 3)
-        at_last = np.append(0.0, np.linspace(self._shortest, 1.2 * self._longest, LOOKS))
+        at_last = np.append(0.0, np.linspace(self._shortest, 1.2 * self._longest, N_TIMES))
         for point, times in ((many.start, at_first), (many.goal, at_last)):
             rows = many.places(np.repeat(times[None], len(point), axis=0))
             scenes = Scenes(many.start, many.goal, rows.reshape(len(rows), -1, rows.shape[-1]))
@@ -255,7 +249,7 @@ class ChangeSampler:
 
 
 def _moved(many: ChangingScenes, time: Float) -> Float:
-    """Every obstacle at a time of its own, shape (N, n), [s]: rows of shape (N, n, 2 D + 1)."""
+    """Return obstacles, shape (N, n, 2 D + 1), each at a time of its own, shape (N, n), [s]."""
     number, rows = time.shape
     each = ChangingScenes(
         np.repeat(many.start, rows, axis=0),

@@ -121,7 +121,9 @@ class SceneSampler:
             where = pending[each]
             given = None if ends is None else (ends[0][where], ends[1][where])
             found, attempt = self._attempt(Uniforms(some.reshape(-1, self._size)), given)
-            solved, first = np.unique(each[found], return_index=True)
+            owner = each[found]
+            first = np.flatnonzero(np.diff(owner, prepend=-1))
+            solved = owner[first]
             scenes.put(pending[solved], attempt.take(first))
             good[solved] = begin + found[first] % some.shape[1]
             rest, begin = np.flatnonzero(good < 0), begin + several
@@ -133,10 +135,10 @@ class SceneSampler:
         u = uniforms.take_table(order.n_ends, 2 * arm.dimension, by_column=order.by_column)
         start, goal, good = sample_ends(u, arm, d.distance, d.steepness, d.reach_margin, ends)
         rows = np.flatnonzero(good)
-        uniforms = uniforms.at(rows)
+        uniforms, start, goal = uniforms.at(rows), start[rows], goal[rows]
         u = uniforms.take_table(order.n_paths, self._obstacles.path_numbers, by_column=order.by_column)
         steered = self._obstacles.steered(uniforms, len(rows))
-        feasible, good = sample_paths(u, arm, start[rows], goal[rows], d.reach_margin, steered)
+        feasible, good = sample_paths(u, arm, start, goal, d.reach_margin, steered)
         some = np.flatnonzero(good)
         rows, feasible = rows[some], feasible.take(some)
         obstacles = np.zeros((0, self._obstacles.rows, 2 * arm.dimension + 1))

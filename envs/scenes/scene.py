@@ -1,4 +1,4 @@
-"""Scenes: where a movement starts and ends, and what stands in its way."""
+"""Scenes: start, goal and obstacles of a movement, and checks of them."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Scenes(NamedTuple):
 
     @property
     def present(self) -> Bool:
-        """Whether a row is an obstacle, shape (N, n): an absent one has no radius."""
+        """Rows that are obstacles, shape (N, n); absent ones have no radius."""
         return self.obstacles[..., -1] > 0.0
 
     def take(self, rows: Any) -> Scenes:
-        """The scenes at `rows`, an index, slice or mask."""
+        """Return the scenes at `rows`, an index, slice or mask."""
         return Scenes(self.start[rows], self.goal[rows], self.obstacles[rows])
 
     def put(self, rows: Any, scenes: Scenes) -> None:
@@ -60,19 +60,19 @@ class Scenes(NamedTuple):
             mine[rows] = theirs
 
     def as_options(self) -> dict[str, Float]:
-        """What `reset(options=...)` of the environments takes."""
+        """Return the scenes as options of `reset`."""
         return dict(self._asdict())
 
 
 def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tuple[str, str]], Scenes]:
-    """The paper's obstacle paradigm: a row of lights across the middle of the line between each two targets.
+    """Return the obstacle paradigm of Flash & Hogan 1985: a row of lights across the middle of each movement.
 
     Args:
-        length: Of the row, [m]; the paper's rows were up to 25 cm long.
-        radius: Of the row, [m].
+        length: Length of the row, [m]; the paper's rows were up to 25 cm long.
+        radius: Radius of the row, [m].
 
     Returns:
-        The ordered pairs of targets, 0.3 m or more apart, and their scenes.
+        Ordered pairs of targets, 0.3 m or more apart, and their scenes.
     """
     pairs = [
         (a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3
@@ -86,14 +86,14 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
 
 
 Problem = tuple[Bool, Callable[[int], str]]
-"""Which scenes have a fault, shape (N,), and the words for it in one of them."""
+"""Mask of the scenes that have a fault, shape (N,), and a function that describes it in one of them."""
 
 
 def check_scenes(scenes: Scenes, collision_model: CollisionModel) -> None:
-    """Refuse a scene that no movement can start or end in.
+    """Check that a movement can start and end in each scene.
 
     Raises:
-        ValueError: With the scene, the offender and what is allowed.
+        ValueError: A scene is impossible; the message names the scene, the fault and the allowed values.
     """
     for wrong, reason in problems(scenes, collision_model):
         if wrong.any():
@@ -102,7 +102,7 @@ def check_scenes(scenes: Scenes, collision_model: CollisionModel) -> None:
 
 
 def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Problem]:
-    """Everything that can be wrong with N scenes."""
+    """Yield the faults that N scenes can have."""
     yield from _problems_of_ends(scenes, collision_model.arm)
     yield from _problems_of_sizes(scenes)
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
@@ -118,6 +118,7 @@ def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Proble
 
 
 def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
+    """Yield the faults of starts and goals."""
     apart = norm(scenes.goal - scenes.start)
     yield (
         apart < MIN_GOAL_DISTANCE,
@@ -134,6 +135,7 @@ def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
 
 
 def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
+    """Yield the faults of single obstacles."""
     dimension = scenes.start.shape[-1]
     half = norm(scenes.obstacles[..., dimension : 2 * dimension])
     radius = scenes.obstacles[..., -1]
@@ -156,7 +158,13 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
 
 
 def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:
-    """Clearance of the arm, its hand at rest at `point` (N, D), from n obstacles and one far away: (N, n + 1), [m]."""
+    """Return the clearance of an arm at rest from n obstacles and one far away, shape (N, n + 1), [m].
+
+    Args:
+        scenes: N scenes.
+        point: Positions of the hand, shape (N, D), [m].
+        collision_model: Arm, and the bodies that count.
+    """
     arm = collision_model.arm
     hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
     if collision_model.whole_arm:
@@ -168,4 +176,5 @@ def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel
 
 
 def _shown(values: Float) -> str:
+    """Return numbers as text."""
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"

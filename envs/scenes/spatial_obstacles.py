@@ -10,7 +10,7 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import squared_length
 from viapoint.envs.common.types import Bool, Float, Index, Int
 from viapoint.envs.scenes.config import SpaceDistribution
-from viapoint.envs.scenes.draws import FeasiblePath, Uniforms, shuffle_rows, whole_between
+from viapoint.envs.scenes.draws import FeasiblePath, Uniforms, present_first, shuffle_rows, whole_between
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS
 from viapoint.envs.scenes.spatial_families import BUILDER_NUMBERS, SpatialSite, draw_obstacles
@@ -84,7 +84,8 @@ class SpatialObstacles:
         added[some], good[some] = self._add(
             others[some], feasible.take(some), hardness[some], swept.take(some), missing[some]
         )
-        return shuffle_rows(np.concatenate((chosen, added), axis=1), order), good
+        both = present_first(np.concatenate((chosen, added), axis=1), self.rows)
+        return shuffle_rows(both, order), good
 
     def _build(
         self, which: Int, u: Float, hardness: Float, feasible: FeasiblePath, swept: SweptVolume

@@ -1,4 +1,4 @@
-"""The space that an arm sweeps, as scenes are drawn around it: quick, and no more exact than that needs."""
+"""Swept volume of an arm, in single precision: clearance of obstacles that are drawn around it."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
 
 OUTER = 5
-"""Links next to the hand: what is drawn near it concerns them first, and only what is chosen concerns the others."""
+"""Links next to the hand, which obstacles near its path touch first; only chosen obstacles are compared with others."""
 LENGTH = 1e-4
-"""A hand alone is a link of that length, as a link must have one, [m]."""
+"""Length of the link that stands for a hand alone, [m]: a link must have a length."""
 ABOVE = 0.06
-"""How far sideways what is above the hand may be, [m]."""
+"""Greatest horizontal distance of links that count as above the hand, [m]."""
 SIZE_ROUNDING = 1e-4
-"""More than what rounding adds to a distance, [m]."""
+"""Upper bound of the rounding error of a distance, [m]."""
 
 
 class LinkBodies(NamedTuple):
-    """Some links of an arm at T times of N movements."""
+    """B links of an arm at T times of N movements."""
 
     ends: Single
-    """Of their axes, with components apart in memory, shape (2, 3, N, B, T), [m]."""
+    """End points of the links' axes, components apart in memory, shape (2, 3, N, B, T), [m]."""
     balls: Single
-    """Centres of balls around the B links, :func:`lift_quadratic`, shape (N, 5, B, T)."""
+    """Centres of balls around the links, lifted by :func:`lift_quadratic`, shape (N, 5, B, T)."""
     around: Single
     """Radii of the balls, shape (B,), [m]."""
     radii: Single
-    """Of the links, shape (B,), [m]."""
+    """Radii of the links, shape (B,), [m]."""
 
     @classmethod
     def of(cls, ends: Single, radii: tuple[float, ...]) -> LinkBodies:
-        """Links whose axes end there, shape (2, 3, N, B, T), [m], and their radii, [m]."""
+        """Return links of end points, shape (2, 3, N, B, T), [m], and radii, [m]."""
         links, size = np.ascontiguousarray(ends), np.array(radii, np.float32)
         balls = lift_quadratic(np.moveaxis(np.float32(0.5) * (links[0] + links[1]), 0, 1))
         half = 0.5 * np.sqrt(np.add.reduce(np.square(links[1] - links[0])).max(axis=(0, 2), initial=0.0))
@@ -51,17 +51,17 @@ class LinkBodies(NamedTuple):
         floor: float = -np.inf,
         together: int = 1,
     ) -> Float:
-        """Least clearance over time from each of n obstacles, or from those that belong together, less a margin.
+        """Return the least clearance over time from each obstacle, or group of obstacles, less a margin.
 
-        A link is at least as far away as the ball around it. Only balls that come near enough to matter are looked
-        into, so narrow bounds are quick.
+        Broad phase: the ball around a link bounds its clearance from below. Narrow phase: exact distances are computed
+        for the nearest ball, then for all balls whose bound is below that result.
 
         Args:
-            rows: Obstacles, shape (N, n, 7), [m]; those without a radius are none, and as far away as `most`.
-            most: Greatest number that matters, [m].
-            margin: To subtract at each time, shape (T,), or at all of them, [m].
-            floor: Below it one number is as good as another, [m].
-            together: How many rows belong together.
+            rows: Obstacles, shape (N, n, 7), [m]; absent ones, without a radius, are as far away as `most`.
+            most: Upper limit of the result, [m]; a low one saves time.
+            margin: Margin at each time, shape (T,), or at all times, [m].
+            floor: Value below which the result need not be exact, [m].
+            together: Rows of a group.
 
         Returns:
             Shape (N, n / together), [m]; no more than `most`.
@@ -91,15 +91,15 @@ class LinkBodies(NamedTuple):
         return least.reshape(shape)
 
     def every_other(self) -> LinkBodies:
-        """The same at every other time."""
+        """Return the links at every other time."""
         return self._replace(ends=self.ends[..., ::2], balls=self.balls[..., ::2])
 
     def take(self, movements: Int) -> LinkBodies:
-        """Some of the movements."""
+        """Return some of the movements."""
         return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
 
     def _between(self, rows: Float, row: Int, ball: Int) -> Float:
-        """Clearance of obstacles, the index of each among all rows, each from one link at one time, shape (M,), [m]."""
+        """Return clearances, shape (M,), [m], of pairs of an obstacle and a link at one time."""
         links, times = self.balls.shape[2:]
         ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
         obstacles = rows.reshape(-1, 7).take(row, axis=0)
@@ -111,14 +111,14 @@ class LinkBodies(NamedTuple):
 
 
 class SweptVolume(NamedTuple):
-    """Where an arm is on N movements, the links near its hand and the others."""
+    """Links of an arm on N movements: those near its hand (outer) and the others (inner)."""
 
     outer: LinkBodies
     inner: LinkBodies
 
     @classmethod
     def of(cls, collision_model: CollisionModel, hand: Float) -> SweptVolume:
-        """Of an arm, or its hand alone, whose hand takes paths of shape (N, T, 3), [m]."""
+        """Return the swept volume of an arm, or of its hand alone, on paths of the hand, shape (N, T, 3), [m]."""
         arm = collision_model.arm
         if collision_model.whole_arm:
             links, radii = np.asarray(arm.links(arm.inverse_kinematics(hand))), arm.link_radii
@@ -132,11 +132,11 @@ class SweptVolume(NamedTuple):
         )
 
     def top(self, phase: Int, place: Float) -> Float:
-        """Height of what of the links near the hand stands above it, at K times of each movement.
+        """Return the height of the links above the hand, at K times of each movement.
 
         Args:
-            phase: Index of the times, shape (N, K).
-            place: The hand then, shape (N, K, 3), [m].
+            phase: Indices of the times, shape (N, K).
+            place: Positions of the hand then, shape (N, K, 3), [m].
 
         Returns:
             Shape (N, K), [m].
@@ -148,5 +148,5 @@ class SweptVolume(NamedTuple):
         return np.asarray(np.where(apart < ABOVE, high, z).max(axis=(-2, -1)))
 
     def take(self, movements: Int) -> SweptVolume:
-        """Some of the movements."""
+        """Return some of the movements."""
         return SweptVolume(*(bodies.take(movements) for bodies in self))
