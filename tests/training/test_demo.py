@@ -7,7 +7,7 @@ import pytest
 from viapoint.training.cli import demo
 from viapoint.training.config.configs import DemoConfig
 from viapoint.training.io.files import BadFileError
-from viapoint.training.runs.callback import Monitor, TrainingStoppedError
+from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
 
 FILES = (
     "table.md",
@@ -48,7 +48,7 @@ def test_everything_is_there_and_a_second_call_only_shows_it(quick, capsys, monk
     def never(*args, **kwargs):
         pytest.fail("did again what was done")
 
-    for name in ("train", "evaluate_methods", "gallery", "film"):
+    for name in ("train", "evaluate_methods", "gallery", "record_video"):
         monkeypatch.setattr(demo, name, never)
     demo.run(quick)
     second = capsys.readouterr().out
@@ -58,14 +58,14 @@ def test_everything_is_there_and_a_second_call_only_shows_it(quick, capsys, monk
 
 
 def test_an_interrupted_demo_goes_on(quick, capsys, monkeypatch):
-    begin = Monitor._on_training_start
+    begin = RunCallback._on_training_start
 
     def interrupted(self):
         begin(self)
         self._stop = True
 
     with monkeypatch.context() as patch:
-        patch.setattr(Monitor, "_on_training_start", interrupted)
+        patch.setattr(RunCallback, "_on_training_start", interrupted)
         with pytest.raises(TrainingStoppedError, match="viapoint demo again"):
             demo.run(quick)
     demo.run(quick)

@@ -85,9 +85,9 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     """Load a model.
 
     Args:
-        folder: That :func:`save_model` wrote.
-        env: To train it on; without one it gets a single environment of its own kind, and is fit for
-            decisions.
+        folder: Model folder.
+        env: Environment to train on; if not given, one environment of the model's own kind, and a small replay buffer,
+            as decisions need.
 
     Raises:
         BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
@@ -135,13 +135,13 @@ def build(
     """Build a new model from plain values.
 
     Args:
-        algorithm: One of ALGORITHMS.
+        algorithm: Name of the algorithm, one of ALGORITHMS.
         policy: Name of the policy.
-        env: To learn on.
+        env: Environment to learn on.
         hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
             writes them.
         discount_unit: Time that counts gamma [s]; None where a decision does, whatever it takes.
-        seed: Of the algorithm.
+        seed: Seed of the algorithm.
 
     Raises:
         ValueError: There is no such algorithm or policy, or it cannot discount by time.

@@ -68,7 +68,7 @@ def evaluate(config: EvaluateConfig) -> None:
     record = result.to_dict()
     report.show(record)
     if run is not None:
-        name = _kept_as(config.scenes, whole, len(scenes.share), partial=result.partial)
+        name = _evaluation_name(config.scenes, whole, len(scenes.share), partial=result.partial)
         print(f"kept as {run.write_evaluation(name, record)}")
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
@@ -85,7 +85,7 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
 
-def _kept_as(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
+def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
     """Return a file name that is unique to the scenes of an evaluation and to their number."""
     name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
     name += "" if number == len(whole.share) else f".first-{number}"
@@ -96,7 +96,7 @@ def _check_failures(agent: Agent | None) -> None:
     """Check that an agent's actions are whole movements.
 
     Raises:
-        ValueError: They are not.
+        ValueError: Its actions are something else.
     """
     env_id = "" if agent is None else agent.env_id
     if env_id in STEP_TASKS or env_id in ONLINE_TASKS:
@@ -109,7 +109,7 @@ def play(config: PlayConfig) -> None:
 
     agent = load_agent(config.agent)
     scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
-    rows = spread(len(scenes.start), config.n_scenes)
+    rows = evenly_spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     method = agent_method(
         f"agent, {config.checks} checks" if config.checks else "agent", agent, config.checks
@@ -120,7 +120,7 @@ def play(config: PlayConfig) -> None:
     print(f"{len(rows)} movements: {config.video}")
 
 
-def spread(number: int, count: int) -> Any:
+def evenly_spread(number: int, count: int) -> Any:
     """Return at most `count` indices, evenly spread over `number`."""
     return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
 from viapoint.training.algorithms.model_io import untrained
-from viapoint.training.cli.commands import progress_bar, spread
+from viapoint.training.cli.commands import evenly_spread, progress_bar
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods
@@ -98,7 +98,7 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
     inner: Any = env.unwrapped
     by_difficulty = np.argsort(-frozen.share, kind="stable")
     result = []
-    for row in by_difficulty[spread(len(by_difficulty), count)]:
+    for row in by_difficulty[evenly_spread(len(by_difficulty), count)]:
         scene = frozen.scenes.take([row])
         observation, _ = env.reset(options=scene.as_options())
         action, _ = agent.predict(observation, deterministic=True)
@@ -175,7 +175,7 @@ def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     record_video(
         path,
         env,
-        frozen.scenes.take(spread(len(frozen.share), MOVEMENTS)),
+        frozen.scenes.take(evenly_spread(len(frozen.share), MOVEMENTS)),
         agent_method("agent", agent, 0).decide,
     )
     env.close()

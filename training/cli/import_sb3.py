@@ -37,8 +37,8 @@ def run(config: ImportConfig) -> None:
     """Convert an archive and print where the model is.
 
     Raises:
-        NotTrustedError: Neither `--trust` was given nor the question answered with yes.
-        BadFileError: It is no such archive, or not of a model for the environment; or the folder is in use.
+        NotTrustedError: `--trust` was not given and the question not answered with yes.
+        BadFileError: The file is no such archive, or its model is for another environment; or the folder is in use.
     """
     if config.out.exists() and (not config.out.is_dir() or any(config.out.iterdir())):
         raise BadFileError(config.out, "is not empty; name another folder")
@@ -55,7 +55,7 @@ def algorithm_of(path: Path) -> str:
     """Return the algorithm of an archive from the names in its description, without opening its objects.
 
     Raises:
-        BadFileError: It is no archive of Stable-Baselines3, or of an algorithm that is not known here.
+        BadFileError: The file is no archive of Stable-Baselines3, or of another algorithm.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -77,7 +77,7 @@ def convert(path: Path, algo: str, env_id: str, out: Path) -> Agent:
     """Open an archive, which runs its code, write its model, and return the agent loaded from it.
 
     Raises:
-        BadFileError: It cannot be opened, is not for the environment, or has parts of its own making.
+        BadFileError: The archive cannot be opened, is for another environment, or holds objects of other packages.
     """
     kind: Any = ALGORITHMS[algo]
     try:

@@ -84,8 +84,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     """Return the configuration that a command line stands for.
 
     Args:
-        words: Of the command line, without the program's name.
-        usual: Of the command's configuration, what stands for everything that is not told; its defaults if not given.
+        words: Words of the command line, without the program's name.
+        usual: Configuration with defaults for everything that the words do not name; that of the command if not given.
 
     Raises:
         SystemExit: Help was asked for; code 0.
@@ -114,7 +114,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     except SystemExit as end:
         if not end.code:
             raise
-        raise UsageError(_unboxed(complaint.getvalue())) from None
+        raise UsageError(_without_frame(complaint.getvalue())) from None
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
@@ -127,7 +127,7 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
     check_unchanged(run, parse(words, usual), usual)
 
 
-def _unboxed(text: str) -> str:
+def _without_frame(text: str) -> str:
     """Return the words in tyro's boxes without frame, title and rules.
 
     Where the output knows only ASCII, there is no frame, and a rule follows the title.

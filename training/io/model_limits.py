@@ -50,7 +50,7 @@ def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
     Torch reserves memory for a layer before it touches it, and the check comes between the two.
 
     Raises:
-        ValueError: Somebody builds more.
+        ValueError: A network with more parameters is built.
     """
     there = sum(int(np.prod(array.shape)) for array in arrays.values())
     left = there + SPARE_PARAMETERS

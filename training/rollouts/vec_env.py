@@ -56,7 +56,7 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
 class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
-    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy, and is 3 to 7 times as
+    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy, and is 2 to 7 times as
     fast (64 copies on two cores; `viapoint bench` measures the ratio). Episodes may have one step or many, and may end
     at different times.
 

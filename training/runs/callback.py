@@ -60,7 +60,7 @@ class TrainingStoppedError(Exception):
     """Exit code of shells for Ctrl-C."""
 
 
-class Monitor(BaseCallback):
+class RunCallback(BaseCallback):
     """Callback that validates, keeps the best model, writes checkpoints and logs, and shows progress.
 
     It acts between two collections of experience, when the state of a run is complete. It draws no random numbers of
@@ -110,7 +110,7 @@ class Monitor(BaseCallback):
         return f"{self.config.algo} on {self.config.env.rpartition('/')[2]}"
 
     @contextmanager
-    def _showing(self, work: str) -> Iterator[None]:
+    def _progress_title(self, work: str) -> Iterator[None]:
         """Show the current work in the progress bar."""
         self._bar.set_description(work)
         try:
@@ -118,7 +118,7 @@ class Monitor(BaseCallback):
         finally:
             self._bar.set_description(self._title)
 
-    def __enter__(self) -> Monitor:
+    def __enter__(self) -> RunCallback:
         self._bar = tqdm(
             total=self.config.total_timesteps,
             unit=" decisions",
@@ -157,9 +157,9 @@ class Monitor(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        self._between(final=False)
+        self._run_due_actions(final=False)
         if self._stop:
-            self._keep()
+            self._save_checkpoint()
             self.run.save("final", self.model)
             raise TrainingStoppedError(
                 f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
@@ -167,26 +167,26 @@ class Monitor(BaseCallback):
             )
 
     def _on_training_end(self) -> None:
-        self._between(final=True)
+        self._run_due_actions(final=True)
 
-    def _between(self, *, final: bool) -> None:
-        validates = self._validation is not None and (self._due("evaluation") or final)
+    def _run_due_actions(self, *, final: bool) -> None:
+        validates = self._validation is not None and (self._is_due("evaluation") or final)
         if self._validation is not None and validates:
             self._validate(self._validation)
-        if self._due("log") or validates or final:
+        if self._is_due("log") or validates or final:
             self._log()
-        if self._due("checkpoint") or final:
-            self._keep()
+        if self._is_due("checkpoint") or final:
+            self._save_checkpoint()
 
-    def _due(self, what: str) -> bool:
+    def _is_due(self, what: str) -> bool:
         """Return whether an action is due, and schedule the next one if so."""
         if self.num_timesteps < self._next[what]:
             return False
         self._next[what] = (self.num_timesteps // self._every[what] + 1) * self._every[what]
         return True
 
-    def _keep(self) -> None:
-        with self._showing("saving a checkpoint"):
+    def _save_checkpoint(self) -> None:
+        with self._progress_title("saving a checkpoint"):
             self.run.checkpoint(self.model, self.state())
 
     def _validate(self, frozen: FrozenScenes) -> None:
@@ -194,7 +194,7 @@ class Monitor(BaseCallback):
         if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
             return
         seconds, began = self.seconds, time.monotonic()
-        with self._showing(f"validating in {len(frozen.share)} scenes"):
+        with self._progress_title(f"validating in {len(frozen.share)} scenes"):
             result = evaluate_methods(
                 [agent_method("agent", self.model)],
                 frozen,
@@ -210,7 +210,7 @@ class Monitor(BaseCallback):
         ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
-            with self._showing("saving the best model"):
+            with self._progress_title("saving the best model"):
                 self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began
@@ -228,9 +228,9 @@ class Monitor(BaseCallback):
             **{name: summary[name] for name in VALIDATED.values() if name != "decision_time"},
         }
         for tag, name in VALIDATED.items():
-            self._note(tag, record[name])
+            self._log_value(tag, record[name])
         for band, rate in record["success_by_band"].items():
-            self._note(BAND_TAGS[band], rate)
+            self._log_value(BAND_TAGS[band], rate)
         return record
 
     def _decision_time(self) -> float:
@@ -244,7 +244,7 @@ class Monitor(BaseCallback):
             times.append(time.perf_counter() - began)
         return float(np.median(times[1:]))
 
-    def _note(self, tag: str, value: Any) -> None:
+    def _log_value(self, tag: str, value: Any) -> None:
         """Log a number or a rate; None, the median of no values, is skipped."""
         number = value["rate"] if isinstance(value, dict) else value
         if number is not None:

@@ -56,12 +56,12 @@ def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any
         "model": describe(model),
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "recent": {name: list(getattr(model, name) or ()) for name in DEQUES},
-        "parameters": _take(model.get_parameters(), "parameters", tensors),
-        "variables": _take(_variables(model), "variables", tensors),
-        "arrays": _take({name: getattr(model, name) for name in ARRAYS}, "arrays", tensors),
-        "buffer": _take(_buffer_state(model), "buffer", tensors),
-        "random": _take(_random_state(model), "random", tensors),
-        "env": _take(_env(model).state(), "env", tensors),
+        "parameters": _extract_arrays(model.get_parameters(), "parameters", tensors),
+        "variables": _extract_arrays(_variables(model), "variables", tensors),
+        "arrays": _extract_arrays({name: getattr(model, name) for name in ARRAYS}, "arrays", tensors),
+        "buffer": _extract_arrays(_buffer_state(model), "buffer", tensors),
+        "random": _extract_arrays(_random_state(model), "random", tensors),
+        "env": _extract_arrays(_env(model).state(), "env", tensors),
         "extra": dict(extra),
     }
 
@@ -78,12 +78,12 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     """Set a newly built model of the same kind and its environment to the state of a checkpoint.
 
     Returns:
-        What `extra` was.
+        Content of `extra`.
 
     Raises:
         BadFileError: The checkpoint is torn, foreign, or of another model.
     """
-    state = _whole(folder)
+    state = _verified_state(folder)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
     difference = _difference(state["model"], describe(model))
     if difference:
@@ -98,7 +98,7 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     return extra
 
 
-def _whole(folder: Path) -> dict[str, Any]:
+def _verified_state(folder: Path) -> dict[str, Any]:
     """Return the content of `state.json` after checking the hashes of both files."""
     path, tensors = folder / "state.json", folder / "tensors.safetensors"
     state = read_json(path)
@@ -130,8 +130,8 @@ def _file_digest(path: Path) -> str:
 
 def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:
     """Set the attributes that a checkpoint holds; the code determines which ones, never the file."""
-    model.set_parameters(_torch(_put(state["parameters"], tensors)), exact_match=True)
-    variables, arrays = _put(state["variables"], tensors), _put(state["arrays"], tensors)
+    model.set_parameters(_torch(_insert_arrays(state["parameters"], tensors)), exact_match=True)
+    variables, arrays = _insert_arrays(state["variables"], tensors), _insert_arrays(state["arrays"], tensors)
     for name in _variables(model):
         recursive_setattr(model, f"{name}.data", torch.from_numpy(variables[name]))
     for name in COUNTERS:
@@ -140,9 +140,9 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any
         setattr(model, name, arrays[name])
     for name in DEQUES:
         setattr(model, name, deque(state["recent"][name], maxlen=model._stats_window_size))
-    _restore_buffer(model, _put(state["buffer"], tensors))
-    _env(model).restore(_put(state["env"], tensors))
-    _restore_random(model, _put(state["random"], tensors))  # last: nothing may be drawn after it
+    _restore_buffer(model, _insert_arrays(state["buffer"], tensors))
+    _env(model).restore(_insert_arrays(state["env"], tensors))
+    _restore_random(model, _insert_arrays(state["random"], tensors))  # last: nothing may be drawn after it
 
 
 def _variables(model: BaseAlgorithm) -> dict[str, Any]:
@@ -218,7 +218,7 @@ def _env(model: BaseAlgorithm) -> ViaVecEnv:
     return env
 
 
-def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
+def _extract_arrays(value: Any, name: str, tensors: dict[str, Any]) -> Any:
     """Return a copy of nested values in which {"tensor": name} replaces each array, and add the arrays to `tensors`."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
@@ -227,24 +227,24 @@ def _take(value: Any, name: str, tensors: dict[str, Any]) -> Any:
         return {"tensor": name}
     if isinstance(value, Mapping):
         whole = [str(key) for key in value if isinstance(key, int)]
-        entries = {str(key): _take(each, f"{name}/{key}", tensors) for key, each in value.items()}
+        entries = {str(key): _extract_arrays(each, f"{name}/{key}", tensors) for key, each in value.items()}
         return {"whole_numbers": entries} if whole else entries
     if isinstance(value, list | tuple):
-        return [_take(each, f"{name}/{i}", tensors) for i, each in enumerate(value)]
+        return [_extract_arrays(each, f"{name}/{i}", tensors) for i, each in enumerate(value)]
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _put(value: Any, tensors: Mapping[str, Any]) -> Any:
-    """Invert :func:`_take`, with arrays in place of torch tensors."""
+def _insert_arrays(value: Any, tensors: Mapping[str, Any]) -> Any:
+    """Invert :func:`_extract_arrays`, with arrays in place of torch tensors."""
     if isinstance(value, list):
-        return [_put(each, tensors) for each in value]
+        return [_insert_arrays(each, tensors) for each in value]
     if not isinstance(value, dict):
         return value
     if set(value) == {"tensor"}:
         return tensors[value["tensor"]]
     if set(value) == {"whole_numbers"}:
-        return {int(key): _put(each, tensors) for key, each in value["whole_numbers"].items()}
-    return {key: _put(each, tensors) for key, each in value.items()}
+        return {int(key): _insert_arrays(each, tensors) for key, each in value["whole_numbers"].items()}
+    return {key: _insert_arrays(each, tensors) for key, each in value.items()}
 
 
 def _torch(value: Any) -> Any:

@@ -103,7 +103,7 @@ class Run:
         folder = config.folder
         check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with _held(folder):
+        with _lock(folder):
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
             _write_config(folder, config)
@@ -176,8 +176,8 @@ class Run:
         """Set a model to the state of the newest intact checkpoint.
 
         Returns:
-            What the checkpoint carried besides, None where there is no checkpoint at all; and why newer ones
-            were passed over.
+            Content of `extra`, None without any checkpoint; and the reasons why newer checkpoints were
+            skipped.
 
         Raises:
             BadFileError: There are checkpoints, but none is whole; the message is about the newest.
@@ -206,7 +206,7 @@ class Run:
         Raises:
             BadFileError: Another process trains in the folder.
         """
-        with _held(self.folder):
+        with _lock(self.folder):
             for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
                 tidy(folder)
             yield
@@ -217,7 +217,7 @@ class Run:
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     """Lock a folder for this process; see :meth:`Run.locked`."""
     lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
     try:
@@ -237,8 +237,8 @@ def check_free(folder: Path) -> None:
     """Check that a folder can hold a new run.
 
     Raises:
-        BadFileError: It holds more than a start left that got no further, or is a file.
-        ValueError: It cannot be written to.
+        BadFileError: The folder holds other files, or is a file.
+        ValueError: The folder cannot be written to.
     """
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")

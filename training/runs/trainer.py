@@ -22,7 +22,7 @@ from viapoint.training.config.discount import ELAPSED
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.callback import Monitor, TrainingStoppedError
+from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
 from viapoint.training.runs.run_dir import Run, check_free, versions
 
 __all__ = [
@@ -81,17 +81,17 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
         if config.resume:
             run = Run(config.folder)
             with run.locked():
-                _take_up(run, config)
-                with _built(run.config) as model:
-                    _carry_on(run, model, callback)
+                _restore_settings(run, config)
+                with _untrained_model(run.config) as model:
+                    _continue_training(run, model, callback)
             return run
         check_free(config.folder)
         begun = resolved(config)
-        with _built(begun) as model:  # before there is a folder: what cannot be built leaves none
-            _check_tells_time(begun)
+        with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
+            _check_reports_duration(begun)
             run = Run.create(begun)
             with run.locked():
-                _carry_on(run, model, callback)
+                _continue_training(run, model, callback)
         return run
 
 
@@ -124,9 +124,9 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
     """Check that a run is resumed with its own settings.
 
     Args:
-        run: To be resumed.
-        config: What was asked for.
-        usual: What stands for everything that was not.
+        run: Run to resume.
+        config: Configuration of the call.
+        usual: Configuration with defaults for everything that the call does not name.
 
     Raises:
         BadFileError: Something was asked for that the run did not begin with.
@@ -139,8 +139,8 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
         if asked[name] != default[name]:
             others += [(name, each) for each in values if each not in known or known[each] != values[each]]
     if others:
-        had = ", ".join(_told(begun, *each) for each in sorted(others))
-        wanted = ", ".join(_told(asked, *each) for each in sorted(others))
+        had = ", ".join(_in_words(begun, *each) for each in sorted(others))
+        wanted = ", ".join(_in_words(asked, *each) for each in sorted(others))
         raise BadFileError(
             run.folder,
             f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
@@ -149,7 +149,7 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
 
 
 @contextmanager
-def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
+def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end.
 
     Raises:
@@ -176,7 +176,7 @@ def _built(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         env.close()
 
 
-def _check_tells_time(config: TrainConfig) -> None:
+def _check_reports_duration(config: TrainConfig) -> None:
     """Check that decisions report their duration if discounts depend on time."""
     if config.discount_unit is None:
         return
@@ -193,14 +193,14 @@ def _check_tells_time(config: TrainConfig) -> None:
         )
 
 
-def _carry_on(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
+def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
     """Train from the last checkpoint of the run to its end.
 
     Raises:
         TrainingFailedError: A file could not be written.
     """
     try:
-        with _logging(model, run), Monitor(run) as monitor:
+        with _logging(model, run), RunCallback(run) as monitor:
             _learn(model, run, monitor, callback)
     except OSError as error:
         raise TrainingFailedError(
@@ -209,13 +209,13 @@ def _carry_on(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
         ) from error
 
 
-def _told(record: dict[str, Any], field: str, name: str) -> str:
+def _in_words(record: dict[str, Any], field: str, name: str) -> str:
     """Return a setting in words: a field, or one name in a field with several."""
     values = record if field == name else record[field]
     return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
 
 
-def _take_up(run: Run, config: TrainConfig) -> None:
+def _restore_settings(run: Run, config: TrainConfig) -> None:
     """Take over a run's own configuration, except for fields that may change.
 
     Raises:
@@ -243,7 +243,7 @@ def _take_up(run: Run, config: TrainConfig) -> None:
         )
 
 
-def _learn(model: BaseAlgorithm, run: Run, monitor: Monitor, callback: Callbacks) -> None:
+def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callbacks) -> None:
     restored, passed_over = run.restore(model)
     for reason in passed_over:
         print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
