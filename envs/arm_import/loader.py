@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from viapoint.envs.arm_import import mjcf_reader
 from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
@@ -50,12 +50,12 @@ def load_arm(
     hand_site: str,
     joints: Sequence[str],
     name: str | None = None,
-    home: Any = None,
-    origin: Any = None,
-    workspace: Any = None,
-    joint_range: Any = None,
-    torque_limit: Any = None,
-    velocity_limit: Any = None,
+    home: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    workspace: ArrayLike | None = None,
+    joint_range: ArrayLike | None = None,
+    torque_limit: ArrayLike | None = None,
+    velocity_limit: ArrayLike | None = None,
     hand_radius: float = 0.02,
 ) -> SerialArm:
     """Load an arm from an MJCF file.
