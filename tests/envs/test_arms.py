@@ -91,9 +91,7 @@ def test_links_are_known_with_the_hand_in_the_shoulder(library):
         np.testing.assert_allclose(np.asarray(link[0]), exact, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "module", ["arms.planar", "registration"]
-)
+@pytest.mark.parametrize("module", ["arms.planar", "registration"])
 def test_examples_run(module, monkeypatch):
     monkeypatch.chdir(Path(__file__).parents[2])
     results = doctest.testmod(importlib.import_module(f"viapoint.envs.{module}"))
