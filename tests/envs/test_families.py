@@ -185,7 +185,7 @@ def registry(monkeypatch):
 
 
 def test_the_family_of_the_page_stands_on_either_side_of_a_way_that_is_free(registry):
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    _, example = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names = {}
     exec(example, names)
     scenes, start = names["scenes"], names["observation"]["hand"]
