@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from viapoint.training.algorithms.agent import Agent, load_agent
     from viapoint.training.algorithms.extractors import SceneExtractor
-    from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback, timed
+    from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback, time_discount
     from viapoint.training.algorithms.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
@@ -30,7 +30,7 @@ else:
         "ViaVecEnv": "viapoint.training.rollouts.vec_env",
         "evaluate": "viapoint.training.evaluation.evaluator",
         "load_agent": "viapoint.training.algorithms.agent",
-        "timed": "viapoint.training.algorithms.smdp_buffers",
+        "time_discount": "viapoint.training.algorithms.smdp_buffers",
         "train": "viapoint.training.runs.trainer",
     }
 
@@ -55,6 +55,6 @@ __all__ = [
     "ViaVecEnv",
     "evaluate",
     "load_agent",
-    "timed",
+    "time_discount",
     "train",
 ]

@@ -89,7 +89,18 @@ def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
 def family_sampler(task: Task, family: str) -> SceneSampler:
     """Return a sampler of one family of scenes for a task.
 
+    Args:
+        task: Task of an environment, `env.unwrapped.task`.
+        family: Name of the family.
+
     Raises:
         ValueError: There is no such family, or it needs more obstacles than the task has.
+
+    Example:
+        >>> import gymnasium as gym, numpy as np
+        >>> from viapoint.envs import family_sampler
+        >>> env = gym.make("viapoint.envs:viapoint/PandaObstacles-v0")
+        >>> scenes = family_sampler(env.unwrapped.task, "shelf")([np.random.default_rng(0)])
+        >>> observation, _ = env.reset(options=scenes.as_options())
     """
     return sampler_of_family(task.collision_model, task.scenes, family)

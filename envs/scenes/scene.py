@@ -73,6 +73,12 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
 
     Returns:
         Ordered pairs of targets, 0.3 m or more apart, and their scenes.
+
+    Example:
+        >>> from viapoint.envs import rows_of_lights
+        >>> pairs, scenes = rows_of_lights()
+        >>> pairs[0], scenes.obstacles.shape  # one capsule in each scene, [m]
+        (('T1', 'T3'), (14, 1, 5))
     """
     pairs = [
         (a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3

@@ -19,7 +19,7 @@ from viapoint.training.algorithms.smdp_buffers import (
     TimedDictReplayBuffer,
     TimedReplayBuffer,
     TimedRolloutBuffer,
-    timed,
+    time_discount,
 )
 from viapoint.training.config.discount import TimeDiscount
 
@@ -173,7 +173,7 @@ def test_infos_that_do_not_tell_are_refused_by_name():
 def learned(kind, steps, *, key="elapsed", cut=None, callback=None, **settings):
     """Values of the chain's four places after training, and the model."""
     env = DummyVecEnv([lambda: Chain(key, cut)] * 2)
-    by_time = timed(kind, env.observation_space, gamma=GAMMA, unit=UNIT, key=key or "elapsed")
+    by_time = time_discount(kind, env.observation_space, gamma=GAMMA, unit=UNIT, key=key or "elapsed")
     model = kind("MlpPolicy", env, gamma=GAMMA, seed=0, device="cpu", **by_time, **copy.deepcopy(settings))
     model.learn(steps, callback=callback)
     places = torch.eye(len(PAID))
@@ -215,7 +215,7 @@ def test_what_an_episode_is_cut_off_from_is_discounted_by_time(gamma):
     """The value after the cut is a constant of the critic: what SB3 adds with gamma counts by time."""
     env = DummyVecEnv([lambda: Chain(cut=3)])
     model = PPO("MlpPolicy", env, gamma=gamma, gae_lambda=1.0, n_steps=3, batch_size=3, n_epochs=1,
-                learning_rate=1e-12, **timed(PPO, env.observation_space, gamma=gamma, unit=UNIT))  # fmt: skip
+                learning_rate=1e-12, **time_discount(PPO, env.observation_space, gamma=gamma, unit=UNIT))  # fmt: skip
     model.learn(3, callback=ElapsedTimeCallback())
     with torch.no_grad():
         after = float(model.policy.predict_values(torch.eye(4)[3:4]))

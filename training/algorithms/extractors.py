@@ -28,6 +28,13 @@ class SceneExtractor(BaseFeaturesExtractor):
     Args:
         observation_space: Observation space of an environment of this package.
         width: Width of the layers of the obstacle network.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> from viapoint.training import SceneExtractor, ViaVecEnv
+        >>> settings = {"features_extractor_class": SceneExtractor, "net_arch": [256, 256]}
+        >>> env = ViaVecEnv("viapoint/PlanarObstacles-v0", 16, seed=0)
+        >>> agent = SAC("MultiInputPolicy", env, learning_starts=16, buffer_size=100, policy_kwargs=settings).learn(32)
     """
 
     def __init__(self, observation_space: spaces.Dict, width: int = 64) -> None:

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.training.algorithms.extractors import EXTRACTORS
 from viapoint.training.algorithms.minimum_critic import POLICIES as MINIMUM
-from viapoint.training.algorithms.smdp_buffers import timed, unit_of
+from viapoint.training.algorithms.smdp_buffers import time_discount, unit_of
 from viapoint.training.config.discount import check_discount_unit
 from viapoint.training.io.files import (
     BadFileError,
@@ -271,7 +271,7 @@ def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: fl
     kind = ALGORITHMS[algorithm]
     known = inspect.signature(kind).parameters
     gamma = arguments["gamma"] if "gamma" in arguments else known["gamma"].default
-    return timed(kind, env.observation_space, gamma=gamma, unit=unit)
+    return time_discount(kind, env.observation_space, gamma=gamma, unit=unit)
 
 
 def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:

@@ -10,8 +10,8 @@ decision is not discounted, as if it were paid when the decision begins:
 The algorithms of Stable-Baselines3 accept these buffers unchanged. SAC, TD3 and TQC read the discount of each sample
 from the buffer. PPO and A2C pass no infos to their buffer, so `learn` needs :class:`ElapsedTimeCallback`:
 
-    SAC("MlpPolicy", env, gamma=0.98, **timed(SAC, env.observation_space, gamma=0.98, unit=0.1)).learn(10_000)
-    PPO("MlpPolicy", env, gamma=0.98, **timed(PPO, env.observation_space, gamma=0.98, unit=0.1)).learn(
+    SAC("MlpPolicy", env, gamma=0.98, **time_discount(SAC, env.observation_space, gamma=0.98, unit=0.1)).learn(10_000)
+    PPO("MlpPolicy", env, gamma=0.98, **time_discount(PPO, env.observation_space, gamma=0.98, unit=0.1)).learn(
         10_000, callback=ElapsedTimeCallback()
     )
 """
@@ -177,7 +177,17 @@ class TimedDictRolloutBuffer(TimedRolloutBuffer, DictRolloutBuffer):
 
 
 class ElapsedTimeCallback(BaseCallback):
-    """Callback that passes the infos of each step to a :class:`TimedRolloutBuffer`; it ignores other buffers."""
+    """Callback that passes the infos of each step to a :class:`TimedRolloutBuffer`; it ignores other buffers.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from stable_baselines3 import PPO
+        >>> from viapoint.training import ElapsedTimeCallback, time_discount
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarTargetJump-v0")
+        >>> arguments = time_discount(PPO, env.observation_space, gamma=0.98, unit=0.1)
+        >>> agent = PPO("MultiInputPolicy", env, gamma=0.98, n_steps=8, batch_size=8, **arguments)
+        >>> agent = agent.learn(8, callback=ElapsedTimeCallback())
+    """
 
     def _on_step(self) -> bool:
         buffer = self.locals.get("rollout_buffer")
@@ -186,7 +196,7 @@ class ElapsedTimeCallback(BaseCallback):
         return True
 
 
-def timed(
+def time_discount(
     algorithm: type[BaseAlgorithm],
     observation_space: spaces.Space[Any],
     *,
@@ -205,6 +215,14 @@ def timed(
 
     Raises:
         ValueError: See :class:`TimeDiscount`.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from stable_baselines3 import SAC
+        >>> from viapoint.training import time_discount
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarTargetJump-v0")
+        >>> arguments = time_discount(SAC, env.observation_space, gamma=0.98, unit=0.1)
+        >>> agent = SAC("MultiInputPolicy", env, gamma=0.98, learning_starts=8, buffer_size=100, **arguments).learn(12)
     """
     TimeDiscount(gamma=gamma, unit=unit, key=key)
     several = isinstance(observation_space, spaces.Dict)
