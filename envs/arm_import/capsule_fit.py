@@ -23,8 +23,8 @@ RIM_POINTS = 24
 def bounding_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[Float, float]:
     """Return balls whose convex hull is a geom: centres in the world, shape (n, 3), [m], and their common radius, [m].
 
-    Ellipsoids count as their bounding boxes. Cylinders count as inscribed prisms, whose faces are up to 0.9 % of the radius
-    inside. Planes, height fields and other unbounded geoms have no balls.
+    Ellipsoids count as their bounding boxes. Cylinders count as inscribed prisms, whose faces are up to 0.9 % of the
+    radius inside. Planes, height fields and other unbounded geoms have no balls.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
