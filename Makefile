@@ -34,7 +34,6 @@ format: $(READY) ## let ruff put the source in order
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
 	@$(BIN)/python -m viapoint.training.scene_sets.generate
-	@$(BIN)/python -m viapoint.training.scene_sets.generate_replanning
 
 hashes: $(READY) ## hash a thousand episodes of every environment anew
 	@$(BIN)/python benchmarks/reliability_determinism.py --write

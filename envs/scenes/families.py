@@ -103,8 +103,7 @@ def register_scene_family(
 
     Example:
         >>> import gymnasium as gym, numpy as np
-        >>> from viapoint.envs.scenes.families import register_scene_family
-        >>> from viapoint.envs.mdp.task import family_sampler
+        >>> from viapoint.envs import family_sampler, register_scene_family
         >>> def post(uniforms, site):
         ...     '''Return a post in the middle between start and goal.'''
         ...     centre = 0.5 * (site.start + site.goal)

@@ -11,7 +11,7 @@ from viapoint.training.planners.baselines import make_method
 from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.generate_replanning import SIZES, shares
+from viapoint.training.scene_sets.replanning import SIZES, solution_shares
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
@@ -65,7 +65,7 @@ def test_shipped_sets_hold_what_they_promise(env_id):
         assert len(np.unique(frozen.number)) == size
         if env_id == MOVING:
             trial, some = OnlineTrial(env_id, 4), frozen.take(slice(0, 4))
-            np.testing.assert_allclose(shares(trial, some.scenes)[:1], some.share[:1], atol=1e-3)
+            np.testing.assert_allclose(solution_shares(trial, some.scenes)[:1], some.share[:1], atol=1e-3)
 
 
 def test_files_of_changing_scenes_come_back_whole(tmp_path):

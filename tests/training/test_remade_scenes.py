@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from viapoint.training.scene_sets import generate, generate_replanning, scene_set_diff
+from viapoint.training.scene_sets import generate
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 
 ENV = "viapoint/PlanarReach-v0"
@@ -15,7 +15,7 @@ ONLINE = "viapoint/PlanarTargetJump-v0"
 
 def parsed(*words):
     parser = argparse.ArgumentParser()
-    scene_set_diff.add_arguments(parser)
+    generate._add_arguments(parser)
     return parser.parse_args(words)
 
 
@@ -24,17 +24,15 @@ def changed(frozen):
 
 
 @pytest.mark.parametrize("same", [True, False])
-@pytest.mark.parametrize(("module", "env_id"), [(generate, ENV), (generate_replanning, ONLINE)])
-def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(
-    module, env_id, same, monkeypatch, capsys
-):
+@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(env_id, same, monkeypatch, capsys):
     path, frozen = shipped_path("test", env_id), load("test", env_id)
     before, made = path.read_bytes(), frozen if same else changed(frozen)
-    for maker in ("make", "remake"):
-        monkeypatch.setattr(module, maker, lambda *_, **__: made, raising=False)
+    for maker in ("make", "remake", "make_replanning"):
+        monkeypatch.setattr(generate, maker, lambda *_, **__: made)
     monkeypatch.setattr(sys, "argv", ["make", "--env", env_id, "--sets", "test"])
     with pytest.raises(SystemExit) as left:
-        module.main()
+        generate.main()
     assert left.value.code == (0 if same else 1)
     assert ("DIFFERENT" in capsys.readouterr().out) is not same
     assert path.read_bytes() == before
@@ -42,10 +40,10 @@ def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(
 
 def test_scenes_go_where_one_says(tmp_path, monkeypatch):
     frozen = load("test", ENV)
-    assert scene_set_diff.compare_with_shipped([frozen], parsed("--out", str(tmp_path / "new")))
+    assert generate.compare_with_shipped([frozen], parsed("--out", str(tmp_path / "new")))
     assert load(tmp_path / "new" / "planar_reach_test.npz", ENV).sha256 == frozen.sha256
-    monkeypatch.setattr(scene_set_diff, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
-    assert not scene_set_diff.compare_with_shipped([changed(frozen)], parsed("--write"))
+    monkeypatch.setattr(generate, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
+    assert not generate.compare_with_shipped([changed(frozen)], parsed("--write"))
     assert load(tmp_path / "test.npz", ENV).sha256 == changed(frozen).sha256
 
 

@@ -1,42 +1,54 @@
-"""Makes the frozen scenes again and compares them with those shipped.
+"""Command that makes the frozen scenes again and compares them with those shipped.
 
     python -m viapoint.training.scene_sets.generate [--env ID ...] [--sets test ...] [--write | --out DIR]
 
 `validation` and `test` are drawn from the training distribution with seeds that training never uses, a quarter of each
-set in each band of the solution share. `hard` holds scenes of some families, as many of each, all with a share below
-5 %. No agent of the plane is trained on its families; in space they are the narrow ones, one of which is never trained
-on. Every scene was solved in simulation by some of at most 4,096 random actions, so that its difficulty is known, and
-by the planner.
+set in each band of the solution share. `hard` holds equal numbers of scenes of several families, all with a share below
+5 %. No agent in the plane is trained on these families; in space they are the narrow ones, of which `tunnel` is never
+trained on. Every scene was solved in simulation by at least one of at most 4,096 random actions, which gives its
+difficulty, and by the planner.
 
-Searching for scenes takes estimates of their shares, which change with the program. So each scene of a file knows which
-of the drawn scenes it is: what is made again are these, and the hash tells whether scenes and shares are the same.
+The search for scenes uses estimates of their shares, which change with the program. Each scene of a file therefore has
+its number among the drawn scenes. The command draws these scenes again, measures their shares, and compares hashes.
+Scenes that change during an episode: see :mod:`viapoint.training.scene_sets.replanning`.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from viapoint.envs.mdp.task import Task, family_sampler
+from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.scene_sets.replanning import SIZES as REPLANNING_SIZES
+from viapoint.training.scene_sets.replanning import make_replanning
 from viapoint.training.scene_sets.scene_search import Kinds, Source, measured, redrawn, search
-from viapoint.training.scene_sets.scene_set import BAND_EDGES, BANDS, DRAWN, FrozenScenes, bands
-from viapoint.training.scene_sets.scene_set_diff import add_arguments, compare_with_shipped, shipped
+from viapoint.training.scene_sets.scene_set import (
+    BAND_EDGES,
+    BANDS,
+    DRAWN,
+    FrozenScenes,
+    bands,
+    load,
+    shipped_path,
+)
 
 SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017}
 """First seeds of the sets; training draws from seeds below a million."""
 SIZES = {"validation": 500, "test": 1000, "hard": 500}
 WITHOUT_OBSTACLES = 100
-"""Scenes of a set with nothing in the way."""
+"""Number of scenes of a set without obstacles."""
 HARDEST = BAND_EDGES[1]
-"""Shares of hard scenes are less."""
+"""Upper limit of the shares of hard scenes."""
 ALL = ("validation", "test", "hard")
 SETS = {
     "viapoint/PlanarReach-v0": ALL[:2],
@@ -45,7 +57,9 @@ SETS = {
     "viapoint/PandaReach-v0": ALL[:2],
     "viapoint/PandaObstacles-v0": ALL,
 }
-"""Environments with shipped scenes, and their sets."""
+"""Environments without replanning that have shipped scenes, and their sets."""
+ALL_SETS = {**SETS, **dict.fromkeys(ONLINE_TASKS, ALL[:2])}
+"""All environments that have shipped scenes, and their sets."""
 
 
 class Lot(NamedTuple):
@@ -58,10 +72,10 @@ class Lot(NamedTuple):
 
 
 def lots(task: Task, name: str, size: int) -> list[Lot]:
-    """Where the scenes of a set come from.
+    """Return the sources of the scenes of a set.
 
     Args:
-        task: They are for.
+        task: Task of the scenes.
         name: `validation`, `test` or `hard`.
         size: Number of scenes, a multiple of the bands or families.
     """
@@ -88,7 +102,7 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
 
 
 def hard_families(task: Task) -> dict[str, SceneSampler]:
-    """The families of hard scenes of a task, by name."""
+    """Return samplers of the families of hard scenes of a task, by name."""
     families = scene_families(task.arm.dimension)
     return {name: family_sampler(task, name) for name, family in families.items() if family.hard}
 
@@ -97,7 +111,7 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
     """Search for the scenes of a set, measure and certify them.
 
     Args:
-        env_id: The environment they are for.
+        env_id: Environment of the scenes.
         name: `validation`, `test` or `hard`.
         size: Number of scenes N, a multiple of the bands or families; by default the set's.
         threads: Of the simulation, 0 for one per core; the result does not depend on it.
@@ -133,7 +147,7 @@ def remake(frozen: FrozenScenes, threads: int = 0) -> FrozenScenes:
         threads: Of the simulation, 0 for one per core; the result does not depend on it.
 
     Raises:
-        RuntimeError: A solution is none.
+        RuntimeError: A stored solution fails.
     """
     trial = Trial(frozen.env_id, threads=threads)
     starts, goals, obstacles, share = (array.copy() for array in (*frozen.scenes, frozen.share))
@@ -148,7 +162,7 @@ def remake(frozen: FrozenScenes, threads: int = 0) -> FrozenScenes:
     trial.close()
     if not solved.all():
         raise RuntimeError(
-            f"{frozen.env_id} {frozen.name}: the solution of scene {int((~solved).argmax())} is none"
+            f"{frozen.env_id} {frozen.name}: the solution of scene {int((~solved).argmax())} fails"
         )
     return again
 
@@ -160,34 +174,83 @@ def _source(
     block: int,
     levels: tuple[tuple[float, int], ...] = (),
 ) -> Source:
+    """Return a source whose scenes all come from one generator."""
     generator = np.random.default_rng(seed)
     return Source(draw=lambda number: sampler([generator] * number), block=block, levels=levels)
 
 
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where to write; by default, nothing is written."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--write", action="store_true", help="replace the shipped files")
+    where.add_argument("--out", type=Path, help="folder to write to")
+
+
+def shipped(name: str, env_id: str) -> FrozenScenes | None:
+    """Return a set as it is shipped; None if there is none yet."""
+    return load(name, env_id) if shipped_path(name, env_id).is_file() else None
+
+
+def compare_with_shipped(sets: Iterable[FrozenScenes], arguments: argparse.Namespace) -> bool:
+    """Print each set's hash as soon as it is made, write it if asked to, and return True if all are as shipped."""
+    same = True
+    for frozen in sets:
+        before, path = shipped(frozen.name, frozen.env_id), shipped_path(frozen.name, frozen.env_id)
+        if arguments.out is not None:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            frozen.save(arguments.out / path.name)
+        elif arguments.write:
+            frozen.save(path)
+        print(
+            f"{path.name}: {_bands(frozen)}, sha256 {frozen.sha256}: {_verdict(before, frozen)}", flush=True
+        )
+        same &= before is not None and before.sha256 == frozen.sha256
+    return same
+
+
+def _bands(frozen: FrozenScenes) -> str:
+    """Return the number of scenes in each band as text."""
+    counts = ", ".join(f"{label}: {int(np.sum(frozen.band == i))}" for i, label in enumerate(BANDS))
+    return f"{len(frozen.share)} scenes ({counts})"
+
+
+def _verdict(before: FrozenScenes | None, frozen: FrozenScenes) -> str:
+    """Return the result of the comparison as text."""
+    if before is None:
+        return "new"
+    return "as shipped" if before.sha256 == frozen.sha256 else f"DIFFERENT, shipped is {before.sha256}"
+
+
 def main() -> None:
-    """Make the sets named on the command line, or all, and say whether they are as shipped."""
+    """Make the sets named on the command line, or all, and tell by the exit status whether they are as shipped."""
     parser = argparse.ArgumentParser(
         description="Make the frozen scenes again and compare their hashes with those shipped."
     )
-    parser.add_argument("--env", nargs="+", default=list(SETS), choices=list(SETS), help="environment ids")
+    parser.add_argument(
+        "--env", nargs="+", default=list(ALL_SETS), choices=list(ALL_SETS), help="environment ids"
+    )
     parser.add_argument("--sets", nargs="+", default=list(SEEDS), choices=list(SEEDS), help="sets of scenes")
     parser.add_argument(
         "--search", action="store_true", help="choose scenes anew, as for a set not there yet"
     )
     parser.add_argument("--threads", type=int, default=0, help="of the simulation, 0 for one per core")
-    add_arguments(parser)
+    _add_arguments(parser)
     arguments = parser.parse_args()
+    made = (
+        _made(env_id, name, search_anew=arguments.search, threads=arguments.threads)
+        for env_id in arguments.env
+        for name in ALL_SETS[env_id]
+        if name in arguments.sets
+    )
+    raise SystemExit(0 if compare_with_shipped(made, arguments) else 1)
 
-    def each() -> Iterator[FrozenScenes]:
-        for env_id in arguments.env:
-            for name in (name for name in SETS[env_id] if name in arguments.sets):
-                before = None if arguments.search else shipped(name, env_id)
-                if before is None:
-                    yield make(env_id, name, threads=arguments.threads)
-                else:
-                    yield remake(before, threads=arguments.threads)
 
-    raise SystemExit(0 if compare_with_shipped(each(), arguments) else 1)
+def _made(env_id: str, name: str, *, search_anew: bool, threads: int) -> FrozenScenes:
+    """Return a set: searched anew, or drawn again by the numbers of its scenes."""
+    if env_id in ONLINE_TASKS:
+        return make_replanning(env_id, name, REPLANNING_SIZES[name])
+    before = None if search_anew else shipped(name, env_id)
+    return make(env_id, name, threads=threads) if before is None else remake(before, threads=threads)
 
 
 if __name__ == "__main__":

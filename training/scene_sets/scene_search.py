@@ -1,4 +1,4 @@
-"""Finding scenes of given difficulty: drawn, estimated, measured and certified until there are enough of each kind."""
+"""Search for scenes of given difficulty: draw, estimate, measure and certify until there are enough of each kind."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import Trial
 
 SPARE, SAFE = 1.2, 1.1
-"""How many more scenes than needed are taken by the estimated share, and what it is multiplied by, as it errs."""
+"""Factors on the number of scenes that are taken by their estimated share, and on this estimate, as it errs."""
 AT_ONCE = 64
-"""Scenes measured together."""
+"""Scenes that are measured at once."""
 QUICK = PlannerBudget(generations=4)
-"""In space, where simulation takes longer."""
+"""Budget of the planner in space, where simulation takes longer."""
 MOST_DRAWN, MOST_ROUNDS = 1 << 18, 20
-"""Scenes drawn, and how often more are measured or planned, before giving up."""
+"""Limits of the scenes drawn and of the rounds of measuring or planning."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Where scenes come from."""
+    """Source of scenes."""
 
     draw: Callable[[int], Scenes]
-    """The next so many."""
+    """Function that returns the next scenes, given their number."""
     block: int
-    """Scenes drawn together, before the next look at what is missing."""
+    """Number of scenes that are drawn at once."""
     levels: tuple[tuple[float, int], ...] = ()
-    """Where the estimated share is below the first number, it is estimated again from so many plans."""
+    """Pairs (share, plans): shares estimated below the first number are estimated again from so many plans."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kinds:
-    """Which scenes are looked for."""
+    """Kinds of scenes to search for."""
 
     of_share: Callable[[Float], Int]
-    """The kind of each share, -1 for none, shape (N,)."""
+    """Function that returns the kind of each share, -1 for none, shape (N,)."""
     names: tuple[str, ...]
     quota: int
-    """Scenes of each kind."""
+    """Number of scenes of each kind."""
 
 
 class Found(NamedTuple):
@@ -57,23 +57,23 @@ class Found(NamedTuple):
     share: Float
     """Solution shares, shape (N,)."""
     solution: Float
-    """What the planner found, shape (N, m)."""
+    """Actions that the planner found, shape (N, m)."""
     number: Int
-    """Which of the drawn scenes they are, shape (N,)."""
+    """Numbers among the drawn scenes, shape (N,)."""
 
 
 def search(
     trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str, most_drawn: int = MOST_DRAWN
 ) -> Found:
-    """As many scenes of each kind as asked for: the first ones that random actions and the planner solve.
+    """Return the first scenes of each kind that random actions and the planner solve.
 
     Args:
-        trial: Simulates.
-        source: Of the scenes; what is found depends on it and the seed alone.
-        kinds: Looked for.
-        seed: Of the random actions.
-        label: Shown beside the progress.
-        most_drawn: Scenes drawn before giving up.
+        trial: Simulation.
+        source: Source of the scenes; the result depends on it and the seed alone.
+        kinds: Kinds to search for.
+        seed: Seed of the random actions.
+        label: Text beside the progress bar.
+        most_drawn: Greatest number of scenes to draw.
 
     Raises:
         RuntimeError: One kind is too rare.
@@ -104,7 +104,7 @@ def search(
 
 
 def redrawn(source: Source, number: Int) -> Scenes:
-    """The scenes of given numbers, drawn again."""
+    """Return the scenes of given numbers, drawn again."""
     kept = []
     for first in range(0, int(number.max()) + 1, source.block):
         block, rows = source.draw(source.block), number - first
@@ -116,7 +116,7 @@ def redrawn(source: Source, number: Int) -> Scenes:
 
 
 class _Pool:
-    """Scenes that are drawn but not measured, with their estimated kinds."""
+    """Pool of scenes that are drawn but not measured, with their estimated kinds."""
 
     def __init__(self, trial: Trial, source: Source, kinds: Kinds, most_drawn: int) -> None:
         self._trial, self._source, self._kinds, self._most_drawn = trial, source, kinds, most_drawn
@@ -125,10 +125,7 @@ class _Pool:
         self._drawn = 0
 
     def more(self, missing: Int) -> tuple[Scenes, Int]:
-        """Some of each kind that is missing, by the estimate, in turn, a few to spare, and their numbers.
-
-        They leave the pool.
-        """
+        """Remove scenes of each missing kind, by the estimate, from the pool, and return them and their numbers."""
         wanted = np.ceil(SPARE * missing).astype(np.int64)
         while (_counts(self._kind, self._kinds) < wanted).any():
             if self._drawn >= self._most_drawn:
@@ -149,7 +146,7 @@ class _Pool:
         return some
 
     def _estimate(self, scenes: Scenes) -> Float:
-        """Planned shares, more exact where they are small, shape (N,)."""
+        """Return planned shares, more exact where they are small, shape (N,)."""
         share = planned_share(self._trial, scenes, draws=256)
         for below, draws in self._source.levels:
             for row in np.flatnonzero(share < below):
@@ -158,14 +155,14 @@ class _Pool:
 
 
 def measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
-    """Solution shares, shape (N,)."""
+    """Return solution shares, shape (N,)."""
     return np.concatenate(
         [solution_share(trial, scenes.take(rows), seed=seed) for rows in _lots(scenes, f"{label}: shares")]
     )
 
 
 def _planned(trial: Trial, scenes: Scenes, label: str) -> tuple[Float, NDArray[np.bool_]]:
-    """The planner's solutions, and which of them are."""
+    """Return the planner's actions, and which of them are solutions."""
     planner = Planner(trial, budget=QUICK if trial.task.arm.dimension == 3 else None)
     planned = [planner(scenes.take(rows)) for rows in _lots(scenes, f"{label}: planner")]
     return np.concatenate([p.action for p in planned]), np.concatenate([p.success for p in planned])
@@ -177,12 +174,12 @@ def _lots(scenes: Scenes, label: str) -> tqdm[slice]:
 
 
 def _first(kind: Int, kinds: Kinds) -> Int:
-    """Where the first scenes of each kind are."""
+    """Return the indices of the first scenes of each kind."""
     return np.flatnonzero((kind >= 0) & (_ranks(kind, kinds) < kinds.quota))
 
 
 def _ranks(kind: Int, kinds: Kinds) -> Int:
-    """How many scenes of its kind stand before each scene."""
+    """Return the number of scenes of the same kind before each scene."""
     rank = np.zeros(len(kind), dtype=np.int64)
     for index in range(len(kinds.names)):
         rank[kind == index] = np.arange((kind == index).sum())

@@ -1,4 +1,4 @@
-"""Scene sets: frozen ones in files and ones drawn anew."""
+"""Scene sets: frozen sets in files, and sets that are drawn anew."""
 
 from __future__ import annotations
 
@@ -28,37 +28,37 @@ BAND_EDGES = (0.2, 0.05, 0.01)
 DRAWN = ""
 """Family of the scenes that are drawn from the training distribution."""
 MEASURED = ("share", "solution")
-"""What is known of each scene."""
+"""Measured values of each scene."""
 LARGEST = 1 << 30
-"""Bytes that a file's arrays may take in memory: a million scenes and more; a small archive can claim any number."""
+"""Limit of the memory of a file's arrays, [bytes], enough for a million scenes: a small archive can claim any size."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
-    """Index into BANDS of each solution share, shape (N,)."""
+    """Return the index into BANDS of each solution share, shape (N,)."""
     return np.searchsorted(-np.array(BAND_EDGES), -share, side="right").astype(np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrozenScenes:
-    """A set of N scenes."""
+    """Set of N scenes."""
 
     name: str
-    """Of the set, or the path of its file."""
+    """Name of the set, or path of its file."""
     env_id: str
     scenes: Any
     """N :class:`~viapoint.envs.scenes.scene.Scenes`, or :class:`~viapoint.envs.scenes.dynamic_scene.ChangingScenes`."""
     share: Float
-    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,); NaN where
-    nobody measured it."""
+    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,); NaN if
+    unknown."""
     solution: Float
-    """An action that the planner found and the simulation confirmed, shape (N, m)."""
+    """Actions that the planner found and the simulation confirmed, shape (N, m)."""
     family: Any = DRAWN
     """Name of each scene's family, shape (N,), or one for all; DRAWN for the training distribution."""
     number: Any = -1
-    """Which scene it is of those drawn for the set, shape (N,); -1 where nobody counted."""
+    """Numbers among the scenes drawn for the set, shape (N,); -1 if unknown."""
 
     def __post_init__(self) -> None:
-        """One name and one number for each scene."""
+        """Expand names and numbers to all scenes."""
         for name, kind in (("family", np.str_), ("number", np.int64)):
             values = np.broadcast_to(np.asarray(getattr(self, name), dtype=kind), self.share.shape)
             object.__setattr__(self, name, values)
@@ -70,7 +70,7 @@ class FrozenScenes:
 
     @property
     def sha256(self) -> str:
-        """Hash of scenes, shares and families, whatever the file's packing and the solutions that were found."""
+        """Hash of scenes, shares and families; file compression and solutions do not count."""
         digest = hashlib.sha256(self.env_id.encode())
         content = self.arrays()
         del content["solution"]
@@ -81,7 +81,7 @@ class FrozenScenes:
         return digest.hexdigest()
 
     def arrays(self) -> dict[str, Float]:
-        """The numbers by name."""
+        """Return the arrays by name."""
         return {**self.scenes._asdict(), **{name: getattr(self, name) for name in MEASURED}}
 
     def save(self, path: Path) -> None:
@@ -91,7 +91,7 @@ class FrozenScenes:
         np.savez_compressed(path, **rest, **self.arrays())  # type: ignore[arg-type]
 
     def take(self, rows: Any) -> FrozenScenes:
-        """The scenes at `rows`, an index array, slice or mask."""
+        """Return the scenes at `rows`, an index array, slice or mask."""
         return FrozenScenes(
             name=self.name,
             env_id=self.env_id,
@@ -104,18 +104,18 @@ class FrozenScenes:
 
 
 def shipped_path(name: str, env_id: str) -> Path:
-    """Where a set of an environment lies in the package."""
+    """Return the path of a shipped set of an environment."""
     task = env_id.removeprefix("viapoint/").partition("-")[0]
     stem = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
     return Path(str(files("viapoint.training") / "scenes" / f"{stem}_{name}.npz"))
 
 
 def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
-    """Read a set of scenes and check that it is whole.
+    """Load a set of scenes and check its hash.
 
     Args:
         name_or_path: One of SETS, or the path of a file.
-        env_id: The environment that the scenes must be for.
+        env_id: Environment of the scenes.
 
     Raises:
         ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
@@ -146,7 +146,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """Which kind of scenes a file holds, and its arrays, whose shapes fit together.
+    """Return the kind of scenes of a file, and its arrays, whose shapes are consistent.
 
     Raises:
         ValueError: It is no such file.
@@ -171,7 +171,7 @@ def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
 
 
 def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
-    """Refuse arrays that are not of N scenes in the same D dimensions, N > 0."""
+    """Raise ValueError unless all arrays are of N > 0 scenes in the same D dimensions."""
     number, d = content["start"].shape if content["start"].ndim == 2 else (0, 0)
     obstacles = content["obstacles"].shape[1:2]
     wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("start", "goal"), (number, d))
@@ -190,27 +190,26 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
 ACTION_ARGUMENTS = frozenset(
     {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
 )
-"""Arguments of an environment that leave its scenes as they are; so does `duration_range` where nothing changes
-on the way."""
+"""Arguments of an environment that its scenes do not depend on; without replanning, `duration_range` is another."""
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}
-"""Of the sets that can be drawn; far from the seeds people train with, and from each other."""
+"""Seeds of the sets that can be drawn, far from training seeds and from each other."""
 NUMBERS = {"validation": 500, "test": 1_000}
-"""How many scenes such a set has."""
+"""Number of scenes of such a set."""
 
 
 def scene_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Those arguments of an environment that its scenes depend on."""
+    """Return the arguments of an environment that its scenes depend on."""
     others = ACTION_ARGUMENTS if env_id in ONLINE_TASKS else ACTION_ARGUMENTS | {"duration_range"}
     return {name: value for name, value in env_kwargs.items() if name not in others}
 
 
 def frozen_fit(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> bool:
-    """Whether a set is shipped whose scenes are those of an environment made with these arguments."""
+    """Return True if a set is shipped for an environment with these arguments."""
     return shipped_path(name, env_id).is_file() and not scene_arguments(env_id, env_kwargs)
 
 
 def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) -> FrozenScenes:
-    """Scenes in place of a set, without shares and solutions; the same for the same arguments."""
+    """Draw a set without shares and solutions; equal arguments give equal scenes."""
     trial = new_trial(env_id, 64 if env_id in ONLINE_TASKS else 1, **env_kwargs)
     scenes = trial.draw(number, SEEDS[name])
     trial.close()
@@ -224,7 +223,7 @@ def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) ->
 
 
 def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) -> FrozenScenes:
-    """The scenes that a command names; drawn ones, with a line that says so, where no frozen ones fit.
+    """Return the named scenes; where no frozen ones fit, draw them and print a line that says so.
 
     Raises:
         ValueError: There is no such set, or its scenes cannot be those of the environment.
@@ -248,7 +247,7 @@ def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) ->
 
 
 def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
-    """Refuse a file whose scenes have other rows of obstacles or another dimension than the environment."""
+    """Raise ValueError if the scenes of a file have another shape than those of the environment."""
     trial = new_trial(frozen.env_id, 1, **env_kwargs)
     layout = trial.task.observation
     trial.close()
