@@ -223,11 +223,7 @@ def run_in_parts(fuzz: Callable[..., Counter[str]], env_id: str, number: int) ->
         found.update(fuzz(env_id, max(1, number // PARTS), seed=part * 10**6))
         samples.append(memory())
     growth = min(samples[PARTS // 2 :]) - min(samples[: PARTS // 2])
-    return {
-        **found,
-        "memory_growth": round(growth, 2),
-        "seconds": round(time.process_time() - began, 1),
-    }
+    return {**found, "memory_growth": round(growth, 2), "seconds": round(time.process_time() - began, 1)}
 
 
 def main() -> None:

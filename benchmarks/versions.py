@@ -23,17 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<version>[0-9.]+)")
-TOOLS = [
-    "pytest",
-    "pytest-xdist",
-    "hypothesis",
-    "mpmath",
-    "moviepy",
-    "setuptools",
-    "build",
-    "ruff",
-    "mypy",
-]
+TOOLS = ["pytest", "pytest-xdist", "hypothesis", "mpmath", "moviepy", "setuptools", "build", "ruff", "mypy"]
 
 
 def lower_bounds() -> dict[str, str]:

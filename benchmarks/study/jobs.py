@@ -33,11 +33,7 @@ N_TIMED = 100
 """Number of scenes in which decisions are timed."""
 ALONE, CHECKED, UNTRAINED = "alone", "checked", "untrained"
 """Decision modes: the network alone, checked proposals, and checked proposals of the untrained network."""
-WAYS = {
-    ALONE: "policy alone",
-    CHECKED: "checked proposals",
-    UNTRAINED: "untrained, checked proposals",
-}
+WAYS = {ALONE: "policy alone", CHECKED: "checked proposals", UNTRAINED: "untrained, checked proposals"}
 """Names of the decision modes in tables."""
 
 

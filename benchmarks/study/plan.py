@@ -68,11 +68,7 @@ ABLATIONS = (
         label="critic of action and obstacle instead of planned poses",
         settings={"form": "action"},
     ),
-    Variant(
-        name="viaq-action-heads",
-        label="the same with 8 heads",
-        settings={"form": "action", "heads": 8},
-    ),
+    Variant(name="viaq-action-heads", label="the same with 8 heads", settings={"form": "action", "heads": 8}),
     Variant(
         name="viaq-sum",
         label="critic of action and scene: sum over obstacles (Deep Sets) instead of the minimum",
@@ -230,9 +226,7 @@ class Cell:
         )
         total = config.total_timesteps
         return dataclasses.replace(
-            config,
-            eval_every=max(total // VALIDATIONS, 1),
-            checkpoint_every=max(total // CHECKPOINTS, 1),
+            config, eval_every=max(total // VALIDATIONS, 1), checkpoint_every=max(total // CHECKPOINTS, 1)
         )
 
 

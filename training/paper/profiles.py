@@ -82,14 +82,18 @@ def arm_profile(motion: SimulatedMovements, row: int = 0) -> Profile:
     return Profile.of(motion.time[within] / motion.duration[row], *fields)
 
 
+def vertex(before: float, here: float, after: float) -> tuple[float, float]:
+    """Return the vertex of the parabola through three equidistant samples: offset from the middle one, and height."""
+    shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+    return shift, here - 0.25 * (before - after) * shift
+
+
 def _peaks(time: Float, value: Float) -> list[tuple[float, float]]:
     """Return time and height of local maxima away from the ends, the highest first, by parabolas through samples."""
     inner = (time > EDGE) & (time < 1.0 - EDGE)
     index = np.flatnonzero(inner[1:-1] & (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])) + 1
     found = []
     for i in index:
-        before, here, after = value[i - 1], value[i], value[i + 1]
-        shift = 0.5 * (before - after) / (before - 2.0 * here + after)
-        step = time[i + 1] - time[i]
-        found.append((float(time[i] + shift * step), float(here - 0.25 * (before - after) * shift)))
+        shift, height = vertex(*value[i - 1 : i + 2])
+        found.append((float(time[i] + shift * (time[i + 1] - time[i])), float(height)))
     return sorted(found, key=lambda each: -each[1])

@@ -155,8 +155,6 @@ def valleys() -> Figure:
     axes[0, 1].set(
         xlabel="$d_3/(d_1+d_2)$", ylabel="curvature peak\nminus valley [% of $t_f$]", xlim=(0.4, 1.0)
     )
-    axes[0, 1].legend(
-        title="$d_1/(d_1+d_2)$",
-    )
+    axes[0, 1].legend(title="$d_1/(d_1+d_2)$")
     letters(axes)
     return figure

@@ -10,17 +10,7 @@ from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.primitives import point_to_point
-from viapoint.training.paper.figures.style import (
-    ARM,
-    GREY,
-    MODEL,
-    SECOND,
-    THIRD,
-    letters,
-    path,
-    plane,
-    sheet,
-)
+from viapoint.training.paper.figures.style import ARM, GREY, MODEL, SECOND, THIRD, letters, path, plane, sheet
 from viapoint.training.paper.reference_movements import curved, passage_share, straight, target
 from viapoint.training.paper.rows.alternatives import PEAKS, diagonal_ends, joint_space
 from viapoint.training.paper.rows.curved import ENDS
@@ -80,19 +70,9 @@ def _label_isochrony(axes: Float) -> None:
         axes[row, 1].axhspan(mean - deviation, mean + deviation, color="0.92", zorder=0)
         axes[row, 1].axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
     axes[1, 1].annotate("grey band:\nsubjects, mean ± s.d.", (0.02, -0.037), fontsize=5.8)
-    axes[0, 0].legend(
-        title="$d_3/(d_1+d_2)$",
-        title_fontsize=6.0,
-        loc="upper left",
-        handlelength=1.2,
-    )
+    axes[0, 0].legend(title="$d_3/(d_1+d_2)$", title_fontsize=6.0, loc="upper left", handlelength=1.2)
     axes[0, 1].legend(loc="upper center", handletextpad=0.2)
-    axes[1, 0].legend(
-        title="$d_1/(d_1+d_2)$",
-        title_fontsize=6.0,
-        loc="lower right",
-        handlelength=1.2,
-    )
+    axes[1, 0].legend(title="$d_1/(d_1+d_2)$", title_fontsize=6.0, loc="lower right", handlelength=1.2)
     letters(axes, "ABCD")
 
 

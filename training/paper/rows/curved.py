@@ -13,7 +13,7 @@ from viapoint.envs.common.types import Float
 from viapoint.primitives import speed_valleys
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.passage_polynomial import closed_form, count_roots, passage_polynomial, root_of
-from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
+from viapoint.training.paper.profiles import Profile, arm_profile, model_profile, vertex
 from viapoint.training.paper.reference_movements import (
     curved,
     minimum_jerk_through,
@@ -91,8 +91,7 @@ def closest_approach(motion: SimulatedMovements, via: Float, row: int = 0) -> fl
     """Return the time at which the simulated hand is nearest to the via-point, as a fraction of the duration."""
     distance = np.linalg.norm(motion.hand[row] - via, axis=-1)
     i = int(np.clip(distance.argmin(), 1, len(distance) - 2))
-    before, here, after = distance[i - 1 : i + 2] ** 2
-    shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+    shift, _ = vertex(*distance[i - 1 : i + 2] ** 2)
     return float((motion.time[i] + shift * (motion.time[1] - motion.time[0])) / motion.duration[row])
 
 
