@@ -16,13 +16,23 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.base import Arm
     from viapoint.envs.mdp.task import family_sampler
     from viapoint.envs.record_video import RecordMovements
+    from viapoint.envs.replanning_env import OnlineReachEnv, OnlineReachVectorEnv
     from viapoint.envs.scenes.families import register_scene_family
     from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
+    from viapoint.envs.single_env import ReachEnv
+    from viapoint.envs.vector_env import ReachVectorEnv
+    from viapoint.envs.velocity_env import StepReachEnv, StepReachVectorEnv
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
+        "OnlineReachEnv": "viapoint.envs.replanning_env",
+        "OnlineReachVectorEnv": "viapoint.envs.replanning_env",
         "Plan": "viapoint.envs.actions.via_points",
+        "ReachEnv": "viapoint.envs.single_env",
+        "ReachVectorEnv": "viapoint.envs.vector_env",
         "RecordMovements": "viapoint.envs.record_video",
+        "StepReachEnv": "viapoint.envs.velocity_env",
+        "StepReachVectorEnv": "viapoint.envs.velocity_env",
         "TARGETS": "viapoint.envs.scenes.scene",
         "family_sampler": "viapoint.envs.mdp.task",
         "load_arm": "viapoint.envs.arm_import.loader",
@@ -47,8 +57,14 @@ __all__ = [
     "TARGETS",
     "TASKS",
     "Arm",
+    "OnlineReachEnv",
+    "OnlineReachVectorEnv",
     "Plan",
+    "ReachEnv",
+    "ReachVectorEnv",
     "RecordMovements",
+    "StepReachEnv",
+    "StepReachVectorEnv",
     "family_sampler",
     "load_arm",
     "register_arm",

@@ -20,7 +20,16 @@ SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "a
 
 
 class ReachEnv(gym.Env[Any, Any], EzPickle):
-    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments."""
+    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> type(env.unwrapped).__name__
+        'ReachEnv'
+    """
 
     metadata = SINGLE_METADATA
     batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv

@@ -69,6 +69,14 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=16)
+        >>> observation, _ = envs.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = envs.step(0.1 * envs.action_space.sample())
+        >>> reward.shape
+        (16,)
     """
 
     metadata = METADATA

@@ -100,6 +100,14 @@ class StepReachVectorEnv(MultiStepVectorEnv):
         width: Of a rendered frame, [pixels].
         height: Of a rendered frame, [pixels].
         threads: Of the simulation; 0 is one for each core. Results do not depend on it.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstaclesStep-v0", num_envs=16)
+        >>> observation, _ = envs.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = envs.step(0.1 * envs.action_space.sample())
+        >>> reward.shape
+        (16,)
     """
 
     config_kind = VelocityConfig
@@ -258,7 +266,16 @@ class StepReachVectorEnv(MultiStepVectorEnv):
 
 
 class StepReachEnv(MultiStepEnv):
-    """A batch of one of :class:`StepReachVectorEnv`, with the same keyword arguments."""
+    """A batch of one of :class:`StepReachVectorEnv`, with the same keyword arguments.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstaclesStep-v0")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> type(env.unwrapped).__name__
+        'StepReachEnv'
+    """
 
     batch_kind: ClassVar[type[ReachVectorEnv]] = StepReachVectorEnv
     batch: StepReachVectorEnv

@@ -108,7 +108,7 @@ def check_documented(function, text):
     signature = inspect.signature(function)
     assert function.__name__ == "__init__" or signature.return_annotation is not signature.empty
     for name, parameter in signature.parameters.items():
-        if name in ("self", "cls") or name.startswith("_"):
+        if name in ("self", "cls") or name.startswith("_") or parameter.kind is parameter.VAR_KEYWORD:
             continue
         assert parameter.annotation is not parameter.empty, f"{function.__qualname__} has no type for {name}"
         if "\nArgs:\n" in text:
