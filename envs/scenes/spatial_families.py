@@ -62,7 +62,7 @@ class SpatialSite(Site):
     top: Float
     """Height of the links above the hand there, shape (N, K), [m]."""
     hardness: Float
-    """From 0 to 1, shape (N, 1)."""
+    """Hardness from 0 to 1, shape (N, 1)."""
 
     def on_line(self, fraction: Float) -> Float:
         """Return points on the straight line, shape (N, K, 3), [m]."""

@@ -300,3 +300,9 @@ def test_what_a_family_returns_is_checked(build, message, registry):
     sampler = family_sampler(task_of(HAND), "wrong")
     with pytest.raises(ValueError, match=f"family 'wrong' must return .*{message}"):
         sampler([np.random.default_rng(seed) for seed in range(8)])
+
+
+def test_a_family_cannot_take_more_numbers_than_there_are(registry):
+    register_scene_family("greedy", lambda uniforms, site: uniforms.take(7), dimension=3, n_obstacles=1)
+    with pytest.raises(ValueError, match="7 uniform numbers were taken of 6"):
+        family_sampler(task_of(SPACE), "greedy")([np.random.default_rng(0)])
