@@ -10,6 +10,7 @@ import pytest
 from viapoint.envs.registration import ENV_IDS
 from viapoint.training.algorithms.agent import find_model
 from viapoint.training.cli import main as cli
+from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.config.configs import EvaluateConfig, TrainConfig
 from viapoint.training.scene_sets.scene_set import load
 
@@ -56,11 +57,21 @@ def test_help_is_short_and_has_an_example(words, capsys):
     assert len(text.splitlines()) < 60
 
 
-def test_help_lists_the_environments(capsys):
+@pytest.mark.parametrize("words", [[], ["train"], ["evaluate"], ["bench"], ["demo"], ["import-sb3"]])
+def test_help_lists_the_environments(words, capsys):
     with pytest.raises(SystemExit):
-        run("--help")
-    text = "".join(capsys.readouterr().out.split())
+        run(*words, "--help")
+    text = "".join(capsys.readouterr().out.replace("│", "").split())
     assert all(env_id in text for env_id in ENV_IDS)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "play"])
+def test_help_lists_the_shipped_agents(command, capsys):
+    with pytest.raises(SystemExit):
+        run(command, "--help")
+    text = "".join(capsys.readouterr().out.replace("│", "").split())
+    assert SHIPPED_IDS
+    assert all(env_id in text for env_id in SHIPPED_IDS)
 
 
 @pytest.mark.parametrize(
