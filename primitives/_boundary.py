@@ -62,7 +62,7 @@ def check_end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, 
     """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
     shapes = {}
     for name, value in ends.items():
-        if not is_given(value):
+        if value is None or value is FREE:
             continue
         if value.ndim < 1 or value.shape[-1] != dimension:
             raise ValueError(f"{name} must have shape (..., {dimension}), got shape {tuple(value.shape)}")
@@ -103,11 +103,11 @@ def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
 
 def unit_time_ends(ends: Ends, duration: Array) -> list[Any]:
     """Return the boundary values in unit time, V = v T and A = a T^2; None and FREE stay."""
-    time = duration[..., None]
-    return [
-        value * (time if "velocity" in name else time * time) if is_given(value) else value
-        for name, value in ends.items()
-    ]
+    values, time = list(ends.values()), duration[..., None]
+    for i, (name, value) in enumerate(ends.items()):
+        if value is not None and value is not FREE:
+            values[i] = value * (time if "velocity" in name else time * time)
+    return values
 
 
 def chosen_items(value: Any, items: Any) -> Any:

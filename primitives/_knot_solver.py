@@ -211,7 +211,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     rows += pieces
     rows += _unit_time_states(states[1:], lengths, rest, order)
     shape = rest.shape
-    data = xp.stack([broadcast_to(xp, row, shape) for row in rows], axis=-2)
+    data = xp.stack([row if row.shape == shape else xp.broadcast_to(row, shape) for row in rows], axis=-2)
     batch = data.shape[:-2]
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
     coefficients = xp.matmul(constant(coefficient_table(order), data), data)

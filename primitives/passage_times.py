@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ._boundary import Ends, check_waypoints, chosen_items, read_arguments, unit_time_ends
+from ._boundary import check_waypoints, chosen_items, read_arguments, unit_time_ends
 from ._passage.cost import PassageCost
 from ._passage.gradient import attach_gradient
 from ._passage.moving_ends import fractions_moving
@@ -19,7 +19,6 @@ from .array_api import (
     Boundary,
     broadcast_to,
     follows_gradient,
-    is_given,
     like,
     require,
     to_numpy,
@@ -75,7 +74,10 @@ def passage_durations(
     )
     batch = check_waypoints(waypoints, ends, duration=duration)
     require(xp, duration > 0, "duration", duration, "must be positive")
-    flat_ends: Ends = {name: _flat(v, batch, 1) if is_given(v) else v for name, v in ends.items()}
+    flat_ends = dict(ends)
+    for name, value in ends.items():
+        if value is not None and value is not FREE:
+            flat_ends[name] = _flat(value, batch, 1)
     unit_ends = unit_time_ends(flat_ends, _flat(duration, batch, 0))
     numbers = _fractions(_flat(waypoints, batch, 2), unit_ends)
     fractions = like(xp, numbers.reshape(*batch, waypoints.shape[-2] - 1), waypoints)

@@ -106,7 +106,8 @@ class Trajectory:
     @property
     def namespace(self) -> Namespace:
         """Array API functions of the arrays."""
-        return namespace_of(self.coefficients)
+        coefficients = self.coefficients  # NumPy, by far the most frequent, without a call
+        return np if isinstance(coefficients, np.ndarray) else namespace_of(coefficients)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -174,7 +175,7 @@ class Trajectory:
         """
         xp = self.namespace
         orders = whole_orders(nu)
-        time, inside = self._times(time)
+        time, inside = self._times(time, xp)
         batch = broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
         shape = (*batch, time.shape[-1], self.dimension)
         if out is not None:
@@ -186,9 +187,8 @@ class Trajectory:
             for value, order in zip(results, orders, strict=True)
         )
 
-    def _times(self, time: Array | int) -> tuple[Array, Array | None]:
+    def _times(self, time: Array | int, xp: Namespace) -> tuple[Array, Array | None]:
         """Return times (..., T) clipped to the movement, and True where they were inside (None: all)."""
-        xp = self.namespace
         end = self.end
         if isinstance(time, int | np.integer):
             if time < 2:

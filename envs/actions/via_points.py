@@ -259,7 +259,10 @@ def frame(line: Array) -> list[Array]:
 
 def _arrays(*values: Array) -> tuple[Array, ...]:
     """Arrays and tensors as they are, anything else as an array of numbers."""
-    if all(hasattr(value, "shape") for value in values):
+    for value in values:
+        if not hasattr(value, "shape"):
+            break
+    else:
         return values
     try:
         return tuple(v if hasattr(v, "shape") else np.asarray(v, dtype=np.float64) for v in values)

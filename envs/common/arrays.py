@@ -42,7 +42,10 @@ def dot(first: Sequence[Array], second: Sequence[Array]) -> Array:
 def squared_length(vectors: Array) -> Array:
     """Return the sum of squares along the last axis, added component by component: `sum` is slow on short axes."""
     square = vectors * vectors
-    return functools.reduce(operator.add, (square[..., i] for i in range(vectors.shape[-1])))
+    total = square[..., 0]
+    for i in range(1, vectors.shape[-1]):
+        total = total + square[..., i]
+    return total
 
 
 def norm(vectors: N) -> N:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -48,6 +49,12 @@ class ObservationLayout:
         """The layout for an arm and at most `n_rows` obstacles."""
         return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows)
 
+    @functools.cached_property
+    def _joint_bounds(self) -> tuple[Float, Float]:
+        """Lowest and highest observed joint angles, shape (J,) each, [rad]."""
+        low, high = np.array(self.joint_range).T
+        return low - BEYOND_LIMIT, high + BEYOND_LIMIT
+
     @property
     def row_size(self) -> int:
         """Numbers of one obstacle."""
@@ -56,11 +63,11 @@ class ObservationLayout:
     def space(self) -> spaces.Dict:
         """The observation space of one environment."""
         point = np.full(self.dimension, FARTHEST)
-        low, high = (np.array(side) for side in zip(*self.joint_range, strict=True))
+        low, high = self._joint_bounds
         bounds = {
             "hand": (-point, point),
             "goal": (-point, point),
-            "joints": (low - BEYOND_LIMIT, high + BEYOND_LIMIT),
+            "joints": (low, high),
         }
         if self.n_rows:
             half = np.full(self.dimension, LARGEST_HALF_AXIS)
@@ -78,11 +85,11 @@ class ObservationLayout:
         self, joints: NDArray[np.float64], hand: NDArray[np.float64], scenes: Scenes
     ) -> dict[str, NDArray[np.float32]]:
         """Observations of N environments, shape (N, .) each, in fresh arrays."""
-        low, high = (np.array(side) for side in zip(*self.joint_range, strict=True))
+        low, high = self._joint_bounds
         parts: dict[str, Any] = {
             "hand": np.clip(hand, -FARTHEST, FARTHEST),
             "goal": scenes.goal,
-            "joints": np.clip(joints, low - BEYOND_LIMIT, high + BEYOND_LIMIT),
+            "joints": np.clip(joints, low, high),
         }
         if self.n_rows:
             rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1)

@@ -62,7 +62,7 @@ def straight_jerk_cost(length: Float, duration: Float) -> Float:
 
 def within_joint_range(joints: Float, arm: Arm) -> Bool:
     """Return True for each joint angle, shape (..., J), within its limits and MuJoCo's tolerance."""
-    low, high = (np.array(side) for side in zip(*arm.joint_range, strict=True))
+    low, high = np.array(arm.joint_range).T
     return np.asarray((joints >= low - LIMIT_TOLERANCE) & (joints <= high + LIMIT_TOLERANCE))
 
 

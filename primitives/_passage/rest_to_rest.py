@@ -42,15 +42,17 @@ class Functions(NamedTuple):
     where: Callable[[Any, Any, Any], Any]
     sqrt: Callable[[Any], Any]
     cube_root: Callable[[Any], Any]
-    clip: Callable[[Any, Any, Any], Any]
+    minimum: Callable[[Any, Any], Any]
+    maximum: Callable[[Any, Any], Any]
 
 
-ARRAYS = Functions(np.where, np.sqrt, np.cbrt, lambda x, low, high: np.minimum(np.maximum(x, low), high))
+ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
 _FLOATS = Functions(
     lambda condition, yes, no: yes if condition else no,
     math.sqrt,
     lambda x: float(np.cbrt(x)),
-    lambda x, low, high: min(max(x, low), high),
+    min,
+    max,
 )
 
 
@@ -119,10 +121,10 @@ def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> N
     top = f.where(a >= 0, c, root - 2.0 * a)  # the form of the quadratic formula without cancellation
     bottom = f.where(a >= 0, 4.0 * a + 2.0 * root + 8.0 * c, 10.0 * b + 8.0 * top)
     t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
-    t = f.clip(t, 0.0, 0.5)
+    t = f.minimum(f.maximum(t, 0.0), 0.5)
     for _ in range(_STEPS):
         value, slope = _residual(t, a, b, c)
-        t = f.clip(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t, 0.5)
+        t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
     return t
 
 
