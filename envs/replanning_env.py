@@ -43,32 +43,32 @@ class PlanStart(NamedTuple):
 
 
 class OnlineReachVectorEnv(MultiStepVectorEnv):
-    """Reaching for targets that jump among obstacles that move, by plans that are revised on the way, many at once.
+    """Reaching with online replanning: targets jump, obstacles move, and plans are revised, `num_envs` times.
 
     Arm, physics and success are those of :class:`ReachVectorEnv`. An episode is several decisions;
-    each starts from what is commanded at present, ends when something happens (`decide_at`), and takes
+    each starts from the present command, ends with an event of `decide_at`, and takes
     `info["elapsed"]` seconds. In the step that ends an episode the next one begins (same-step autoreset): its first
     observation is returned, the last of the old is in `info["final_obs"]`, its info in `info["final_info"]` and, as
     that of the other environments, at the top level.
 
     Args:
         num_envs: Number of environments N.
-        arm: The arm that moves, a record or the name of one.
-        whole_arm: Whether the links must clear the obstacles, too, or the hand alone.
+        arm: Arm that moves, a record or its name.
+        whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
         n_via: Number of via-points of an action.
-        n_obstacles: An exact number, or the fewest and the most.
-        moving_obstacles: Whether they move.
-        n_jumps: Of the target: an exact number, or the fewest and the most.
-        decide_at: What ends a decision on the way: some of `horizon`, `target`, `course`, `clearance`.
-        horizon: After which a decision ends, [s].
+        n_obstacles: Number of obstacles, or the fewest and the most.
+        moving_obstacles: True if the obstacles move.
+        n_jumps: Number of jumps of the target, or the fewest and the most.
+        decide_at: Events that end a decision: some of `horizon`, `target`, `course`, `clearance`.
+        horizon: Time after which a decision ends, [s].
         margin: Predicted clearance below which a decision ends, [m].
         timing: `optimal` passage times; there are no others here.
         duration_range: Shortest and longest movement, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.OnlineRewardWeights`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
-        width: Of a rendered frame, [pixels].
-        height: Of a rendered frame, [pixels].
-        threads: Of the simulation; 0 is one for each core. Results do not depend on it.
+        width: Width of a rendered frame, [pixels].
+        height: Height of a rendered frame, [pixels].
+        threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -326,7 +326,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
 
 
 class OnlineReachEnv(MultiStepEnv):
-    """A batch of one of :class:`OnlineReachVectorEnv`, with the same keyword arguments.
+    """One environment of a :class:`OnlineReachVectorEnv`, with the same keyword arguments.
 
     Example:
         >>> import gymnasium as gym
@@ -346,5 +346,5 @@ class OnlineReachEnv(MultiStepEnv):
 
     @property
     def last_plans(self) -> History:
-        """Every plan of the episode and when it began, [s]."""
+        """All plans of the episode with the times at which they began, [s]."""
         return self.batch.last_plans[0]

@@ -1,4 +1,4 @@
-"""The same tasks with an action in every control step: what one would use instead of via-points."""
+"""Environments with a velocity action in every control step, for comparison with via-points."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 @dataclass(frozen=True, kw_only=True)
 class StepObservationLayout(ObservationLayout):
-    """The parts of a whole movement's observation, and what changes on the way.
+    """Layout of observations during a movement.
 
     `start` [m], `velocity` [m/s] and `acceleration` [m/s^2] of the reference that the hand follows, `time_left` [s].
     """
@@ -37,7 +37,7 @@ class StepObservationLayout(ObservationLayout):
     time_limit: float
 
     def space(self) -> spaces.Dict:
-        """The observation space of one environment."""
+        """Return the observation space of one environment."""
         d = self.dimension
         sides = {
             "start": (-FARTHEST, FARTHEST, d),
@@ -49,7 +49,7 @@ class StepObservationLayout(ObservationLayout):
         return spaces.Dict({**super().space().spaces, **boxes})
 
     def moving(self, observation: Observation, scenes: Scenes, motion: Motion, time: Float) -> Observation:
-        """An observation with what changes on the way, `time` after the start, shape (N,), [s]."""
+        """Return an observation with the parts that change during a movement, `time` after the start, (N,), [s]."""
         parts = {
             "start": scenes.start,
             "velocity": np.clip(motion.velocity, -self.speed, self.speed),
@@ -90,16 +90,16 @@ class StepReachVectorEnv(MultiStepVectorEnv):
 
     Args:
         num_envs: Number of environments N.
-        arm: The arm that moves, a record or the name of one.
-        whole_arm: Whether the links must clear the obstacles, too, or the hand alone.
-        n_obstacles: An exact number, or the fewest and the most.
+        arm: Arm that moves, a record or its name.
+        whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
+        n_obstacles: Number of obstacles, or the fewest and the most.
         control_step: Time for which an action holds, [s].
         duration_range: Shortest and longest movement of the twin, [s]; the longest and the settling time are the limit.
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.StepRewardWeights`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
-        width: Of a rendered frame, [pixels].
-        height: Of a rendered frame, [pixels].
-        threads: Of the simulation; 0 is one for each core. Results do not depend on it.
+        width: Width of a rendered frame, [pixels].
+        height: Height of a rendered frame, [pixels].
+        threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -266,7 +266,7 @@ class StepReachVectorEnv(MultiStepVectorEnv):
 
 
 class StepReachEnv(MultiStepEnv):
-    """A batch of one of :class:`StepReachVectorEnv`, with the same keyword arguments.
+    """One environment of a :class:`StepReachVectorEnv`, with the same keyword arguments.
 
     Example:
         >>> import gymnasium as gym

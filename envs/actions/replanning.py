@@ -1,6 +1,6 @@
-"""Plans that are revised on the way: from what is commanded at present, without a jump of it.
+"""Online replanning: plans that begin at the present command, without a jump of position, velocity or acceleration.
 
-An action says how the *default* plan is changed: the rest of the plan under way while its goal is the present one, else
+An action changes the *nominal* plan: the rest of the plan under way while its goal is the present one, else
 the smoothest movement to the new goal. By the principle of optimality the rest of a minimum-jerk movement, made again
 through its own via-points, is itself, so a zero action changes nothing.
 """
@@ -23,17 +23,17 @@ class MovingPlan(NamedTuple):
     """N movements that may begin in motion."""
 
     waypoints: Float
-    """Present place, via-points and goal, shape (N, K + 2, D), [m]."""
+    """Present position, via-points and goal, shape (N, K + 2, D), [m]."""
     durations: Float
-    """Of the segments between them, shape (N, K + 1), [s]."""
+    """Durations of the segments, shape (N, K + 1), [s]."""
     velocity: Float
-    """At the beginning, shape (N, D), [m/s]."""
+    """Initial velocity, shape (N, D), [m/s]."""
     acceleration: Float
-    """At the beginning, shape (N, D), [m/s^2]."""
+    """Initial acceleration, shape (N, D), [m/s^2]."""
 
     @classmethod
     def of(cls, plan: Plan) -> MovingPlan:
-        """A plan that begins at rest."""
+        """Return a plan that begins at rest."""
         start = np.asarray(plan.waypoints[..., 0, :])
         return cls(plan.waypoints, plan.durations, np.zeros_like(start), np.zeros_like(start))
 
@@ -44,11 +44,11 @@ class MovingPlan(NamedTuple):
 
     @property
     def duration(self) -> Float:
-        """Shape (N,), [s]."""
+        """Total duration, shape (N,), [s]."""
         return np.asarray(self.durations.sum(axis=-1))
 
     def take(self, rows: Any) -> MovingPlan:
-        """The movements at `rows`, an index, slice or mask."""
+        """Return the movements at `rows`, an index, slice or mask."""
         return MovingPlan(*(field[rows] for field in self))
 
     def put(self, rows: Any, other: MovingPlan) -> None:
@@ -57,56 +57,56 @@ class MovingPlan(NamedTuple):
             mine[rows] = theirs
 
     def trajectory(self) -> primitives.Trajectory:
-        """The minimum-jerk movement through the waypoints."""
+        """Return the minimum-jerk movement through the waypoints."""
         return primitives.through(
             self.waypoints, self.durations, start_velocity=self.velocity, start_acceleration=self.acceleration
         )
 
     def states(self, time: Float) -> Motion:
-        """What is commanded at a time for each, shape (N,), [s]."""
+        """Return the commands at one time per plan, shape (N,), [s]."""
         return Motion(*(part[:, 0] for part in self.trajectory().sample(time[:, None])))
 
 
 class NominalPlan(NamedTuple):
-    """What N hands do if the agent wants nothing else."""
+    """Plans that N hands follow on a zero action."""
 
     begun: Bool
-    """Whether a movement is under way; if not, the default is the straight one, as in one-decision episodes."""
+    """True if a movement is under way; otherwise the nominal plan is the straight movement."""
     changed: Bool
-    """Whether the goal is not that of the plan under way."""
+    """True if the goal differs from that of the plan under way."""
     state: Motion
-    """Commanded at present."""
+    """Present command."""
     start: Float
-    """Of the episode, shape (N, D), [m]."""
+    """Start of the episode, shape (N, D), [m]."""
     goal: Float
-    """The present one, shape (N, D), [m]."""
+    """Present goal, shape (N, D), [m]."""
     vias: Float
     """Via-points, shape (N, K, D), [m]."""
     remaining: Float
-    """Time left of it, shape (N,), [s]; 0 where the hand rests at its goal."""
+    """Remaining duration, shape (N,), [s]; 0 where the hand rests at its goal."""
 
 
 class Reviser:
-    """Makes plans of actions on the way.
+    """Decoder of actions during a movement.
 
     Args:
-        layout: Of the actions.
+        layout: Layout of the actions.
     """
 
     def __init__(self, layout: ActionLayout) -> None:
         self.layout = layout
         self.least_remaining = 0.5 * layout.duration_range[0]
-        """A revision takes no less time, and a plan that has less left to its goal is not revised, [s]."""
+        """Shortest revised movement; a plan with less time left is not revised, [s]."""
 
     def default(self, plan: MovingPlan, time: Float, begun: Bool, start: Float, goal: Float) -> NominalPlan:
-        """What happens if the agent wants nothing else.
+        """Return the plans of zero actions.
 
         Args:
             plan: N movements under way.
-            time: Since they began, shape (N,), [s].
-            begun: Whether they have, shape (N,).
-            start: Of the episodes, shape (N, D), [m].
-            goal: The present one, shape (N, D), [m].
+            time: Time since they began, shape (N,), [s].
+            begun: True if they have begun, shape (N,).
+            start: Starts of the episodes, shape (N, D), [m].
+            goal: Present goals, shape (N, D), [m].
         """
         trajectory, end, number = plan.trajectory(), plan.duration, self.layout.n_via
         changed = (plan.waypoints[:, -1] != goal).any(axis=-1)
@@ -133,7 +133,7 @@ class Reviser:
         )
 
     def _passages(self, plan: MovingPlan, time: Float) -> Float:
-        """When the rest of a plan passes its via-points, and points of the last leg for those that it has passed.
+        """Return passage times of the remaining via-points, and times on the last segment for those passed.
 
         Shape (N, K), [s], in order.
         """
@@ -148,11 +148,11 @@ class Reviser:
         return np.where(index < ahead, kept, filled)
 
     def revise(self, default: NominalPlan, plan: MovingPlan, actions: Float) -> tuple[MovingPlan, Bool]:
-        """Plans for actions, and where the one under way is kept: on a zero action, or shortly before its goal.
+        """Return plans for actions, and True where the plan under way is kept: zero action, or close to the goal.
 
         Args:
-            default: What the actions change.
-            plan: Under way.
+            default: Nominal plans, which the actions change.
+            plan: Plans under way.
             actions: Shape (N, m), in [-1, 1].
         """
         zero = (actions == 0.0).all(axis=-1)
@@ -187,7 +187,7 @@ class Reviser:
 
     @staticmethod
     def _line(default: NominalPlan) -> Float:
-        """Along which offsets are measured: from the hand to the goal; where it is there, from the start."""
+        """Return the line of the offsets' frame: from the hand to the goal or, at the goal, from the start."""
         line = default.goal - default.state.position
         for other in (default.goal - default.start, np.eye(1, line.shape[-1])):
             line = np.where((norm(line) < MIN_GOAL_DISTANCE)[:, None], other, line)
@@ -230,7 +230,7 @@ def revised_waypoints(
 
 
 def timed(waypoints: Float, duration: Float, state: Motion) -> MovingPlan:
-    """The plan through waypoints, from a state, with the passage times of least jerk."""
+    """Return the plan through waypoints, from a state, with the passage times of least jerk."""
     durations = primitives.passage_durations(
         waypoints, duration, start_velocity=state.velocity, start_acceleration=state.acceleration
     )

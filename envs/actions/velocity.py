@@ -1,4 +1,4 @@
-"""From an action of every control step to the reference that the hand follows.
+"""Steering: decoding of the action of a control step into the reference that the hand follows.
 
 The action is a velocity. A critically damped filter of the second order makes a smooth reference of it: position,
 velocity and acceleration are continuous, so jerk is finite and its cost can be compared with that of planned movements.
@@ -22,22 +22,22 @@ from viapoint.envs.common.types import Float
 
 AXES = ("along", "across", "above")
 STEP_TOLERANCE = 1e-6
-"""Relative difference that numbers of single precision may make."""
+"""Relative rounding error of numbers of single precision."""
 
 
 class Motion(NamedTuple):
-    """Where N references are, shape (N, ..., D) each."""
+    """State of N references, shape (N, ..., D) each."""
 
     position: Float
-    """[m]."""
+    """Position, [m]."""
     velocity: Float
-    """[m/s]."""
+    """Velocity, [m/s]."""
     acceleration: Float
-    """[m/s^2]."""
+    """Acceleration, [m/s^2]."""
 
     @classmethod
     def at_rest(cls, position: Float) -> Motion:
-        """References that rest at `position`, shape (N, D), [m]."""
+        """Return references that rest at `position`, shape (N, D), [m]."""
         return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
 
     def put(self, rows: Any, other: Motion) -> None:
@@ -48,7 +48,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Steering:
-    """What the components of a step-wise action mean, and what becomes of them.
+    """Layout of the actions of control steps, and the filter that turns them into references.
 
     An action is the velocity wanted of the hand, in the frame of start and goal, as a fraction of `top_speed`. The zero
     action brings the hand to rest.
@@ -59,14 +59,14 @@ class Steering:
     control_step: float = 0.04
     """Time for which an action holds, [s]."""
     timestep: float = 0.002
-    """Of the physics, [s]."""
+    """Length of a physics step, [s]."""
     top_speed: float = 1.5
     """Velocity that an action of 1 stands for, [m/s]."""
     bandwidth: float = 25.0
-    """Of the filter, w, [rad/s]: a new velocity is nine tenths there after 0.16 s."""
+    """Bandwidth w of the filter, [rad/s]: 90 % of a new velocity is reached after 0.16 s."""
 
     def __post_init__(self) -> None:
-        """Refuse a control step that is no multiple of the physics step."""
+        """Check that the control step is a multiple of the physics step."""
         given: Any = self.control_step
         number = isinstance(given, Real) and not isinstance(given, bool)
         value = float(given) if number else 0.0
@@ -84,12 +84,12 @@ class Steering:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the components, in order."""
+        """Names of the components, in order."""
         return AXES[: self.dimension]
 
     @property
     def units(self) -> tuple[str, ...]:
-        """What an action of 1 in each component stands for."""
+        """Value of an action of 1 in each component."""
         return (f"{self.top_speed:g} m/s",) * self.dimension
 
     @property
@@ -99,7 +99,7 @@ class Steering:
 
     @property
     def physics_steps(self) -> int:
-        """Of a control step, S."""
+        """Physics steps S of a control step."""
         return round(self.control_step / self.timestep)
 
     @property
@@ -113,28 +113,28 @@ class Steering:
         return speed, 2.0 * speed * self.bandwidth / float(np.e)
 
     def decode(self, action: Float, start: Float, goal: Float) -> Float:
-        """The velocity that an action stands for, shape (N, D), [m/s]."""
+        """Return the velocity of an action, shape (N, D), [m/s]."""
         axes = frame(goal - start)
         return np.asarray(
             self.top_speed * sum(action[..., i : i + 1] * axis for i, axis in enumerate(axes)), dtype=float
         )
 
     def encode(self, velocity: Float, start: Float, goal: Float) -> Float:
-        """The action that stands for a velocity: the inverse of :meth:`decode`."""
+        """Return the action of a velocity, the inverse of :meth:`decode`."""
         axes = frame(goal - start)
         return np.stack([(velocity * axis).sum(axis=-1) for axis in axes], axis=-1) / self.top_speed
 
     def follow(self, motion: Motion, wanted: Float) -> Motion:
-        """References over one control step, shape (N, S + 1, D): at its beginning and after each physics step.
+        """Return references over one control step, shape (N, S + 1, D): at its beginning and after each physics step.
 
         Args:
-            motion: At the beginning, shape (N, D) each.
-            wanted: Velocity, shape (N, D), [m/s].
+            motion: State at the beginning, shape (N, D) each.
+            wanted: Decoded velocity, shape (N, D), [m/s].
         """
         return Motion(*(_combined(table, motion, wanted) for table in self._tables))
 
     def jerk_cost(self, motion: Motion, wanted: Float) -> Float:
-        """Half the integral of the squared jerk over one control step, exact, shape (N,), [m^2/s^5]."""
+        """Return half the integral of the squared jerk over one control step, exact, shape (N,), [m^2/s^5]."""
         jerk = _combined(self._jerk_table, motion, wanted)
         each = (jerk * jerk).sum(axis=-1)
         cost = np.zeros(len(each))
@@ -150,7 +150,7 @@ class Steering:
 
     @functools.cached_property
     def _tables(self) -> tuple[Float, Float, Float]:
-        """How position, velocity and acceleration depend on the step's beginning, shape (S + 1, 4) each."""
+        """Matrices from (p, v, a, u) at the beginning to position, velocity and acceleration, shape (S + 1, 4) each."""
         time = self.timestep * np.arange(self.physics_steps + 1)
         w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
         one, zero = np.ones_like(time), np.zeros_like(time)
@@ -163,7 +163,7 @@ class Steering:
 
     @functools.cached_property
     def _jerk_table(self) -> Float:
-        """How jerk at the nodes of the quadrature depends on the step's beginning, shape (12, 4)."""
+        """Matrix from (p, v, a, u) at the beginning to the jerk at the quadrature nodes, shape (12, 4)."""
         time, w = self._quadrature[0], self.bandwidth
         decay = np.exp(-w * time)
         of_velocity = -(w**2) * (1.0 - w * time) * decay
@@ -171,6 +171,6 @@ class Steering:
 
 
 def _combined(table: Float, motion: Motion, wanted: Float) -> Float:
-    """What a table makes of position, velocity, acceleration and wanted velocity, shape (N, rows, D)."""
+    """Return the product of a matrix with position, velocity, acceleration and decoded velocity, (N, rows, D)."""
     parts = (*motion, wanted)
     return np.asarray(sum(table[:, k, None] * part[:, None] for k, part in enumerate(parts)))

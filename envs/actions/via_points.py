@@ -1,4 +1,4 @@
-"""From an action to via-points and durations, and back."""
+"""Action layout: decoding of actions into via-points and durations, and encoding."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MIN_GOAL_DISTANCE = 0.02
 Timing = Literal["optimal", "learned"]
 
 LOG_SPLIT = float(np.log(4.0))
-"""What an action of 1 adds to the log ratio of two neighbouring segments' durations: a factor of four."""
+"""Log ratio of neighbouring segments' durations for an action of 1: a factor of four."""
 
 
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 """Bounds of the duration range, [s]."""
 MOST_VIAS = 16
-"""Via-points of an action at most: more of them only say the same movement in more words."""
+"""Greatest number of via-points of an action; more add no new movements in practice."""
 
 
 class Plan(NamedTuple):
@@ -42,7 +42,7 @@ class Plan(NamedTuple):
     waypoints: Array
     """Start, via-points and goal, shape (..., K + 2, D), [m]."""
     durations: Array
-    """Of the segments between them, shape (..., K + 1), [s]."""
+    """Durations of the segments, shape (..., K + 1), [s]."""
 
     def take(self, rows: Any) -> Plan:
         """Return the movements at `rows`, an index, slice or mask of the batch."""
@@ -55,7 +55,7 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ActionLayout:
-    """What each component of an action means.
+    """Layout of actions: the meaning of each component.
 
     An action is a vector in [-1, 1]^m: for each of K via-points its offset from the k-th of K evenly spaced points of
     the straight line, in the frame of start and goal; then the duration; then, with `timing="learned"`, how it is
@@ -67,14 +67,14 @@ class ActionLayout:
     n_via: int = 1
     """Number of via-points K, 0 to :data:`MOST_VIAS`."""
     timing: Timing = "optimal"
-    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: the action says."""
+    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: part of the action."""
     duration_range: tuple[float, float] = (0.6, 1.2)
     """Shortest and longest total duration, [s]; an action of 0 is their geometric mean."""
     via_scale: tuple[float, ...] = (0.15, 0.25, 0.25)
     """Largest offset along, across and above the straight line, [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+        """Check all fields."""
         if self.dimension not in (2, 3):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
         whole = isinstance(self.n_via, int | np.integer) and not isinstance(self.n_via, bool)
@@ -99,7 +99,7 @@ class ActionLayout:
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the components, in order."""
+        """Names of the components, in order."""
         axes = ("along", "across", "above")[: self.dimension]
         vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in axes]
         splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
@@ -107,7 +107,7 @@ class ActionLayout:
 
     @functools.cached_property
     def units(self) -> tuple[str, ...]:
-        """What an action of 1 in each component stands for."""
+        """Value of an action of 1 in each component."""
         scale = [f"{s:g} m" for s in self.via_scale[: self.dimension]] * self.n_via
         low, high = self.duration_range
         splits = ["factor 4 between the segments before and after"] * (
@@ -129,7 +129,7 @@ class ActionLayout:
         return tuple(float(r) for r in np.diff(np.log(durations)))
 
     def decode(self, action: Array, start: Array, goal: Array) -> Plan:
-        """The movement that an action stands for.
+        """Return the movement of an action.
 
         Args:
             action: Shape (..., m), in [-1, 1].
@@ -158,7 +158,7 @@ class ActionLayout:
         return Plan(points, self._durations(points, duration, action[..., ends + 1 :]))
 
     def encode(self, plan: Plan) -> Array:
-        """The action that stands for a movement: the inverse of :meth:`decode`.
+        """Return the action of a movement, the inverse of :meth:`decode`.
 
         Components outside [-1, 1] say that the movement lies outside the action space.
 
@@ -204,7 +204,7 @@ class ActionLayout:
             )
 
     def _check_shapes(self, action: tuple[int, ...], start: tuple[int, ...], goal: tuple[int, ...]) -> None:
-        """Refuse what would be read as something else; numbers are not looked at, as a graph of tensors has none."""
+        """Check shapes, not values: exported graphs of tensors have none."""
         if action[-1:] != (self.size,):
             raise ValueError(
                 f"action must have shape (..., {self.size}) ({', '.join(self.names)}), got {tuple(action)}"
@@ -236,9 +236,9 @@ class ActionLayout:
 
 
 def frame(line: Array) -> list[Array]:
-    """Unit vectors along a line, across it (to its left, horizontal) and above it, each of shape (..., D).
+    """Return unit vectors along a line, across it (to its left, horizontal) and above it, each of shape (..., D).
 
-    In space a vertical line has no left; the x axis stands in.
+    A vertical line in space has no left; the x axis replaces it.
     """
     xp = namespace_of(line)
     along = line / xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
@@ -258,7 +258,7 @@ def frame(line: Array) -> list[Array]:
 
 
 def _arrays(*values: Array) -> tuple[Array, ...]:
-    """Arrays and tensors as they are, anything else as an array of numbers."""
+    """Return arrays and tensors unchanged and anything else as arrays of numbers."""
     for value in values:
         if not hasattr(value, "shape"):
             break
@@ -271,7 +271,7 @@ def _arrays(*values: Array) -> tuple[Array, ...]:
 
 
 def check_increasing_pair(name: str, pair: Any) -> None:
-    """Refuse anything but two positive finite numbers in increasing order."""
+    """Check that a pair is two positive finite numbers in increasing order."""
     try:
         low, high = pair
     except (TypeError, ValueError):
@@ -283,11 +283,11 @@ def check_increasing_pair(name: str, pair: Any) -> None:
 
 
 MAX_START_OFFSET = 1e-3
-"""How far from the hand a plan may begin at most, [m]."""
+"""Greatest distance of a plan's beginning from the hand, [m]."""
 
 
 def checked_plan(plan: Plan, start: Float) -> Plan:
-    """Movements that begin where the hands are, shape (N, D), [m]."""
+    """Return a plan as arrays, after a check that it begins at the hands, shape (N, D), [m]."""
     try:
         waypoints, durations = (np.asarray(part, dtype=np.float64) for part in plan)
     except (TypeError, ValueError):

@@ -20,11 +20,11 @@ from viapoint.primitives.array_api import Array
 FARTHEST = 1.0
 """Bound of every coordinate, [m]."""
 BEYOND_LIMIT = 0.1
-"""How far a joint may be pushed past its limit before the observation clips it, [rad]."""
+"""Margin beyond the joint limits at which observed angles are clipped, [rad]."""
 
 
 class ObstacleRows(NamedTuple):
-    """The obstacles of an observation by name, shape (..., n, .) each, [m]; absent rows are zero."""
+    """Obstacles of an observation by name, shape (..., n, .) each, [m]; absent rows are zero."""
 
     centre: Array
     half_axis: Array
@@ -46,7 +46,7 @@ class ObservationLayout:
 
     @classmethod
     def of(cls, arm: Arm, n_rows: int) -> ObservationLayout:
-        """The layout for an arm and at most `n_rows` obstacles."""
+        """Return the layout for an arm and at most `n_rows` obstacles."""
         return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows)
 
     @functools.cached_property
@@ -57,11 +57,11 @@ class ObservationLayout:
 
     @property
     def row_size(self) -> int:
-        """Numbers of one obstacle."""
+        """Number of values of one obstacle."""
         return 2 * self.dimension + 2
 
     def space(self) -> spaces.Dict:
-        """The observation space of one environment."""
+        """Return the observation space of one environment."""
         point = np.full(self.dimension, FARTHEST)
         low, high = self._joint_bounds
         bounds = {
@@ -84,7 +84,7 @@ class ObservationLayout:
     def observe(
         self, joints: NDArray[np.float64], hand: NDArray[np.float64], scenes: Scenes
     ) -> dict[str, NDArray[np.float32]]:
-        """Observations of N environments, shape (N, .) each, in fresh arrays."""
+        """Return observations of N environments, shape (N, .) each, in fresh arrays."""
         low, high = self._joint_bounds
         parts: dict[str, Any] = {
             "hand": np.clip(hand, -FARTHEST, FARTHEST),
@@ -97,7 +97,7 @@ class ObservationLayout:
         return {name: part.astype(np.float32) for name, part in parts.items()}
 
     def obstacles(self, flat: Array) -> ObstacleRows:
-        """The `obstacles` part, shape (..., n (2 D + 2)), by name; a view, of NumPy arrays and torch tensors."""
+        """Return views of the `obstacles` part, shape (..., n (2 D + 2)), by name, in NumPy or torch."""
         rows = flat.reshape((*flat.shape[:-1], self.n_rows, self.row_size))
         d = self.dimension
         return ObstacleRows(rows[..., :d], rows[..., d : 2 * d], rows[..., 2 * d], rows[..., 2 * d + 1])
@@ -111,9 +111,9 @@ GREATEST_ACCELERATION = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class OnlineObservationLayout(ObservationLayout):
-    """The parts of a whole movement's observation, and what changes on the way; what lies in the future is hidden.
+    """Layout of replanning observations; future changes of the scene are hidden.
 
-    `hand` [m], `velocity` [m/s] and `acceleration` [m/s^2] are what is commanded, `goal` and `obstacles` the present
+    `hand` [m], `velocity` [m/s] and `acceleration` [m/s^2] are the present command, `goal` and `obstacles` the present
     ones, `obstacle_velocities` n rows of D [m/s], flattened, `time_left` [s]; `via`, K rows of D [m], flattened, and
     `remaining` [s] are the plan that a zero action leads to. What exceeds its bounds is clipped.
     """
@@ -122,7 +122,7 @@ class OnlineObservationLayout(ObservationLayout):
     time_limit: float
 
     def space(self) -> spaces.Dict:
-        """The observation space of one environment."""
+        """Return the observation space of one environment."""
         d = self.dimension
         sides = {
             "velocity": (-GREATEST_SPEED, GREATEST_SPEED, d),
@@ -136,13 +136,13 @@ class OnlineObservationLayout(ObservationLayout):
         return spaces.Dict({**super().space().spaces, **boxes})
 
     def online(self, joints: Float, scenes: ChangingScenes, default: NominalPlan, time: Float) -> Observation:
-        """Observations of N environments, shape (N, .) each, in fresh arrays.
+        """Return observations of N environments, shape (N, .) each, in fresh arrays.
 
         Args:
             joints: Shape (N, J), [rad].
             scenes: N of them.
-            default: What N hands do on a zero action.
-            time: Since the start, shape (N,), [s].
+            default: Plans of N hands on a zero action.
+            time: Time since the start, shape (N,), [s].
         """
         now = scenes.at(time)
         d, number = self.dimension, len(time)

@@ -18,16 +18,16 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
 
 CLEARANCE_RANGE = (-0.05, 0.01)
-"""Clearance beyond which nothing more is lost or won, [m]."""
+"""Range in which clearance changes the reward, [m]."""
 CLEARANCE_UNIT = 0.05
-"""[m]."""
+"""Unit of the clearance term, [m]."""
 GOAL_ERROR_UNIT = 0.1
-"""Goal error at which all is lost, [m]."""
+"""Unit of the goal error term, and the goal error at which it saturates, [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeights:
-    """How much each term counts, 0 or more."""
+    """Weights of the terms of the reward, 0 or more."""
 
     success: float = 1.0
     """+ 1[success]."""
@@ -43,7 +43,7 @@ class RewardWeights:
     """- (duration / duration of the zero action - 1)."""
 
     def __post_init__(self) -> None:
-        """Refuse a weight that turns its term round."""
+        """Check that no weight is negative."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) < np.inf:
@@ -53,10 +53,10 @@ class RewardWeights:
 
     @classmethod
     def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:
-        """Weights from a record, from a mapping of some of them, or the defaults.
+        """Return weights from a record, from a mapping of some of them, or the defaults.
 
         Raises:
-            ValueError: It is something else, or has terms that there are not.
+            ValueError: The argument is something else, or names an unknown term.
         """
         if weights is not None and not isinstance(weights, RewardWeights | Mapping):
             raise ValueError(f"reward_weights must be a mapping of names to numbers, got {weights!r}")
@@ -69,7 +69,7 @@ class RewardWeights:
 
 
 class RewardTerms(NamedTuple):
-    """The weighted terms, shape (N,) each; the reward is their sum."""
+    """Weighted terms of N rewards, shape (N,) each; the reward is their sum."""
 
     success: Float
     collision: Float
@@ -79,25 +79,25 @@ class RewardTerms(NamedTuple):
     duration: Float
 
     def total(self) -> Float:
-        """The reward, shape (N,): the terms added in order."""
+        """Return the reward, shape (N,): the terms added in order."""
         return np.asarray(sum(self))
 
     def as_info(self) -> dict[str, Any]:
-        """The terms as `reward_*`."""
+        """Return the terms as `reward_*`."""
         return {f"reward_{name}": term for name, term in self._asdict().items()}
 
 
 def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeights) -> RewardTerms:
-    """The weighted terms of movements.
+    """Return the weighted terms of movements.
 
     Every term is bounded, so that no movement outweighs all others. With the default weights any success is worth
     more than any failure; and among movements of one shape the one of the centre duration is best: there a longer
     one costs as much time as it saves jerk.
 
     Args:
-        outcome: Of N movements.
+        outcome: Metrics of N movements.
         centre_duration: Duration of the zero action, [s].
-        weights: Of the terms.
+        weights: Weights of the terms.
     """
     relative: Any = outcome.duration / centre_duration
     log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
@@ -147,7 +147,7 @@ def weighted_terms(
 
 @dataclass(frozen=True, kw_only=True)
 class OnlineRewardWeights(RewardWeights):
-    """How much each term counts, 0 or more."""
+    """Weights of the terms of the reward, 0 or more."""
 
     smoothness: float = 0.05
     """- log(1 + jerk cost so far / jerk cost of the straight movement), less what was given before."""
@@ -165,19 +165,19 @@ def online_rewards(
     centre_duration: float,
     weights: RewardWeights,
 ) -> RewardTerms:
-    """The weighted terms of one decision of N episodes.
+    """Return the weighted terms of one decision of N episodes.
 
     Over an episode clearance and smoothness sum to what they are of all that was commanded, the duration to its time.
 
     Args:
-        before: The decision.
-        after: It.
-        elapsed: Time that it took, shape (N,), [s].
-        ended: Whether the episode ended in it, shape (N,).
-        begun: Whether it is the episode's first.
-        scenes: N of them.
+        before: Metrics before the decision.
+        after: Metrics after the decision.
+        elapsed: Time of the decision, shape (N,), [s].
+        ended: True if the episode ended, shape (N,).
+        begun: True for the first decision of an episode, shape (N,).
+        scenes: Scenes of the N episodes.
         centre_duration: Duration of the zero action, [s].
-        weights: Of the terms.
+        weights: Weights of the terms.
     """
     low, high = CLEARANCE_RANGE
     kept, lost = (np.clip(each.planned_clearance, low, high) / CLEARANCE_UNIT for each in (after, before))
@@ -196,7 +196,7 @@ def online_rewards(
 
 @dataclass(frozen=True, kw_only=True)
 class StepRewardWeights(RewardWeights):
-    """How much each term counts, 0 or more: those of a whole movement, and one for every step of it."""
+    """Weights of the terms of a control step's reward, 0 or more."""
 
     progress: float = 1.0
     """+ how much nearer the goal, as a share of the distance at the start."""
@@ -211,20 +211,20 @@ def step_rewards(
     centre_duration: float,
     weights: StepRewardWeights,
 ) -> tuple[RewardTerms, Float]:
-    """The weighted terms of one control step of N episodes, and that of its progress.
+    """Return the weighted terms of one control step of N episodes, and the progress term.
 
     Over an episode the terms of a success sum to those of a whole movement with the same outcome, and the progress to
     its weight. Clearance and goal error are given when they change, the others at the end; smoothness and duration
     count where the hand arrived only, as a movement that ends early would seem the smoothest and quickest.
 
     Args:
-        before: The step.
-        after: It.
-        ended: Whether the episode ended in it, shape (N,).
-        begun: Whether it is the episode's first.
-        scenes: N of them.
+        before: Metrics before the step.
+        after: Metrics after the step.
+        ended: True if the episode ended, shape (N,).
+        begun: True for the first step of an episode, shape (N,).
+        scenes: Scenes of the N episodes.
         centre_duration: Duration of the zero action of a whole movement, [s].
-        weights: Of the terms.
+        weights: Weights of the terms.
     """
     whole = reward_terms(after, centre_duration, weights)
     low, high = CLEARANCE_RANGE

@@ -1,4 +1,4 @@
-"""What a task is, apart from any episode of it: all that an agent may compute with before it has moved."""
+"""Task of an environment: everything that an agent may compute with before it moves."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Task:
 
     @property
     def observation(self) -> ObservationLayout:
-        """The layout of the observation."""
+        """Layout of the observation."""
         return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
 
     def sampler(self) -> SceneSampler:
@@ -53,13 +53,13 @@ class Task:
         return SceneSampler(self.collision_model, self.scenes)
 
     def as_dict(self) -> dict[str, Any]:
-        """The task as plain values, fit for JSON."""
+        """Return the task as plain values for JSON."""
         record = {name: dataclasses.asdict(getattr(self, name)) for name in ("action", "weights", "scenes")}
         return {"arm": self.arm.name, "whole_arm": self.whole_arm, **record}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any], arms: Mapping[str, Arm]) -> Task:
-        """The task that :meth:`as_dict` wrote down; its arm is one of `arms`.
+        """Return the task of a record of :meth:`as_dict`; its arm is one of `arms`.
 
         Raises:
             ValueError: The arm is not among them, or a value is not allowed.
@@ -77,12 +77,12 @@ class Task:
 
 
 def distribution_of(arm: Arm) -> type[SceneDistribution] | type[SpaceDistribution]:
-    """What describes the scenes of an arm: of the plane, or of space."""
+    """Return the class of an arm's scene distribution, planar or spatial."""
     return SceneDistribution if arm.dimension == 2 else SpaceDistribution
 
 
 def _tuples(record: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON knows lists only; the records hold tuples."""
+    """Return a record with tuples instead of JSON's lists."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 

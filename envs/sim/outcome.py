@@ -1,4 +1,4 @@
-"""What came of a movement."""
+"""Metrics of executed movements."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ GOAL_TOLERANCE = 0.01
 REST_SPEED = 0.02
 """Greatest hand speed at the end that counts as rest, [m/s]."""
 LIMIT_TOLERANCE = 1e-3
-"""How far MuJoCo's soft limits may give way, [rad]."""
+"""Tolerance of MuJoCo's soft joint limits, [rad]."""
 
 
 class Outcome(NamedTuple):
-    """What came of N movements, shape (N,) each."""
+    """Metrics of N executed movements, shape (N,) each."""
 
     is_success: Bool
-    """No contact, joint limits kept, at rest within 1 cm of the goal after the settling time."""
+    """True for no contact, joint limits kept, and rest within 1 cm of the goal after the settling time."""
     collision: Bool
-    """Contact at any physics step."""
+    """True for contact at any physics step."""
     first_contact_time: Float
-    """[s]; -1 without contact."""
+    """Time of the first contact, [s]; -1 without contact."""
     min_clearance: Float
-    """[m], exact, over all physics steps; at most 1."""
+    """Least clearance over all physics steps, [m], exact; at most 1."""
     planned_clearance: Float
-    """[m], of the plan: how deep it would cut into an obstacle that gave way; at most 1."""
+    """Least clearance of the plan, [m]; negative for the depth inside an obstacle; at most 1."""
     goal_error: Float
-    """[m], after the settling time."""
+    """Distance from the goal after the settling time, [m]."""
     duration: Float
-    """[s], planned, and stretched where the arm's limits ask for it."""
+    """Planned duration after time scaling, [s]."""
     path_length: Float
-    """[m], of the hand."""
+    """Length of the hand's path, [m]."""
     jerk_cost: Float
-    """Half the integral of the planned squared jerk, [m^2/s^5]."""
+    """Jerk cost of the plan: half the integral of its squared jerk, [m^2/s^5]."""
     jerk_ratio: Float
     """Jerk cost relative to the straight movement's of the same duration."""
     peak_speed: Float
-    """[m/s], of the hand."""
+    """Greatest speed of the hand, [m/s]."""
     tracking_error: Float
-    """[m], root mean square of hand minus plan."""
+    """Root mean square distance of hand and plan, [m]."""
     reachable: Bool
-    """Whether the whole plan is within the arm's reach; if not, the arm does not start."""
+    """True if the whole plan is within the arm's reach; otherwise the arm does not start."""
     unstable: Bool
-    """Whether the physics broke down."""
+    """True if the physics broke down."""
     stretch: Float
-    """By which factor the movement was slowed down for the arm's limits; 1 where it was not."""
+    """Factor by which the movement was slowed down for the arm's limits, 1 or more."""
 
 
 def straight_jerk_cost(length: Float, duration: Float) -> Float:

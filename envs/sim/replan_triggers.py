@@ -1,4 +1,7 @@
-"""When a decision ends. Plans and courses are known to the environment, so all but a contact is known beforehand."""
+"""Triggers that end a decision.
+
+Plans and courses are known to the environment, so all events but a contact are known in advance.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +21,19 @@ from viapoint.envs.sim.executor import SETTLING
 
 Trigger = Literal["horizon", "target", "course", "clearance"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
-"""What may end a decision on the way."""
+"""Events that may end a decision before the goal."""
 
 FORESIGHT = 0.4
-"""How far ahead clearance is predicted, [s]."""
+"""Horizon of the predicted clearance, [s]."""
 SAMPLED = 0.016
-"""Between the times at which clearance is predicted, [s]."""
+"""Time between the samples of a predicted clearance, [s]."""
 LOOK = 2
-"""How many of them pass from one prediction to the next."""
+"""Samples from one prediction to the next."""
 NEVER = np.iinfo(np.int64).max
 
 
 class Event(IntEnum):
-    """What ended a decision, the `event` of `info`; of several at once the most telling."""
+    """Event that ended a decision, the `event` of `info`; of simultaneous events, the one of highest rank."""
 
     HORIZON = 0
     """The horizon has passed."""
@@ -53,26 +56,26 @@ class Event(IntEnum):
 
 
 class Ends(NamedTuple):
-    """How N decisions end, if nothing is touched."""
+    """Ends of N decisions without contact."""
 
     step: Int
-    """Physics step of the episode before which they end, shape (N,)."""
+    """Physics step of the episode before which each decision ends, shape (N,)."""
     event: Int
     """:class:`Event`, shape (N,)."""
     final: NDArray[np.bool_]
-    """Whether the hand has arrived and nothing is to come, shape (N,)."""
+    """True if the hand has arrived and no change is left, shape (N,)."""
 
 
 class DecisionEnds:
-    """Finds out when decisions end.
+    """Predictor of the ends of decisions.
 
     Args:
         collision_model: Arm that moves.
-        timestep: Of the physics, [s].
-        triggers: What ends a decision on the way.
-        horizon: [s].
+        timestep: Length of a physics step, [s].
+        triggers: Events that end a decision before the goal.
+        horizon: Longest decision, [s].
         margin: Predicted clearance below which a decision ends, [m].
-        time_limit: Of an episode, [s].
+        time_limit: Time limit of an episode, [s].
 
     Raises:
         ValueError: There is no such trigger, or horizon or margin are too small.
@@ -97,13 +100,13 @@ class DecisionEnds:
         self.horizon, self.limit = self.steps(min(horizon, time_limit)), self.steps(time_limit)
 
     def steps(self, time: Any) -> Any:
-        """The first physics step at or after a time [s]; NEVER for an infinite one."""
+        """Return the first physics step at or after a time [s], NEVER for an infinite time."""
         finite = np.isfinite(time)
         number = np.ceil((np.where(finite, time, 0.0) - 1e-9) / self.timestep).astype(np.int64)
         return np.where(finite, number, NEVER)[()]
 
     def __call__(self, plan: MovingPlan, began: Int, now: Int, scenes: ChangingScenes) -> Ends:
-        """How decisions end that begin at the physics step `now`, under plans that began at the step `began`."""
+        """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`."""
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_times)
         moving_until = began + self.steps(plan.duration)
         arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
@@ -128,10 +131,10 @@ class DecisionEnds:
         return Ends(steps.min(axis=0), event, there & (event == Event.ARRIVAL))
 
     def _clearance(self, plan: MovingPlan, began: Int, now: Int, scenes: ChangingScenes, latest: Int) -> Int:
-        """When the predicted clearance falls below the margin, NEVER where it does not before the `latest` step.
+        """Return the step at which the predicted clearance falls below the margin, NEVER if not before `latest`.
 
-        An obstacle is foreseen to go on as it does at that moment. As every course turns once at most, two profiles
-        over time say it all: without the turn, and with it.
+        The prediction assumes that obstacles keep their present velocity. Every course turns once at most, so two
+        clearance profiles suffice: without the turn, and with it.
         """
         never = np.full(len(now), NEVER)
         if "clearance" not in self.triggers or not scenes.present.any():
@@ -159,9 +162,9 @@ class DecisionEnds:
 
 
 _RANK = [Event.TIME_LIMIT, Event.TARGET, Event.COURSE, Event.CLEARANCE, Event.ARRIVAL, Event.HORIZON]
-"""Of several events at once the first counts."""
+"""Rank of simultaneous events, highest first."""
 
 
 def _next(steps: Int, now: Int) -> Int:
-    """The first of some steps, shape (N, n), after the present one; NEVER where there is none: (N,)."""
+    """Return the first of some steps, shape (N, n), after the present one, NEVER without one, shape (N,)."""
     return np.asarray(np.where(steps > now[:, None], steps, NEVER).min(axis=1, initial=NEVER))

@@ -1,4 +1,4 @@
-"""Many simulations of one arm among obstacles, run by one call into C."""
+"""Batch simulator of one arm among obstacles, on MuJoCo's batch engine."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.narrow_phase import LinkPositions
 
 OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
-"""Where an absent obstacle waits, [m]."""
+"""Position of absent obstacles, [m]."""
 
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
-"""What a control sequence holds where obstacles move: controls, then the obstacles' centres."""
+"""Parts of a control sequence with moving obstacles: controls, then the obstacles' centres."""
 
 
 class SimulationLog(NamedTuple):
-    """What a rollout of n simulations over T physics steps left behind."""
+    """Record of n simulations over T physics steps."""
 
     joints: Float
-    """Angles after each step, shape (n, T, J), [rad]."""
+    """Joint angles after each step, shape (n, T, J), [rad]."""
     contact: NDArray[np.bool_]
-    """Whether arm and obstacle touched at the state before each step, shape (n, T)."""
+    """True where arm and obstacle touch at the state before a step, shape (n, T)."""
     unstable: NDArray[np.bool_]
-    """Whether MuJoCo raised a warning, shape (n,); such a simulation stopped there."""
+    """True for simulations that MuJoCo stopped with a warning, shape (n,)."""
     traced: LinkPositions | None
-    """The arm's traced sites before each step; None where it has none."""
+    """Positions of the arm's traced sites before each step; None without such sites."""
 
 
 class Simulator:
-    """MuJoCo's batch engine with the arm in its posture and capsules of any place and size around it."""
+    """MuJoCo's batch engine with one arm and capsules of any place and size in each simulation."""
 
     def __init__(
         self, collision_model: CollisionModel, *, n_obstacles: int, num_envs: int, threads: int
@@ -48,10 +48,10 @@ class Simulator:
         self.physics_steps = 0
         """Physics steps simulated so far, all simulations together."""
         self.batch = batch.Batch(self.model, num_envs, threads)
-        """MuJoCo's engine, whose state rows are the simulations'."""
+        """MuJoCo's batch engine; row i of its state is simulation i."""
         self._rest_state = self.batch.state[0].copy()
         self.recorded = ("qpos", "ncon", "site_xpos") if self.arm.traced else ("qpos", "ncon")
-        """What the engine records at every step."""
+        """Quantities that the engine records at every step."""
         sites = [self.model.site(name).id for name in self.arm.traced]
         self._traced = (sites[0], np.array(sites[1:]).reshape(-1, 2)) if sites else None
         self._geoms = [self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)]
@@ -63,13 +63,13 @@ class Simulator:
     def place(
         self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
     ) -> None:
-        """Put arms at rest and obstacles where they belong.
+        """Place arms at rest, and obstacles.
 
         Args:
             sims: The simulations, shape (n,).
             joints: Shape (n, J), [rad].
             obstacles: Rows (centre D, half-axis D, radius), shape (n, rows, 2 D + 1), [m].
-            present: Whether a row is an obstacle, shape (n, rows).
+            present: True for rows that are obstacles, shape (n, rows).
         """
         self.batch.state[sims] = self._rest_state
         self.batch.bind("qpos")[sims] = joints
@@ -102,15 +102,15 @@ class Simulator:
     def rollout_among_moving(
         self, sims: NDArray[np.int64], controls: Float, places: Float, steps: NDArray[np.int64]
     ) -> SimulationLog:
-        """Run simulations under controls while their obstacles move, each for a number of steps of its own.
+        """Run simulations under controls among moving obstacles, each for its own number of steps.
 
-        Those of a call run together for the greatest number, and then stand where they were after their own.
+        All run for the greatest number of steps; then each is set back to its state after its own steps.
 
         Args:
             sims: The simulations in increasing order, shape (n,).
             controls: Shape (n, T, U).
-            places: Of the obstacles' centres before each step, NaN where there is none, shape (n, T, rows, D), [m].
-            steps: Of each, 1 to T, shape (n,).
+            places: Centres of the obstacles before each step, NaN for absent ones, shape (n, T, rows, D), [m].
+            steps: Physics steps of each simulation, 1 to T, shape (n,).
         """
         number = controls.shape[1]
         warnings = self._warnings(sims)
@@ -131,7 +131,7 @@ class Simulator:
         return SimulationLog(joints, contact, unstable, None)
 
     def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Model and data of one simulation with the arm at `joints`, to draw them."""
+        """Return model and data of one simulation with the arm at `joints`, for rendering."""
         model, data = self.batch.get_model(sim), self.batch.get_data(sim)
         data.qpos[:] = joints
         mujoco.mj_forward(model, data)
@@ -150,7 +150,7 @@ class Simulator:
 
 
 def _turn_up_to(axis: Float, half: Float) -> Float:
-    """Quaternion that turns the z axis, along which MuJoCo lays its capsules, towards `axis`."""
+    """Return the quaternion that turns the z axis, along which MuJoCo's capsules lie, to `axis`."""
     lying = half > 1e-9
     unit = np.where(lying[..., None], axis / np.where(lying, half, 1.0)[..., None], (0.0, 0.0, 1.0))
     unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction

@@ -1,4 +1,4 @@
-"""How much slower a movement is made for the limits of the arm's joints, and whether it stays within their reach."""
+"""Time scaling of movements for the limits of the arm's joints."""
 
 from __future__ import annotations
 
@@ -10,51 +10,51 @@ from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float
 
 LOOK_EVERY = 0.008
-"""Clearance and reach of the plan are looked at that often, which is every few millimetres, [s]."""
+"""Time between checks of a plan's clearance and reach, every few millimetres, [s]."""
 LOOKS, LEAST = 32, 12
-"""At how many times a movement is looked at for the arm's limits, and each of its segments at least."""
+"""Times at which the arm's limits are checked, per movement and per segment at least."""
 CLOSER = np.linspace(-1.0, 1.0, 10)[1:-1]
-"""Where it is looked at again: around the look with the greatest demand of each segment, up to those beside it."""
+"""Relative places of the second checks between the neighbours of the most demanding time of each segment."""
 NEARLY = 1.1
-"""A movement that would be at a limit if it were so much faster is looked at again."""
+"""Margin of the first check: a movement that would reach a limit if it were this much faster is checked again."""
 TOGETHER = 256
-"""Movements that are looked at together: as many steps of the inverse dynamics for many as for one."""
+"""Movements checked in one call; a larger batch leaves the cache."""
 
 
 class TimeScale(NamedTuple):
-    """What the arm's limits ask of N movements."""
+    """Time scaling that the arm's limits require of N movements."""
 
     stretch: Float
-    """By which factor each must be slowed down, shape (N,); 1 where it need not, or leaves the reach."""
+    """Factor by which each must be slowed down, shape (N,); 1 if that is not needed or out of reach."""
     within: Bool
-    """Whether it stays within the reach where it was looked at, shape (N,)."""
+    """True if the movement stays within reach at the checked times, shape (N,)."""
 
 
 def required_time_scale(arm: Arm, plan: Any) -> TimeScale:
-    """What limits ask of plans: of an arm that has none, only how short ones keep within its reach.
+    """Return the time scaling that joint limits require; for an arm without limits, check the reach of short plans.
 
     Args:
-        arm: That would move.
+        arm: Arm that moves.
         plan: N movements, with `durations` of their segments [s], `trajectory()` and `take(rows)`.
     """
     number, segments = plan.durations.shape
     stretch, within = np.ones(number), np.ones(number, dtype=bool)
-    # Others are looked at no less often where their clearance is computed.
+    # The reach of longer segments is checked as densely where their clearance is computed.
     short = (plan.durations < LOOK_EVERY * looks_of(segments)).any(axis=-1)
     rows = np.arange(number) if arm.velocity_limit else np.flatnonzero(short)
     for first in range(0, len(rows), TOGETHER):
         some = rows[first : first + TOGETHER]
-        stretch[some], within[some] = _looked_at(arm, plan.take(some))
+        stretch[some], within[some] = _check_block(arm, plan.take(some))
     return TimeScale(stretch, within)
 
 
 def looks_of(segments: int) -> int:
-    """At how many times each of so many segments is looked at."""
+    """Return the number of checks of each segment."""
     return max(-(-LOOKS // segments), LEAST)
 
 
-def _looked_at(arm: Arm, plan: Any) -> TimeScale:
-    """The same of some of them, with all of their segments."""
+def _check_block(arm: Arm, plan: Any) -> TimeScale:
+    """Check one block of movements."""
     durations = plan.durations
     number, segments = durations.shape
     each = looks_of(segments)
@@ -78,6 +78,6 @@ def _looked_at(arm: Arm, plan: Any) -> TimeScale:
 
 
 def _demand(arm: Arm, position: Float, velocity: Float, acceleration: Float) -> Float:
-    """By which factor movements must be slowed down for each of their times, shape (N, T); no less than 1 / NEARLY."""
+    """Return the factor that the state at each time requires, shape (N, T), at least 1 / NEARLY."""
     faster = NEARLY * velocity[:, :, None], NEARLY**2 * acceleration[:, :, None]
     return np.asarray(arm.required_time_scale(position[:, :, None], *faster)) / NEARLY
