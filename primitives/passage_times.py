@@ -9,9 +9,8 @@ import numpy as np
 
 from ._boundary import check_waypoints, chosen_items, read_arguments, unit_time_ends
 from ._passage.cost import PassageCost
-from ._passage.gradient import attach_gradient
 from ._passage.moving_ends import fractions_moving
-from ._passage.newton import fractions_by_newton
+from ._passage.newton import attach_gradient, fractions_by_newton
 from ._passage.rest_to_rest import fractions_at_rest
 from .array_api import (
     FREE,
