@@ -142,21 +142,24 @@ class Episodes:
     def add(self, segment: Segment) -> Float:
         """Add one step of some episodes; return the distances that the hand moved per physics step, (n, T), [m]."""
         now, rows, steps = self.now, segment.rows, segment.steps
-        done, last = np.arange(segment.hand.shape[1]) < steps[:, None], (np.arange(len(rows)), steps - 1)
+        last = np.arange(len(rows)), steps - 1
         self._store(segment)
-        contact = segment.contact & done
+        contact, moved = segment.contact, norm(np.diff(segment.hand, axis=1, prepend=now.hand[rows, None]))
+        deviation = ((segment.hand - segment.planned) ** 2).sum(axis=-1)
+        kept = within_joint_range(segment.joints, self.arm).all(axis=-1)
+        done = np.arange(segment.hand.shape[1]) < steps[:, None]
+        if not done.all():  # steps beyond the end of a shorter movement do not count
+            contact, moved, deviation, kept = contact & done, moved * done, deviation * done, kept | ~done
         touched = contact.any(axis=-1) & (now.first_contact[rows] < 0)
         now.first_contact[rows[touched]] = (now.steps[rows] + contact.argmax(axis=-1))[touched]
         now.min_clearance[rows] = np.minimum(now.min_clearance[rows], segment.min_clearance)
         now.planned_clearance[rows] = np.minimum(now.planned_clearance[rows], segment.planned_clearance)
-        moved = norm(np.diff(segment.hand, axis=1, prepend=now.hand[rows, None])) * done
         now.path_length[rows] += sum_in_order(moved)
         now.peak_speed[rows] = np.maximum(now.peak_speed[rows], moved.max(axis=-1) / self.timestep)
         now.last_speed[rows] = moved[last] / self.timestep
-        now.deviation[rows] += sum_in_order(((segment.hand - segment.planned) ** 2).sum(axis=-1) * done)
+        now.deviation[rows] += sum_in_order(deviation)
         now.jerk_cost[rows] += segment.jerk_cost
-        kept = within_joint_range(segment.joints, self.arm).all(axis=-1)
-        now.within[rows] &= (kept | ~done).all(axis=-1)
+        now.within[rows] &= kept.all(axis=-1)
         now.unstable[rows] |= segment.unstable
         now.joints[rows], now.hand[rows] = segment.joints[last], segment.hand[last]
         now.steps[rows] += steps
