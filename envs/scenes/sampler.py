@@ -122,7 +122,7 @@ class SceneSampler:
             given = None if ends is None else (ends[0][where], ends[1][where])
             found, attempt = self._attempt(Uniforms(some.reshape(-1, self._size)), given)
             owner = each[found]
-            first = np.flatnonzero(np.diff(owner, prepend=-1))
+            first = np.flatnonzero(np.concatenate(([True], owner[1:] != owner[:-1]))[: len(owner)])
             solved = owner[first]
             scenes.put(pending[solved], attempt.take(first))
             good[solved] = begin + found[first] % some.shape[1]
@@ -135,15 +135,17 @@ class SceneSampler:
         u = uniforms.take_table(order.n_ends, 2 * arm.dimension, by_column=order.by_column)
         start, goal, good = sample_ends(u, arm, d.distance, d.steepness, d.reach_margin, ends)
         rows = np.flatnonzero(good)
-        uniforms, start, goal = uniforms.at(rows), start[rows], goal[rows]
+        if len(rows) < len(good):
+            uniforms, start, goal = uniforms.at(rows), start[rows], goal[rows]
         u = uniforms.take_table(order.n_paths, self._obstacles.path_numbers, by_column=order.by_column)
         steered = self._obstacles.steered(uniforms, len(rows))
         feasible, good = sample_paths(u, arm, start, goal, d.reach_margin, steered)
-        some = np.flatnonzero(good)
-        rows, feasible = rows[some], feasible.take(some)
+        if not good.all():
+            some = np.flatnonzero(good)
+            uniforms, rows, feasible = uniforms.at(some), rows[some], feasible.take(some)
         obstacles = np.zeros((0, self._obstacles.rows, 2 * arm.dimension + 1))
         if len(rows):
-            obstacles, good = self._obstacles(uniforms.at(some), feasible)
+            obstacles, good = self._obstacles(uniforms, feasible)
             some = np.flatnonzero(good)
             rows, feasible, obstacles = rows[some], feasible.take(some), obstacles[some]
         return rows, Scenes(feasible.start, feasible.goal, obstacles)
@@ -200,6 +202,8 @@ class AttemptNumbers:
             scenes: Indices of the scenes, shape (P,).
             first: Index of the first good attempt, shape (P,); -1 for none.
         """
+        if len(self._groups) == 1:
+            return
         ends = np.cumsum(self._groups)
         for i, states, attempt in zip(scenes, self._states, first, strict=True):
             if 0 <= attempt < ends[-1] - self._groups[-1]:
