@@ -55,7 +55,8 @@ class Task:
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON."""
         record = {name: dataclasses.asdict(getattr(self, name)) for name in ("action", "weights", "scenes")}
-        return {"arm": self.arm.name, "whole_arm": self.whole_arm, **record}
+        kind = {name: True for name in ("replanning", "stepwise") if getattr(self, name)}
+        return {"arm": self.arm.name, "whole_arm": self.whole_arm, **record, **kind}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any], arms: Mapping[str, Arm]) -> Task:
@@ -73,6 +74,8 @@ class Task:
             action=ActionLayout(**_tuples(record["action"])),
             weights=RewardWeights(**record["weights"]),
             scenes=distribution_of(arm)(**_tuples(record["scenes"])),
+            replanning=bool(record.get("replanning", False)),
+            stepwise=bool(record.get("stepwise", False)),
         )
 
 
