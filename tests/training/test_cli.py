@@ -195,8 +195,11 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path)
 def test_the_environment_is_that_of_the_run_or_of_the_pretrained_agent(trained, shipped, capsys):
     run("evaluate", trained, "--baselines", "straight", "--n-scenes", 2)
     assert ENV in capsys.readouterr().out
-    run("evaluate", ENV, "--env", ENV, "--baselines", "straight", "--n-scenes", 2)
-    assert ENV in capsys.readouterr().out
+    for words in ((ENV, "--env", ENV), ("--pretrained", ENV)):
+        run("evaluate", *words, "--baselines", "straight", "--n-scenes", 2)
+        assert ENV in capsys.readouterr().out
+    assert "named twice" in failed(capsys, "evaluate", trained, "--pretrained", ENV)
+    assert "pretrained must be one of" in failed(capsys, "play", "--pretrained", "nobody")
     assert f"env must be {ENV}" in failed(
         capsys, "evaluate", trained, "--env", REACH, "--baselines", "straight"
     )

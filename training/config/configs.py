@@ -33,6 +33,7 @@ _AGENT = tyro.conf.arg(
     metavar="AGENT",
     help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
 )
+_PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent, one of {', '.join(SHIPPED_IDS)}.")
 EnvId = Annotated[str, _ENV]
 """Id of an environment; the help of a command lists them."""
 
@@ -200,6 +201,21 @@ class TrainConfig(Config):
         )
 
 
+def _take_pretrained(config: EvaluateConfig | PlayConfig) -> None:
+    """Set the agent of a configuration from `pretrained`.
+
+    Raises:
+        ValueError: An agent is named twice, or no agent is shipped for the id.
+    """
+    if config.pretrained is None:
+        return
+    if config.agent not in (None, config.pretrained):
+        raise ValueError(f"the agent is named twice: {config.agent} and pretrained={config.pretrained}")
+    if config.pretrained not in SHIPPED_IDS:
+        raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {config.pretrained!r}")
+    object.__setattr__(config, "agent", config.pretrained)
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(Config):
     """Evaluate an agent and baselines on the same scenes.
@@ -209,6 +225,8 @@ class EvaluateConfig(Config):
 
     agent: Annotated[tyro.conf.Positional[str | None], _AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent; None for baselines alone."""
+    pretrained: Annotated[str | None, _PRETRAINED] = None
+    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     baselines: tuple[str, ...] = ("straight", "random", "planner")
     """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
     search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
@@ -229,6 +247,7 @@ class EvaluateConfig(Config):
     least: ClassVar = {"n_scenes": 1}
 
     def _check(self) -> None:
+        _take_pretrained(self)
         check_baselines(self.baselines)
         if self.env is not None:
             check_env(self.env)
@@ -252,8 +271,10 @@ class PlayConfig(Config):
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
-    agent: Annotated[tyro.conf.Positional[str], _AGENT]
+    agent: Annotated[tyro.conf.Positional[str | None], _AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent."""
+    pretrained: Annotated[str | None, _PRETRAINED] = None
+    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -266,6 +287,9 @@ class PlayConfig(Config):
     least: ClassVar = {"n_scenes": 1, "checks": 0}
 
     def _check(self) -> None:
+        _take_pretrained(self)
+        if self.agent is None:
+            raise ValueError("name an agent: run folder, model folder or id")
         check_file("video", self.video, ".mp4")
 
 
