@@ -9,10 +9,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Reviser
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, Plan, checked_plan
+from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.common.validation import checked_actions, fewest_and_most
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
 from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import OnlineObservationLayout

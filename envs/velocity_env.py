@@ -8,8 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from viapoint.envs.actions.velocity import Motion, Steering
-from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.actions.velocity import Steering
+from viapoint.envs.actions.via_points import Motion, Plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Int, Observation
 from viapoint.envs.common.validation import checked_actions

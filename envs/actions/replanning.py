@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint import primitives
-from viapoint.envs.actions.velocity import Motion
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, ActionLayout, Plan, frame
+from viapoint.envs.actions.via_points import ActionLayout, Motion, Plan, frame
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 
 
 class MovingPlan(NamedTuple):

@@ -13,37 +13,16 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from viapoint.envs.actions.via_points import frame
+from viapoint.envs.actions.via_points import Motion, frame
 from viapoint.envs.common.types import Float
 
 AXES = ("along", "across", "above")
 STEP_TOLERANCE = 1e-6
 """Relative rounding error of numbers of single precision."""
-
-
-class Motion(NamedTuple):
-    """State of N references, shape (N, ..., D) each."""
-
-    position: Float
-    """Position, [m]."""
-    velocity: Float
-    """Velocity, [m/s]."""
-    acceleration: Float
-    """Acceleration, [m/s^2]."""
-
-    @classmethod
-    def at_rest(cls, position: Float) -> Motion:
-        """Return references that rest at `position`, shape (N, D), [m]."""
-        return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
-
-    def put(self, rows: Any, other: Motion) -> None:
-        """Overwrite the references at `rows`."""
-        for mine, theirs in zip(self, other, strict=True):
-            mine[rows] = theirs
 
 
 @dataclass(frozen=True, kw_only=True)

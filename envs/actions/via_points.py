@@ -13,9 +13,6 @@ from viapoint import primitives
 from viapoint.envs.common.types import Float
 from viapoint.primitives.array_api import Array, namespace_of
 
-MIN_GOAL_DISTANCE = 0.02
-"""Least distance between start and goal, [m]."""
-
 Timing = Literal["optimal", "learned"]
 
 LOG_SPLIT = float(np.log(4.0))
@@ -51,6 +48,27 @@ class Plan(NamedTuple):
     def trajectory(self) -> primitives.Trajectory:
         """Return the minimum-jerk movement through the waypoints."""
         return primitives.through(self.waypoints, self.durations)
+
+
+class Motion(NamedTuple):
+    """State of N references, shape (N, ..., D) each."""
+
+    position: Float
+    """Position, [m]."""
+    velocity: Float
+    """Velocity, [m/s]."""
+    acceleration: Float
+    """Acceleration, [m/s^2]."""
+
+    @classmethod
+    def at_rest(cls, position: Float) -> Motion:
+        """Return references that rest at `position`, shape (N, D), [m]."""
+        return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
+
+    def put(self, rows: Any, other: Motion) -> None:
+        """Overwrite the references at `rows`."""
+        for mine, theirs in zip(self, other, strict=True):
+            mine[rows] = theirs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int
 
+MIN_GOAL_DISTANCE = 0.02
+"""Least distance between start and goal, [m]."""
+
 
 def whole_number(name: str, value: Any, least: int) -> int:
     """Return a whole number that is at least `least`."""

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Container
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from viapoint.envs.actions.replanning import NominalPlan
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
 from viapoint.envs.scenes.scene import LARGEST_HALF_AXIS, LARGEST_RADIUS, Scenes
 from viapoint.primitives.array_api import Array
+
+if TYPE_CHECKING:
+    from viapoint.envs.actions.replanning import NominalPlan
 
 FARTHEST = 1.0
 """Bound of every coordinate, [m]."""
@@ -159,3 +162,8 @@ class OnlineObservationLayout(ObservationLayout):
             "remaining": np.clip(default.remaining, 0.0, self.time_limit)[:, None],
         }
         return {**seen, **{name: part.astype(np.float32) for name, part in parts.items() if part.shape[1]}}
+
+
+def is_replanning(parts: Container[str]) -> bool:
+    """Return whether decisions on observations with these parts revise a movement that may be under way."""
+    return "remaining" in parts

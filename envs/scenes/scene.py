@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 
 LARGEST_HALF_AXIS = 0.3

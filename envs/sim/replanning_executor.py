@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan, timed
-from viapoint.envs.actions.velocity import Motion
+from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.arms.serial_arm import CONTROL_STRIDE
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE

@@ -236,6 +236,7 @@ def test_non_finite_actions_are_refused(env_id, action, message):
         env.step(bad)
 
 
+@pytest.mark.filterwarnings("ignore:.*render_mode='rgb' that is not")  # Gymnasium's, before our error
 def test_wrong_shapes_and_unknown_arguments_are_refused(env_id):
     env = gym.make(env_id, disable_env_checker=True)
     env.reset(seed=0)

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.mdp.rewards import OnlineRewardWeights
 from viapoint.envs.registration import ONLINE_TASKS
 from viapoint.envs.replanning_env import OnlineReachVectorEnv

@@ -8,7 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.actions.velocity import Motion, Steering
+from viapoint.envs.actions.velocity import Steering
+from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.mdp.rewards import RewardTerms, RewardWeights, StepRewardWeights, reward_terms
 from viapoint.envs.registration import STEP_TASKS, twin_of

@@ -11,8 +11,8 @@ import pytest
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planners.baselines import METHODS, make_method
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget
-from viapoint.training.planners.difficulty import planned_share, screen, solution_share
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget, screen
+from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.generate import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import ONLINE_TASKS, TASKS
 from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS, make_method
 from viapoint.training.rollouts.rollout import new_trial

@@ -51,6 +51,9 @@ def copy(saved, tmp_path):
     return tmp_path
 
 
+@pytest.mark.filterwarnings(
+    "ignore:You have specified a mini-batch size"
+)  # the preset is for 64 environments
 @pytest.mark.parametrize("algo", PRESETS)
 def test_a_model_decides_the_same_after_a_round_trip(algo, env, tmp_path):
     model = new(algo, env)

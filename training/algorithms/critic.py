@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.envs.mdp.task import Task
 from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses, bodies_of, dense
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 Form = Literal["places", "action"]
 Pooling = Literal["minimum", "sum"]

@@ -10,8 +10,9 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, frame
-from viapoint.training.search.planned_movements import is_replanning
+from viapoint.envs.actions.via_points import frame
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
+from viapoint.envs.mdp.observation import is_replanning
 
 POSITION_SCALE = 5.0
 """Scale of positions, [1/m]: obstacles lie within a few decimetres of the line from start to goal."""

@@ -14,14 +14,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from viapoint.envs.mdp.task import Task
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
+
 
 PART = {2: 0.0625, 3: 0.15}
 """Maximum half-length of an obstacle part by spatial dimension, [m]."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from viapoint.envs.actions.via_points import frame
 from viapoint.envs.arms import ARMS
+from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.training.algorithms.critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
@@ -24,7 +25,6 @@ from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 from viapoint.training.search.planned_movements import (
     Observation,
     direction,
-    is_replanning,
     plan_movements,
     take_rows,
 )

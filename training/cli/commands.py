@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
-import numpy as np
-from tqdm.auto import tqdm
 
 from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
 from viapoint.training.algorithms.agent import Agent, load_agent
+from viapoint.training.cli.progress import evenly_spread, progress_bar
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, task_of
@@ -107,7 +102,7 @@ def play(config: PlayConfig) -> None:
     """Record a video of an agent's movements."""
     from viapoint.training.plotting.video import record_video
 
-    agent = load_agent(config.agent)
+    agent = load_agent(str(config.agent))
     scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
     rows = evenly_spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
@@ -118,22 +113,3 @@ def play(config: PlayConfig) -> None:
     record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()
     print(f"{len(rows)} movements: {config.video}")
-
-
-def evenly_spread(number: int, count: int) -> Any:
-    """Return at most `count` indices, evenly spread over `number`."""
-    return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
-
-
-@contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar over the scenes of each method."""
-    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
-
-        def progress(name: str, done: int, total: int) -> None:
-            if bar.desc != f"{name}: ":
-                bar.reset(total)
-                bar.set_description(name)
-            bar.update(done - bar.n)
-
-        yield progress

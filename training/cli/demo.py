@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
 from viapoint.training.algorithms.model_io import untrained
-from viapoint.training.cli.commands import evenly_spread, progress_bar
+from viapoint.training.cli.progress import evenly_spread, progress_bar
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods

@@ -119,8 +119,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
     """Check that flags equal those of the run to resume, including flags with default values."""
-    from viapoint.training.runs.run_dir import Run
-    from viapoint.training.runs.trainer import check_unchanged
+    from viapoint.training.runs.run_dir import Run, check_unchanged
 
     run = Run(config.folder)
     usual = dataclasses.replace(run.config, out=config.out, resume=True)

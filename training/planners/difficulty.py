@@ -2,51 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.planners.cma_planner import screen
 from viapoint.training.rollouts.rollout import Trial
-from viapoint.training.search.plan_checks import check_plans
 
-CERTAIN_FAILURE = 0.002
-"""Depth in an obstacle, or beyond the reach, at which a plan certainly fails, [m].
-
-With the default durations plans are tracked within a fifth of a millimetre; much shorter ones are not. The error of
-computed clearance is half a millimetre.
-"""
-CERTAIN_SUCCESS = 0.01
-"""Least clearance and reach margin at which a plan in space certainly succeeds, [m].
-
-There movements are slowed down to the arm's limits, so that plans are tracked within a millimetre, whatever their
-duration: of 1,017 random plans with a margin over 2 mm none failed.
-"""
-
-
-class Screening(NamedTuple):
-    """Outcomes that the plans of N actions determine without simulation, shape (N,) each."""
-
-    fails: NDArray[np.bool_]
-    """True where the movement certainly fails."""
-    succeeds: NDArray[np.bool_]
-    """True where the movement certainly succeeds; never in the plane, where it may be too fast to be tracked."""
-    margin: Float
-    """Minimum of clearance and reach margin of the plan, [m]."""
-
-
-def screen(task: Task, scenes: Scenes, actions: Float) -> Screening:
-    """Screen one action in each of N scenes by its plan."""
-    joints = np.asarray(task.arm.inverse_kinematics(scenes.start))
-    observation = task.observation.observe(joints, scenes.start, scenes)
-    checks = check_plans(observation, actions[:, None], task)
-    margin = np.minimum(checks.clearance, checks.reach_margin)[:, 0].astype(np.float64)
-    in_space = task.whole_arm and task.arm.dimension == 3
-    return Screening(margin < -CERTAIN_FAILURE, margin > (CERTAIN_SUCCESS if in_space else np.inf), margin)
-
+if TYPE_CHECKING:
+    pass
 
 FEW, MANY, ENOUGH = 512, 4096, 8
 """Draws for each scene; draws where fewer than ENOUGH of the first succeed."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,11 @@ from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Trial, Trials
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 Clear = Callable[[Float, Float], bool]
 """Predicate for a straight line between two hand positions that is clear."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,9 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import ONLINE_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.vector_env import Decision, ReachVectorEnv
+
+if TYPE_CHECKING:
+    from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
 class Trials(NamedTuple):

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.actions.velocity import Motion
+from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import STEP_TASKS, twin_of
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.velocity_env import StepReachVectorEnv
 from viapoint.training.rollouts.rollout import Trials
+
+if TYPE_CHECKING:
+    from viapoint.envs.velocity_env import StepReachVectorEnv
 
 
 def is_step_wise(env_id: str) -> bool:

@@ -41,6 +41,9 @@ from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 KEPT_CHECKPOINTS = 2
 PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
+"""Fields that may differ when a run is resumed."""
+
 
 class Run:
     """Run folder, which holds everything about one training.
@@ -260,3 +263,37 @@ def versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in PACKAGES},
     }
+
+
+def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
+    """Check that a run is resumed with its own settings.
+
+    Args:
+        run: Run to resume.
+        config: Configuration of the call.
+        usual: Configuration with defaults for everything that the call does not name.
+
+    Raises:
+        BadFileError: Something was asked for that the run did not begin with.
+    """
+    begun, asked, default = (each.as_json() for each in (run.config, config, usual))
+    others = []
+    for name in asked.keys() - MAY_CHANGE:
+        values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}
+        known = begun[name] if isinstance(asked[name], dict) else begun
+        if asked[name] != default[name]:
+            others += [(name, each) for each in values if each not in known or known[each] != values[each]]
+    if others:
+        had = ", ".join(_in_words(begun, *each) for each in sorted(others))
+        wanted = ", ".join(_in_words(asked, *each) for each in sorted(others))
+        raise BadFileError(
+            run.folder,
+            f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
+            "leave these flags out, or name another folder",
+        )
+
+
+def _in_words(record: dict[str, Any], field: str, name: str) -> str:
+    """Return a setting in words: a field, or one name in a field with several."""
+    values = record if field == name else record[field]
+    return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"

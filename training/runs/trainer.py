@@ -7,7 +7,6 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -23,16 +22,14 @@ from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
-from viapoint.training.runs.run_dir import Run, check_free, versions
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, versions
 
 __all__ = [
-    "TrainingFailedError", "TrainingStoppedError", "check_unchanged", "new_model", "one_thread", "resolved", "train",
+    "TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train",
 ]  # fmt: skip
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
-MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
-"""Fields that may differ when a run is resumed."""
 UNFIT = (
     ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
 )  # fmt: skip
@@ -120,34 +117,6 @@ def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     )
 
 
-def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
-    """Check that a run is resumed with its own settings.
-
-    Args:
-        run: Run to resume.
-        config: Configuration of the call.
-        usual: Configuration with defaults for everything that the call does not name.
-
-    Raises:
-        BadFileError: Something was asked for that the run did not begin with.
-    """
-    begun, asked, default = (each.as_json() for each in (run.config, config, usual))
-    others = []
-    for name in asked.keys() - MAY_CHANGE:
-        values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}
-        known = begun[name] if isinstance(asked[name], dict) else begun
-        if asked[name] != default[name]:
-            others += [(name, each) for each in values if each not in known or known[each] != values[each]]
-    if others:
-        had = ", ".join(_in_words(begun, *each) for each in sorted(others))
-        wanted = ", ".join(_in_words(asked, *each) for each in sorted(others))
-        raise BadFileError(
-            run.folder,
-            f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
-            "leave these flags out, or name another folder",
-        )
-
-
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end.
@@ -207,12 +176,6 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
             f"{run.decisions}, and viapoint train --resume goes on from there"
         ) from error
-
-
-def _in_words(record: dict[str, Any], field: str, name: str) -> str:
-    """Return a setting in words: a field, or one name in a field with several."""
-    values = record if field == name else record[field]
-    return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
 
 
 def _restore_settings(run: Run, config: TrainConfig) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from viapoint.envs.common.types import Single
-from viapoint.envs.mdp.task import Task
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Numbers, Single
-from viapoint.envs.mdp.task import Task
+from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes, problems
 from viapoint.training.search.candidates import candidate_actions, sobol_actions
@@ -23,7 +23,10 @@ from viapoint.training.search.plan_checks import (
     merit,
     pruned_merit,
 )
-from viapoint.training.search.planned_movements import Observation, is_replanning, take_rows
+from viapoint.training.search.planned_movements import Observation, take_rows
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 N_CENTRES = 4
 """Number of best candidates that a round of refinement samples around."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +22,18 @@ from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import squared_length
 from viapoint.envs.common.types import Index, Numbers, Single
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, point_distance_squared, segment_distance_squared
-from viapoint.envs.mdp.observation import ObservationLayout, ObstacleRows
+from viapoint.envs.mdp.observation import ObservationLayout, ObstacleRows, is_replanning
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, weighted_terms
-from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.training.search.planned_movements import (
     Observation,
     PlannedMovements,
-    is_replanning,
     plan_movements,
     take_rows,
 )
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 CLEARANCE_MARGIN = 0.001
 """Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.actions.replanning import revised_waypoints
-from viapoint.envs.actions.via_points import MIN_GOAL_DISTANCE, frame
+from viapoint.envs.actions.via_points import frame
 from viapoint.envs.common.types import Numbers
-from viapoint.envs.mdp.task import Task
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
+from viapoint.envs.mdp.observation import is_replanning
 from viapoint.primitives._passage.rest_to_rest import nearer_fraction
+
+if TYPE_CHECKING:
+    from viapoint.envs.mdp.task import Task
 
 Observation = Mapping[str, Numbers]
 
@@ -77,11 +81,6 @@ def plan_movements(
 def take_rows(observation: Observation, rows: Any) -> Observation:
     """Select the observations at `rows`, an index array, slice or mask."""
     return {name: values[rows] for name, values in observation.items()}
-
-
-def is_replanning(parts: Container[str]) -> bool:
-    """Return whether decisions on observations with these parts revise a movement that may be under way."""
-    return "remaining" in parts
 
 
 def direction(observation: Observation) -> Numbers:

@@ -1,0 +1,30 @@
+"""Progress bar of commands, and the scenes that they show."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+
+def evenly_spread(number: int, count: int) -> Any:
+    """Return at most `count` indices, evenly spread over `number`."""
+    return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar over the scenes of each method."""
+    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
+
+        def progress(name: str, done: int, total: int) -> None:
+            if bar.desc != f"{name}: ":
+                bar.reset(total)
+                bar.set_description(name)
+            bar.update(done - bar.n)
+
+        yield progress
