@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from viapoint.envs.registration import STEP_TASKS, TASKS
-from viapoint.training.algorithms.policy import ViaQPolicy
 from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS, STEP_PRESETS, Algorithm

@@ -9,9 +9,9 @@ import torch
 from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.algorithms import policy as viaq_policy
-from viapoint.training.algorithms.policy import ViaQPolicy, seen_from_line
+from viapoint.training.algorithms import viaq_policy
 from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.algorithms.viaq_policy import ViaQPolicy, seen_from_line
 from viapoint.training.rollouts.rollout import Trial
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.search.candidates import sobol_actions

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from viapoint.training.algorithms.model_io import ALGORITHMS, _argument_names, _encode
-from viapoint.training.algorithms.policy import ViaQPolicy
+from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.config.checks import HYPERPARAMETERS, PARTICULAR, VIA_POLICY, check_hyperparameters
 from viapoint.training.config.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, STEP_PRESETS
 

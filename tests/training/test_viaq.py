@@ -13,8 +13,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.training.algorithms.outcome_buffer import Outcomes, outcome_of
-from viapoint.training.algorithms.policy import ViaQPolicy
 from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 

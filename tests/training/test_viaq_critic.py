@@ -19,12 +19,12 @@ import viapoint.envs.sim.outcome
 import viapoint.training.search.geometry_search
 import viapoint.training.search.plan_checks
 from viapoint.envs.registration import TASKS
-from viapoint.training.algorithms import policy as viaq_policy
-from viapoint.training.algorithms.critic import Values, _Saturated
-from viapoint.training.algorithms.minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
+from viapoint.training.algorithms import viaq_policy
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
 from viapoint.training.algorithms.pair_networks import PART, PairMinimum, Poses, cut_obstacles, pair_features
+from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
 from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.algorithms.viaq_critic import Values, _Saturated
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 from viapoint.training.search.candidates import best_duration, candidate_actions
 

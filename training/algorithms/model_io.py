@@ -24,7 +24,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.training.algorithms.extractors import EXTRACTORS
-from viapoint.training.algorithms.minimum_critic import POLICIES as MINIMUM
+from viapoint.training.algorithms.sb3_minimum_critic import POLICIES as MINIMUM
 from viapoint.training.algorithms.smdp_buffers import time_discount, unit_of
 from viapoint.training.config.discount import check_discount_unit
 from viapoint.training.io.files import (

@@ -24,10 +24,10 @@ from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.mdp.task import Task
 from viapoint.training.algorithms.agent import Agent
-from viapoint.training.algorithms.critic import Values
 from viapoint.training.algorithms.model_io import ALGORITHMS
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
-from viapoint.training.algorithms.policy import KEEP, ViaQPolicy
+from viapoint.training.algorithms.viaq_critic import Values
+from viapoint.training.algorithms.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.config.checks import PARTICULAR, check_hyperparameters, check_via_policy
 from viapoint.training.search.candidates import candidate_actions
 

@@ -8,7 +8,7 @@ structure; this critic has it. Actor, replay buffer and updates are those of SAC
 Example:
     >>> import gymnasium as gym, viapoint.envs
     >>> from stable_baselines3 import SAC
-    >>> from viapoint.training.algorithms.minimum_critic import MinimumCriticSACPolicy
+    >>> from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy
     >>> model = SAC(MinimumCriticSACPolicy, gym.make("viapoint/PlanarObstacles-v0"), policy_kwargs={"heads": 2})
     >>> type(model.critic.qf0).__name__
     'MinimumQ'

@@ -17,8 +17,8 @@ from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
-from viapoint.training.algorithms.critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
 from viapoint.training.algorithms.pair_networks import Poses, cut_obstacles
+from viapoint.training.algorithms.viaq_critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
 from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import score_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
