@@ -315,7 +315,8 @@ def spread(entry: dict[str, Any] | None) -> str:
 
 def draw(record: dict[str, Any], path: Path) -> None:
     """Draw failures and jerk against the number of checks, and failures against the time of a decision."""
-    tasks = [env for env in record if "sobol-64" in record[env].get("test", {}) and "Reach" not in env]
+    solved_at_once = ("PlanarReach-v0", "PandaReach-v0", "PlanarTargetJump-v0")
+    tasks = [env for env in record if "sobol-64" in record[env].get("test", {}) and env not in solved_at_once]
     figure, axes = plt.subplots(3, len(tasks), figsize=(3.6 * len(tasks), 8.4), squeeze=False, sharey="row")
     kinds = {
         "viaq": ("agent", "#1f5fa8", "o"),
@@ -345,6 +346,9 @@ def draw(record: dict[str, Any], path: Path) -> None:
         for row in (0, 1):
             axes[row, column].set_xticks([0.5, 1, 4, 16, 64, 512], ["0", "1", "4", "16", "64", "512"])
             axes[row, column].minorticks_off()
+        shortest, longest = axes[2, column].get_xlim()
+        ticks = [each for each in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if shortest <= each <= longest]
+        axes[2, column].set_xticks(ticks, [f"{each:g}" for each in ticks])
         for row in (0, 2):
             axes[row, column].set_yscale("log")
             axes[row, column].set_yticks([0.05, 0.1, 1, 10, 100], ["0", "0.1", "1", "10", "100"])
