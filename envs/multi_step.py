@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -75,9 +76,9 @@ class MultiStepVectorEnv(ReachVectorEnv):
         scene = self.scenes.take([row])
         return self._episodes.rollout(row, lambda *movement: self._clearance(scene, *movement))
 
+    @abstractmethod
     def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
         """Return the clearance in one scene at each time, shape (T,), [m]."""
-        raise NotImplementedError
 
 
 class MultiStepEnv(ReachEnv):
