@@ -1,0 +1,1 @@
+"""Studies: many trainings and evaluations described by one YAML file, on one machine or many."""
