@@ -190,10 +190,17 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
         claim("t1/(t1+t2) minus the model's through the point of greatest curvature: mean", "-.004",
               lambda f: float(np.nanmean(f.residual)), near(0.0, 0.02)),
         claim("The same: standard deviation", ".02", lambda f: float(np.nanstd(f.residual)), at_most(0.04)),
+        claim("The same: slope over d1/(d1+d2); it has a trend, in the model as on the arm", "no trend",
+              lambda f: _slope(f.via[:, 0], f.residual), near(0.035, 0.015)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * float(np.nanmedian(f.apart)), at_most(5.0), "%"),
         _scaling_claim(avoidance, who),
     ]  # fmt: skip
+
+
+def _slope(place: Float, residual: Float) -> float:
+    known = np.isfinite(residual)
+    return float(np.polyfit(place[known], residual[known], 1)[0])
 
 
 def _share(values: Float) -> float:
