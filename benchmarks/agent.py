@@ -29,12 +29,12 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from viapoint.envs.registration import ONLINE_TASKS, TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, TASKS
 from viapoint.training.algorithms.model_io import load_model, untrained
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import SEARCHES, agent_method, make_method
-from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.runs.trainer import one_thread
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 from viapoint.training.search.candidates import candidate_actions
@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("--times", action="store_true", help="only time decisions anew, on an idle machine")
     parser.add_argument("--page", action="store_true", help="only write the page from what is measured")
     words = parser.parse_args()
-    known = [*TASKS, *ONLINE_TASKS]
+    known = [*TASKS, *REPLANNING_TASKS]
     envs = words.envs or [each for each in known if seeds_of(words.runs, each)]
     unknown = [each for each in envs if each not in known]
     if unknown:
@@ -104,7 +104,7 @@ def seeds_of(runs: Path, env: str) -> dict[int, Path]:
 
 def measure(env: str, words: argparse.Namespace) -> None:
     """Measure everything of one environment that is not measured yet."""
-    trial = new_trial(env, 2)
+    simulation = new_simulation(env, 2)
     for name in (each for each in SETS if shipped_path(each, env).is_file()):
         for seed, path in seeds_of(words.runs, env).items():
             for checks in CHECKS:
@@ -113,17 +113,17 @@ def measure(env: str, words: argparse.Namespace) -> None:
                 for checks in (0, 64):
                     once(words, env, name, f"untrained-{checks}", agent(path, checks, trained=False))
         for checks in ORDERED:
-            once(words, env, name, f"sobol-{checks}", lambda n=checks: GeometrySearch(trial.task, n))
-            if env not in ONLINE_TASKS:
-                once(words, env, name, f"random-{checks}", lambda n=checks: RandomOrder(trial.task, n))
+            once(words, env, name, f"sobol-{checks}", lambda n=checks: GeometrySearch(simulation.task, n))
+            if env not in REPLANNING_TASKS:
+                once(words, env, name, f"random-{checks}", lambda n=checks: RandomOrder(simulation.task, n))
         for search in SEARCHES:
             once(words, env, name, search, lambda n=search: make_method(n, env))
-    trial.close()
+    simulation.close()
 
 
 def time_anew(env: str, words: argparse.Namespace) -> None:
     """Time single decisions of every method that is measured in an environment, with the agent of the first seed."""
-    trial = new_trial(env, 2)
+    simulation = new_simulation(env, 2)
     seeds = seeds_of(words.runs, env)
     frozen = load("test", env).take(slice(0, TIMED))
     for file in sorted((words.out / env.rpartition("/")[2] / "test").glob("*.json")):
@@ -133,20 +133,22 @@ def time_anew(env: str, words: argparse.Namespace) -> None:
             method = agent(seeds[min(seeds)], number, trained=kind == "viaq")()
         elif kind in ("sobol", "random"):
             method = (
-                GeometrySearch(trial.task, number) if kind == "sobol" else RandomOrder(trial.task, number)
+                GeometrySearch(simulation.task, number)
+                if kind == "sobol"
+                else RandomOrder(simulation.task, number)
             )
         else:
             method = make_method(file.stem, env)
         times = []
         for row in range(TIMED):
             scene = frozen.scenes.take(slice(row, row + 1))
-            observation = trial.observe(scene)
+            observation = simulation.observe(scene)
             began = time.perf_counter()
             method.decide(observation, scene)
             times.append(time.perf_counter() - began)
         write_json(file, {**read_json(file), "decision_time": statistics.median(times[1:])})
         print(env, file.stem, f"{1e3 * statistics.median(times[1:]):.2f} ms", flush=True)
-    trial.close()
+    simulation.close()
 
 
 def agent(path: Path, checks: int, *, trained: bool = True) -> Callable[[], Any]:
@@ -163,7 +165,7 @@ def once(words: argparse.Namespace, env: str, scenes: str, name: str, make: Call
     """Measure a method on a set unless it is measured already."""
     path = words.out / env.rpartition("/")[2] / scenes / f"{name}.json"
     frozen = load(scenes, env)
-    frozen = frozen.take(slice(0, MOVING_SCENES)) if env in ONLINE_TASKS else frozen
+    frozen = frozen.take(slice(0, MOVING_SCENES)) if env in REPLANNING_TASKS else frozen
     if path.is_file() and read_json(path)["sha256"] == frozen.sha256:
         return
     result = evaluate_methods([make()], frozen, env).results[0]
@@ -212,19 +214,19 @@ def write_page(words: argparse.Namespace) -> None:
     place(
         words.docs / "agent.md",
         "checks",
-        table({k: v for k, v in record["measured"].items() if not online(k)}),
+        table({k: v for k, v in record["measured"].items() if not is_replanning(k)}),
     )
     place(
-        words.docs / "agents-online.md",
-        "online",
-        table({k: v for k, v in record["measured"].items() if online(k)}),
+        words.docs / "agents-replanning.md",
+        "replanning",
+        table({k: v for k, v in record["measured"].items() if is_replanning(k)}),
     )
     place(words.docs / "agent.md", "ablations", ablations(study))
 
 
-def online(env: str) -> bool:
+def is_replanning(env: str) -> bool:
     """Return whether plans are revised in an environment."""
-    return f"viapoint/{env}" in ONLINE_TASKS
+    return f"viapoint/{env}" in REPLANNING_TASKS
 
 
 def place(page: Path, name: str, content: str) -> None:

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.registration import ONLINE_TASKS, TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, TASKS
 from viapoint.training.planners.baselines import SEARCHES
-from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.search.geometry_search import GeometrySearch
 from viapoint.training.search.plan_checks import NODES, check_plans
@@ -81,19 +81,19 @@ def report(env_id: str, scenes: str, number: int, methods: list[str]) -> None:
     """Print one row for each method in one task."""
     every = load(scenes, env_id).scenes
     some = every.take(np.linspace(0, len(every.start) - 1, min(number, len(every.start))).astype(int))
-    trial = new_trial(env_id, min(256, len(some.start)), threads=1)
-    observation = trial.observe(some)
+    simulation = new_simulation(env_id, min(256, len(some.start)), threads=1)
+    observation = simulation.observe(some)
     for name in methods:
-        method: Any = SEARCHES[name](trial)
-        result = trial.play(method, some, method.decide(observation))
+        method: Any = SEARCHES[name](simulation)
+        result = simulation.play(method, some, method.decide(observation))
         jerk = np.median(result.info["jerk_ratio"][result.success]) if result.success.any() else np.nan
         decisions = result.info["decisions"].mean() if "decisions" in result.info else 1.0
         print(
-            f"{env_id.removeprefix('viapoint/'):25} {name:10} {times(trial.task, method, observation)} "
+            f"{env_id.removeprefix('viapoint/'):25} {name:10} {times(simulation.task, method, observation)} "
             f"{100.0 * result.success.mean():8.1f} {jerk:8.2f} {decisions:9.2f}",
             flush=True,
         )
-    trial.close()
+    simulation.close()
 
 
 def main() -> None:
@@ -103,7 +103,7 @@ def main() -> None:
     )
     parser.add_argument("--scenes", default="validation")
     parser.add_argument("--number", type=int, default=200, help="greatest number of scenes of each task")
-    parser.add_argument("--tasks", nargs="+", default=[*TASKS, *ONLINE_TASKS])
+    parser.add_argument("--tasks", nargs="+", default=[*TASKS, *REPLANNING_TASKS])
     parser.add_argument("--methods", nargs="+", default=list(SEARCHES))
     arguments = parser.parse_args()
     heads = ("single", "batch", "refined", "all", "ratio", "solved", "jerk")

@@ -30,10 +30,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import viapoint.envs
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS, TASKS
 
 FILE = Path(__file__).parents[1] / "tests" / "envs" / "episode_hashes.json"
-IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
+IDS = sorted({*TASKS, *STEP_TASKS, *REPLANNING_TASKS})
 EPISODES = 1_000
 EVERY = 100
 """Interval of stored hashes: of the first 100 episodes, of the first 200 and so on."""

@@ -27,9 +27,9 @@ import gymnasium as gym
 import numpy as np
 
 import viapoint.envs
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS, TASKS
 
-IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
+IDS = sorted({*TASKS, *STEP_TASKS, *REPLANNING_TASKS})
 DOCUMENTED = (ValueError, gym.error.ResetNeeded)
 """Exceptions that a call may raise."""
 PARTS = 10

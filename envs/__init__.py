@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.base import Arm
     from viapoint.envs.mdp.task import family_sampler
     from viapoint.envs.record_video import RecordMovements
-    from viapoint.envs.replanning_env import OnlineReachEnv, OnlineReachVectorEnv
+    from viapoint.envs.replanning_env import ReplanningEnv, ReplanningVectorEnv
     from viapoint.envs.scenes.families import register_scene_family
     from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
     from viapoint.envs.single_env import ReachEnv
     from viapoint.envs.vector_env import ReachVectorEnv
-    from viapoint.envs.velocity_env import StepReachEnv, StepReachVectorEnv
+    from viapoint.envs.velocity_env import VelocityEnv, VelocityVectorEnv
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
-        "OnlineReachEnv": "viapoint.envs.replanning_env",
-        "OnlineReachVectorEnv": "viapoint.envs.replanning_env",
+        "ReplanningEnv": "viapoint.envs.replanning_env",
+        "ReplanningVectorEnv": "viapoint.envs.replanning_env",
         "Plan": "viapoint.envs.actions.via_points",
         "ReachEnv": "viapoint.envs.single_env",
         "ReachVectorEnv": "viapoint.envs.vector_env",
         "RecordMovements": "viapoint.envs.record_video",
-        "StepReachEnv": "viapoint.envs.velocity_env",
-        "StepReachVectorEnv": "viapoint.envs.velocity_env",
+        "VelocityEnv": "viapoint.envs.velocity_env",
+        "VelocityVectorEnv": "viapoint.envs.velocity_env",
         "TARGETS": "viapoint.envs.scenes.scene",
         "family_sampler": "viapoint.envs.mdp.task",
         "load_arm": "viapoint.envs.arm_import.loader",
@@ -57,14 +57,14 @@ __all__ = [
     "TARGETS",
     "TASKS",
     "Arm",
-    "OnlineReachEnv",
-    "OnlineReachVectorEnv",
     "Plan",
     "ReachEnv",
     "ReachVectorEnv",
     "RecordMovements",
-    "StepReachEnv",
-    "StepReachVectorEnv",
+    "ReplanningEnv",
+    "ReplanningVectorEnv",
+    "VelocityEnv",
+    "VelocityVectorEnv",
     "family_sampler",
     "load_arm",
     "register_arm",

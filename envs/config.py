@@ -13,7 +13,7 @@ import numpy as np
 from viapoint.envs.actions.via_points import ActionLayout, Timing
 from viapoint.envs.arms import ADULT, Arm, arm_of
 from viapoint.envs.common.validation import fewest_and_most, refuse_unknown
-from viapoint.envs.mdp.rewards import OnlineRewardWeights, RewardWeights, StepRewardWeights
+from viapoint.envs.mdp.rewards import ReplanningRewardWeights, RewardWeights, StepRewardWeights
 from viapoint.envs.mdp.task import Task, distribution_of
 from viapoint.envs.sim.replan_triggers import TRIGGERS, Trigger
 
@@ -129,7 +129,7 @@ class VelocityConfig(EnvConfig):
 class ReplanningConfig(ViaPointConfig):
     """Keyword arguments of environments whose plans are revised during the movement."""
 
-    weights_kind = OnlineRewardWeights
+    weights_kind = ReplanningRewardWeights
     replanning = True
 
     n_obstacles: int | tuple[int, int] = 0

@@ -41,10 +41,10 @@ STEP_TASKS: dict[str, str] = {
 }
 """Tasks with one action per control step: ids and the ids whose keyword arguments they share.
 
-Their class is :class:`~viapoint.envs.velocity_env.StepReachVectorEnv`.
+Their class is :class:`~viapoint.envs.velocity_env.VelocityVectorEnv`.
 """
 
-ONLINE_TASKS: dict[str, dict[str, Any]] = {
+REPLANNING_TASKS: dict[str, dict[str, Any]] = {
     "viapoint/PlanarTargetJump-v0": {"n_jumps": (1, 2)},
     "viapoint/PlanarMovingObstacles-v0": {"n_obstacles": (1, 4), "moving_obstacles": True},
     "viapoint/PandaMovingObstacles-v0": {
@@ -56,12 +56,12 @@ ONLINE_TASKS: dict[str, dict[str, Any]] = {
         "horizon": 0.5,
     },
 }
-"""Tasks with online replanning: ids and keyword arguments.
+"""Replanning tasks: ids and keyword arguments.
 
-Their class is :class:`~viapoint.envs.replanning_env.OnlineReachVectorEnv`.
+Their class is :class:`~viapoint.envs.replanning_env.ReplanningVectorEnv`.
 """
 
-ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *ONLINE_TASKS)
+ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *REPLANNING_TASKS)
 """All ids."""
 
 
@@ -71,11 +71,11 @@ def register_all() -> None:
         ("single_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS),
         ("single_env:ReachEnv", "vector_env:ReachVectorEnv", {a: TASKS[b] for a, b in OWN_ARM_TASKS.items()}),
         (
-            "velocity_env:StepReachEnv",
-            "velocity_env:StepReachVectorEnv",
+            "velocity_env:VelocityEnv",
+            "velocity_env:VelocityVectorEnv",
             {a: TASKS[b] for a, b in STEP_TASKS.items()},
         ),
-        ("replanning_env:OnlineReachEnv", "replanning_env:OnlineReachVectorEnv", ONLINE_TASKS),
+        ("replanning_env:ReplanningEnv", "replanning_env:ReplanningVectorEnv", REPLANNING_TASKS),
     )
     for single, batch, table in tables:
         for env_id, kwargs in table.items():

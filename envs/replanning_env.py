@@ -8,15 +8,15 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Reviser
+from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, ReplanningDecoder
 from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
 from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
-from viapoint.envs.mdp.observation import OnlineObservationLayout
-from viapoint.envs.mdp.rewards import online_rewards
+from viapoint.envs.mdp.observation import ReplanningObservationLayout
+from viapoint.envs.mdp.rewards import replanning_rewards
 from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import EpisodeRenderer, History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
@@ -25,7 +25,7 @@ from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome, straight_jerk_cost
-from viapoint.envs.sim.replan_triggers import DecisionEnds, Event
+from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
 from viapoint.envs.vector_env import METADATA, Decision, ReachVectorEnv
 
@@ -42,8 +42,8 @@ class PlanStart(NamedTuple):
     """True if there is a plan, shape (N,)."""
 
 
-class OnlineReachVectorEnv(MultiStepVectorEnv):
-    """Reaching with online replanning: targets jump, obstacles move, and plans are revised, `num_envs` times.
+class ReplanningVectorEnv(MultiStepVectorEnv):
+    """Reaching with replanning: targets jump, obstacles move, and plans are revised, `num_envs` times.
 
     Arm, physics and success are those of :class:`ReachVectorEnv`. An episode is several decisions;
     each starts from the present command, ends with an event of `decide_at`, and takes
@@ -64,7 +64,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
         margin: Predicted clearance below which a decision ends, [m].
         timing: `optimal` passage times; there are no others here.
         duration_range: Shortest and longest movement, [s].
-        reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.OnlineRewardWeights`.
+        reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.ReplanningRewardWeights`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
@@ -82,7 +82,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
     config_kind = ReplanningConfig
     __signature__ = ReplanningConfig.signature()
     scenes: ChangingScenes | None  # type: ignore[assignment]
-    observation_layout: OnlineObservationLayout
+    observation_layout: ReplanningObservationLayout
     _renderer: EpisodeRenderer
 
     def _build(self) -> None:
@@ -95,15 +95,15 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
             n_jumps=fewest_and_most(config.n_jumps, "n_jumps"), moving=bool(config.moving_obstacles)
         )
         """Distribution of the changes of scenes."""
-        self.reviser = Reviser(action)
+        self.decoder = ReplanningDecoder(action)
         """Meaning of the components of an action during a movement."""
-        self._ends = DecisionEnds(
+        self._ends = ReplanTriggers(
             model, timestep=timestep, triggers=config.decide_at, horizon=config.horizon, margin=config.margin,
             time_limit=(2 + self.changes.n_jumps[1]) * longest + SETTLING,
         )  # fmt: skip
         self.time_limit = float(self._ends.limit * timestep)
         """Time limit of an episode, [s]."""
-        self.observation_layout = OnlineObservationLayout(
+        self.observation_layout = ReplanningObservationLayout(
             dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, n_via=action.n_via,
             time_limit=self.time_limit,
         )  # fmt: skip
@@ -146,7 +146,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
         start, episodes = self._plan_start, self._episodes
         plan_time = np.asarray((episodes.now.steps - start.step) * self._simulator.timestep)
         goal = self.scenes.goals(episodes.time)
-        return self.reviser.default(self._plan, plan_time, start.begun, self.scenes.start, goal)
+        return self.decoder.default(self._plan, plan_time, start.begun, self.scenes.start, goal)
 
     def execute_actions(self, actions: Any) -> Decision:
         """Make one decision in each environment and execute it until it ends, without a reset.
@@ -158,7 +158,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
         """
         self._check_running()
         actions = checked_actions(actions, self.num_envs, self._action_names)
-        plan, kept = self.reviser.revise(self.default, self._plan, actions)
+        plan, kept = self.decoder.revise(self.default, self._plan, actions)
         return self._execute_decision(plan, ~kept)
 
     def execute_plan(self, plan: Plan) -> Decision:
@@ -222,7 +222,7 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
             final | (event == Event.TIME_LIMIT) | (event >= Event.REACH) | (event == Event.CONTACT)
         )
         elapsed = np.asarray((now.steps - steps) * self._simulator.timestep)
-        terms = online_rewards(
+        terms = replanning_rewards(
             before, after, elapsed, self.terminated, first, scenes, self.action_layout.centre_duration,
             self.task.weights,
         )  # fmt: skip
@@ -317,7 +317,9 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
         """Return the present observations."""
         assert self.scenes is not None
         episodes = self._episodes
-        return self.observation_layout.online(episodes.now.joints, self.scenes, self.default, episodes.time)
+        return self.observation_layout.observe_replanning(
+            episodes.now.joints, self.scenes, self.default, episodes.time
+        )
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
@@ -325,8 +327,8 @@ class OnlineReachVectorEnv(MultiStepVectorEnv):
         return self._renderer.episode(self.scenes.take([sim]), self._history[sim], self._rollout(sim))
 
 
-class OnlineReachEnv(MultiStepEnv):
-    """One environment of a :class:`OnlineReachVectorEnv`, with the same keyword arguments.
+class ReplanningEnv(MultiStepEnv):
+    """One environment of a :class:`ReplanningVectorEnv`, with the same keyword arguments.
 
     Example:
         >>> import gymnasium as gym
@@ -334,15 +336,15 @@ class OnlineReachEnv(MultiStepEnv):
         >>> observation, _ = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> type(env.unwrapped).__name__
-        'OnlineReachEnv'
+        'ReplanningEnv'
     """
 
-    batch_kind: ClassVar[type[ReachVectorEnv]] = OnlineReachVectorEnv
-    batch: OnlineReachVectorEnv
+    batch_kind: ClassVar[type[ReachVectorEnv]] = ReplanningVectorEnv
+    batch: ReplanningVectorEnv
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.reviser = self.batch.reviser
+        self.decoder = self.batch.decoder
 
     @property
     def last_plans(self) -> History:

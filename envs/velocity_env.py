@@ -79,7 +79,7 @@ class StepReferences(NamedTuple):
     """Jerk cost of the references, shape (n,), [m^2/s^5]."""
 
 
-class StepReachVectorEnv(MultiStepVectorEnv):
+class VelocityVectorEnv(MultiStepVectorEnv):
     """Reaching around obstacles by a velocity in every control step, `num_envs` times.
 
     Arm, scenes, physics, success and reward are those of :class:`ReachVectorEnv`. An episode ends
@@ -265,8 +265,8 @@ class StepReachVectorEnv(MultiStepVectorEnv):
         return self._renderer.movement(scene, plan.take([sim]), self._rollout(sim))
 
 
-class StepReachEnv(MultiStepEnv):
-    """One environment of a :class:`StepReachVectorEnv`, with the same keyword arguments.
+class VelocityEnv(MultiStepEnv):
+    """One environment of a :class:`VelocityVectorEnv`, with the same keyword arguments.
 
     Example:
         >>> import gymnasium as gym
@@ -274,11 +274,11 @@ class StepReachEnv(MultiStepEnv):
         >>> observation, _ = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> type(env.unwrapped).__name__
-        'StepReachEnv'
+        'VelocityEnv'
     """
 
-    batch_kind: ClassVar[type[ReachVectorEnv]] = StepReachVectorEnv
-    batch: StepReachVectorEnv
+    batch_kind: ClassVar[type[ReachVectorEnv]] = VelocityVectorEnv
+    batch: VelocityVectorEnv
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)

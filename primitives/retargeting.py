@@ -1,4 +1,4 @@
-"""Online replanning: a movement under way gets another goal, arrival time or via-point."""
+"""Replanning: a movement under way gets another goal, arrival time or via-point."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def passage() -> None:
     save(figure, "passage")
 
 
-def online() -> None:
+def replanning() -> None:
     """Draw replanning from noisy states until the end, and with the last plan kept for the last 100 ms."""
     figure, (positions, jerks) = plt.subplots(1, 2, figsize=(9, 3.0))
     step, arrival, goal = 0.01, 0.8, np.array([0.3])
@@ -106,9 +106,9 @@ def online() -> None:
     positions.set(title="position [m]", xlabel="time [s]")
     jerks.set(title="jerk [m/s³]", xlabel="time [s]", yscale="symlog")
     jerks.legend(fontsize=8)
-    save(figure, "online")
+    save(figure, "replanning")
 
 
 if __name__ == "__main__":
-    for draw in (reach, family, passage, online):
+    for draw in (reach, family, passage, replanning):
         draw()

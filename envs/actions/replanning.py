@@ -1,4 +1,4 @@
-"""Online replanning: plans that begin at the present command, without a jump of position, velocity or acceleration.
+"""Replanning: plans that begin at the present command, without a jump of position, velocity or acceleration.
 
 An action changes the *nominal* plan: the rest of the plan under way while its goal is the present one, else
 the smoothest movement to the new goal. By the principle of optimality the rest of a minimum-jerk movement, made again
@@ -86,7 +86,7 @@ class NominalPlan(NamedTuple):
     """Remaining duration, shape (N,), [s]; 0 where the hand rests at its goal."""
 
 
-class Reviser:
+class ReplanningDecoder:
     """Decoder of actions during a movement.
 
     Args:

@@ -113,7 +113,7 @@ GREATEST_ACCELERATION = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnlineObservationLayout(ObservationLayout):
+class ReplanningObservationLayout(ObservationLayout):
     """Layout of replanning observations; future changes of the scene are hidden.
 
     `hand` [m], `velocity` [m/s] and `acceleration` [m/s^2] are the present command, `goal` and `obstacles` the present
@@ -138,7 +138,9 @@ class OnlineObservationLayout(ObservationLayout):
         boxes = {name: spaces.Box(low, high, (n,), np.float32) for name, (low, high, n) in sides.items() if n}
         return spaces.Dict({**super().space().spaces, **boxes})
 
-    def online(self, joints: Float, scenes: ChangingScenes, default: NominalPlan, time: Float) -> Observation:
+    def observe_replanning(
+        self, joints: Float, scenes: ChangingScenes, default: NominalPlan, time: Float
+    ) -> Observation:
         """Return observations of N environments, shape (N, .) each, in fresh arrays.
 
         Args:

@@ -146,7 +146,7 @@ def weighted_terms(
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnlineRewardWeights(RewardWeights):
+class ReplanningRewardWeights(RewardWeights):
     """Weights of the terms of the reward, 0 or more."""
 
     smoothness: float = 0.05
@@ -155,7 +155,7 @@ class OnlineRewardWeights(RewardWeights):
     """- time that the decision took / duration of the zero action."""
 
 
-def online_rewards(
+def replanning_rewards(
     before: Outcome,
     after: Outcome,
     elapsed: Float,

@@ -21,7 +21,7 @@ from viapoint.envs.sim.outcome import (
     within_joint_range,
 )
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
-from viapoint.envs.sim.time_scaling import LOOK_EVERY, required_time_scale
+from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
 
 SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
@@ -167,7 +167,7 @@ class Executor:
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator, self.arm = simulator, simulator.arm
-        self._look_steps = round(LOOK_EVERY / simulator.timestep)
+        self._check_steps = round(CHECK_INTERVAL / simulator.timestep)
         self._settling_steps = round(SETTLING / simulator.timestep)
 
     def scale_time(self, movements: Movements) -> ScaledMovements:
@@ -186,7 +186,7 @@ class Executor:
         time = self.simulator.timestep * np.arange(number + 1)
         position, velocity, acceleration = trajectory.sample(time)
         # Reach and clearance are checked every few millimetres, up to where all movements have ended.
-        every, scenes = self._look_steps, movements.scenes
+        every, scenes = self._check_steps, movements.scenes
         seen = position[:, : number - self._settling_steps + every + 1 : every]
         return TrackingReferences(
             movements=movements,

@@ -66,7 +66,7 @@ class Ends(NamedTuple):
     """True if the hand has arrived and no change is left, shape (N,)."""
 
 
-class DecisionEnds:
+class ReplanTriggers:
     """Predictor of the ends of decisions.
 
     Args:

@@ -16,7 +16,7 @@ from viapoint.envs.sim.episode_state import Segment
 from viapoint.envs.sim.executor import GROUP
 from viapoint.envs.sim.outcome import sum_in_order
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
-from viapoint.envs.sim.time_scaling import LOOK_EVERY, required_time_scale
+from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
 
 PROLONGED, ENOUGH = 6, 1.002
 """Greatest number of times that a plan in motion is prolonged, and the remaining factor that needs no further one."""
@@ -143,7 +143,7 @@ class ReplanningExecutor:
         position, velocity, acceleration = plan.trajectory().sample(timestep * (since[:, None] + index))
         controls = self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])[:, :number]
         rows = scenes.places(np.asarray(timestep * (now[:, None] + np.arange(number + 1))))
-        looks = np.arange(0, number + 1, max(round(LOOK_EVERY / timestep), 1))
+        looks = np.arange(0, number + 1, max(round(CHECK_INTERVAL / timestep), 1))
         profile = self.simulator.collision_model.clearance_profile(
             position[:, looks], rows[:, looks], scenes.present
         ).min(axis=-1, initial=MAX_CLEARANCE)
@@ -191,7 +191,7 @@ class ReplanningExecutor:
 
     def _reachable(self, plan: MovingPlan) -> Bool:
         """Return True for plans within the arm's reach, shape (N,)."""
-        every = np.arange(int(np.ceil(plan.duration.max() / LOOK_EVERY)) + 1) * LOOK_EVERY
+        every = np.arange(int(np.ceil(plan.duration.max() / CHECK_INTERVAL)) + 1) * CHECK_INTERVAL
         return np.asarray((np.asarray(self.arm.reach_margin(plan.trajectory()(every))) >= 0.0).all(axis=-1))
 
     def _clearance(self, scenes: ChangingScenes, now: Int, steps: Int, hand: Float, joints: Float) -> Float:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, events, make, play
 
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.motion import ChangeSampler
 
 
@@ -18,7 +18,7 @@ def test_what_lies_in_the_future_is_hidden():
     assert not np.array_equal(first["goal"], second["goal"])
 
 
-@pytest.mark.parametrize("env_id", ONLINE_TASKS)
+@pytest.mark.parametrize("env_id", REPLANNING_TASKS)
 def test_the_scenes_of_an_episode_are_options_that_make_it_again(env_id):
     drawn, given = gym.make_vec(env_id, num_envs=5), gym.make_vec(env_id, num_envs=5)
     first, _ = drawn.reset(seed=3)

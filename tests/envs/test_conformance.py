@@ -16,9 +16,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs import TASKS
 from viapoint.envs.mdp.rewards import RewardTerms
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 
-IDS = sorted({*TASKS, *STEP_TASKS, *ONLINE_TASKS})
+IDS = sorted({*TASKS, *STEP_TASKS, *REPLANNING_TASKS})
 INFO = {
     "is_success", "collision", "first_contact_time", "min_clearance", "goal_error", "duration", "path_length",
     "jerk_cost", "jerk_ratio", "peak_speed", "tracking_error", "reachable", "unstable",
@@ -73,7 +73,7 @@ def test_info_is_complete_finite_and_scalar(env_id):
         assert set(info) >= INFO
         assert set(info) >= {f"reward_{name}" for name in RewardTerms._fields}
         for name, value in info.items():
-            assert isinstance(value, bool | float | (int if env_id in ONLINE_TASKS else float)), name
+            assert isinstance(value, bool | float | (int if env_id in REPLANNING_TASKS else float)), name
             assert np.isfinite(value), name
 
 

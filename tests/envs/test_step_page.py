@@ -12,7 +12,7 @@ from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.registration import STEP_TASKS
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED
-from viapoint.envs.velocity_env import StepReachVectorEnv
+from viapoint.envs.velocity_env import VelocityVectorEnv
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-step.md").read_text(encoding="utf-8")
 WORDS = " ".join(PAGE.split())
@@ -75,7 +75,7 @@ def test_rewards():
 
 
 def test_arguments():
-    parameters = inspect.signature(StepReachVectorEnv).parameters
+    parameters = inspect.signature(VelocityVectorEnv).parameters
     code = {n: p.default for n, p in parameters.items() if n not in ("self", "num_envs", "unknown")}
     stated = {row[0]: row[1] for row in table("## Arguments")}
     assert set(stated) == set(code)

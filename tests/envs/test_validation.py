@@ -10,7 +10,7 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.validation import reset_options
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.record_video import RecordMovements
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 
 PLANAR = (
     "viapoint/PlanarObstacles-v0",
@@ -65,7 +65,7 @@ def test_options_are_copied():
 
 def test_an_unknown_option_is_answered_with_those_that_there_are(env_id):
     known = "start, goal, obstacles"
-    known += ", jumps, courses" if env_id in ONLINE_TASKS else ""
+    known += ", jumps, courses" if env_id in REPLANNING_TASKS else ""
     env = gym.make_vec(env_id, num_envs=2, threads=1)
     with pytest.raises(ValueError, match=f"^reset options know {known} and reset_mask, not 'speed'$"):
         env.reset(options={"speed": 3})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import FrozenScenes
 
@@ -26,13 +26,13 @@ def one_thread():
 @pytest.fixture(scope="session")
 def small_scenes():
     """Forty scenes, each with the best of 32 random actions as its solution."""
-    trial = Trial(ENV, 64, threads=1)
+    simulation = SceneSimulation(ENV, 64, threads=1)
     generator = np.random.default_rng(0)
-    scenes = trial.task.sampler()([generator] * 40)
-    actions = generator.uniform(-1.0, 1.0, (32, 40, trial.task.action.size))
-    tried = [trial(scenes, each) for each in actions]
+    scenes = simulation.task.sampler()([generator] * 40)
+    actions = generator.uniform(-1.0, 1.0, (32, 40, simulation.task.action.size))
+    tried = [simulation(scenes, each) for each in actions]
     success, reward = np.array([each.success for each in tried]), np.array([each.reward for each in tried])
-    trial.close()
+    simulation.close()
     return FrozenScenes(
         name="small",
         env_id=ENV,

@@ -12,7 +12,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms import viaq_policy
 from viapoint.training.algorithms.viaq import ViaQ
 from viapoint.training.algorithms.viaq_policy import ViaQPolicy, seen_from_line
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.search.candidates import sobol_actions
 from viapoint.training.search.plan_checks import best_plan, check_plans
@@ -31,25 +31,25 @@ FORMS = (
 
 
 @pytest.fixture(scope="module", params=IDS)
-def trial(request):
-    trial = Trial(request.param, 64)
-    yield trial
-    trial.close()
+def simulation(request):
+    simulation = SceneSimulation(request.param, 64)
+    yield simulation
+    simulation.close()
 
 
-def scenes_of(trial, number=16, seed=0):
-    return trial.task.sampler()([np.random.default_rng(seed + i) for i in range(number)])
+def scenes_of(simulation, number=16, seed=0):
+    return simulation.task.sampler()([np.random.default_rng(seed + i) for i in range(number)])
 
 
-def policy_for(trial, **kwargs):
+def policy_for(simulation, **kwargs):
     torch.manual_seed(0)
-    env = next(iter(trial._envs.values()))
+    env = next(iter(simulation._envs.values()))
     settings = {"width": 8, "candidates": 32, "refinements": 1, "per_refinement": 16, **kwargs}
     return ViaQPolicy(
         env.single_observation_space,
         env.single_action_space,
         lambda _: 1e-3,
-        task=trial.task.as_dict(),
+        task=simulation.task.as_dict(),
         **settings,
     )
 
@@ -63,51 +63,51 @@ def margins(policy, observation):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_order_of_the_obstacles_is_irrelevant(trial, form):
-    scenes = scenes_of(trial)
+def test_the_order_of_the_obstacles_is_irrelevant(simulation, form):
+    scenes = scenes_of(simulation)
     if not scenes.obstacles.shape[1]:
         pytest.skip("there are no obstacles in this task")
-    policy = policy_for(trial, **form)
+    policy = policy_for(simulation, **form)
     turned_over = Scenes(scenes.start, scenes.goal, scenes.obstacles[:, ::-1])
-    one, other = (margins(policy, trial.observe(each)) for each in (scenes, turned_over))
+    one, other = (margins(policy, simulation.observe(each)) for each in (scenes, turned_over))
     np.testing.assert_allclose(one, other, atol=1e-5)
 
 
 @pytest.mark.parametrize("form", FORMS[:2])
-def test_the_margin_among_obstacles_is_the_least_of_those_from_each(trial, form):
-    scenes = scenes_of(trial)
+def test_the_margin_among_obstacles_is_the_least_of_those_from_each(simulation, form):
+    scenes = scenes_of(simulation)
     number = scenes.obstacles.shape[1]
     if not number:
         pytest.skip("there are no obstacles in this task")
-    policy = policy_for(trial, **form)
+    policy = policy_for(simulation, **form)
     rows = np.arange(number)
     alone = [
         Scenes(scenes.start, scenes.goal, np.where((rows == i)[:, None], scenes.obstacles, 0.0)) for i in rows
     ]
-    each = np.array([margins(policy, trial.observe(one)) for one in alone])
-    np.testing.assert_allclose(margins(policy, trial.observe(scenes)), each.min(axis=0), atol=1e-5)
+    each = np.array([margins(policy, simulation.observe(one)) for one in alone])
+    np.testing.assert_allclose(margins(policy, simulation.observe(scenes)), each.min(axis=0), atol=1e-5)
 
 
-def test_gradients_reach_the_pair_networks(trial):
-    policy, observation = policy_for(trial), trial.observe(scenes_of(trial))
+def test_gradients_reach_the_pair_networks(simulation):
+    policy, observation = policy_for(simulation), simulation.observe(scenes_of(simulation))
     actions = np.broadcast_to(sobol_actions(8, policy.task.action.size), (16, 8, policy.task.action.size))
     policy.critic(policy.inputs(observation, actions)).margin.sum().backward()
     weights = policy.critic.pairs.networks.weights
-    if trial.task.scenes.n_obstacles == (0, 0):
+    if simulation.task.scenes.n_obstacles == (0, 0):
         assert all(each.grad is None or not each.grad.any() for each in weights)
     else:
         assert all(torch.isfinite(each.grad).all() and each.grad.any() for each in weights)
 
 
-def test_a_scene_is_seen_along_its_line(trial):
+def test_a_scene_is_seen_along_its_line(simulation):
     """Turning start, goal and obstacles about the vertical through the base changes nothing of the obstacles' view."""
-    scenes, d = scenes_of(trial), trial.task.arm.dimension
+    scenes, d = scenes_of(simulation), simulation.task.arm.dimension
     turn = np.eye(d)
     turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
     rows = scenes.obstacles.copy()
     rows[..., :d], rows[..., d : 2 * d] = rows[..., :d] @ turn.T, rows[..., d : 2 * d] @ turn.T
     other = Scenes(scenes.start @ turn.T, scenes.goal @ turn.T, rows)
-    here, there = (_seen(trial, each) for each in (scenes, other))
+    here, there = (_seen(simulation, each) for each in (scenes, other))
     np.testing.assert_array_equal(here[2], there[2])
     present = here[2][..., None]
     sense = d == 2  # in space a half-axis across the line may be seen either way
@@ -115,23 +115,23 @@ def test_a_scene_is_seen_along_its_line(trial):
     np.testing.assert_allclose(mine, theirs, atol=1e-4)
 
 
-def _seen(trial, scenes):
+def _seen(simulation, scenes):
     rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1).reshape(
         len(scenes.start), -1
     )
     observation = {"hand": scenes.start, "goal": scenes.goal}
-    return seen_from_line({**observation, "obstacles": rows} if rows.size else observation, trial.task)
+    return seen_from_line({**observation, "obstacles": rows} if rows.size else observation, simulation.task)
 
 
-def test_it_takes_the_candidate_of_the_greatest_value(trial):
-    policy, observation = policy_for(trial), trial.observe(scenes_of(trial))
+def test_it_takes_the_candidate_of_the_greatest_value(simulation):
+    policy, observation = policy_for(simulation), simulation.observe(scenes_of(simulation))
     actions, values = policy.propose(observation)
     np.testing.assert_array_equal(policy.decide(observation), actions[np.arange(16), values.argmax(axis=1)])
 
 
 @pytest.mark.parametrize("checks", [1, 12, 1_000])
-def test_of_the_candidates_that_are_checked_it_takes_the_best(trial, checks, monkeypatch):
-    policy, observation = policy_for(trial, checks=checks), trial.observe(scenes_of(trial))
+def test_of_the_candidates_that_are_checked_it_takes_the_best(simulation, checks, monkeypatch):
+    policy, observation = policy_for(simulation, checks=checks), simulation.observe(scenes_of(simulation))
     every, values = policy.propose(observation)
     seen, score_plans = [], viaq_policy.score_plans
 
@@ -146,35 +146,35 @@ def test_of_the_candidates_that_are_checked_it_takes_the_best(trial, checks, mon
     for row in range(16):
         candidates = {each.tobytes() for each in every[row]}
         assert len({each.tobytes() for each in checked[row]} & candidates) == checked.shape[1]
-    best = checked[np.arange(16), best_plan(check_plans(observation, checked, trial.task))]
+    best = checked[np.arange(16), best_plan(check_plans(observation, checked, simulation.task))]
     np.testing.assert_array_equal(decided, best)
     if checks > 1:
         greatest = every[np.arange(16), values.argmax(axis=1)]
         assert (checked == greatest[:, None]).all(axis=-1).any(axis=1).all()
 
 
-def test_the_task_survives_json(trial):
-    record = json.loads(json.dumps(trial.task.as_dict()))
-    assert Task.from_dict(record, ARMS) == trial.task
+def test_the_task_survives_json(simulation):
+    record = json.loads(json.dumps(simulation.task.as_dict()))
+    assert Task.from_dict(record, ARMS) == simulation.task
     with pytest.raises(ValueError, match=r"arm must be one of planar.*, got 'octopus'"):
         Task.from_dict({**record, "arm": "octopus"}, ARMS)
 
 
 def test_it_learns_within_a_minute_what_chance_does_not():
     """A few hundred decisions suffice to double the success of random ones, and to triple it with checks."""
-    trial = Trial(IDS[1], 256)
-    scenes = scenes_of(trial, 256, seed=10_000)
-    observation = trial.observe(scenes)
-    chance = trial(scenes, np.random.default_rng(0).uniform(-1.0, 1.0, (256, 3))).success.mean()
+    simulation = SceneSimulation(IDS[1], 256)
+    scenes = scenes_of(simulation, 256, seed=10_000)
+    observation = simulation.observe(scenes)
+    chance = simulation(scenes, np.random.default_rng(0).uniform(-1.0, 1.0, (256, 3))).success.mean()
     env = ViaVecEnv(IDS[1], 64, seed=0)
     few = {"candidates": 128, "refinements": 1, "per_refinement": 32}
     model = ViaQ("ViaQPolicy", env, seed=0, learning_starts=512, gradient_steps=16, policy_kwargs=few)
     model.learn(64 * 24)
-    alone = trial(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
+    alone = simulation(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
     model.policy.checks = 16
-    checked = trial(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
+    checked = simulation(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
     assert alone > 2.0 * chance
     assert checked > 3.0 * chance
     assert checked > 0.7
     env.close()
-    trial.close()
+    simulation.close()

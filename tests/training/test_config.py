@@ -19,7 +19,7 @@ from viapoint.training.config.configs import (
     TrainConfig,
 )
 from viapoint.training.config.presets import PRESETS
-from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS
+from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS
 
 EXAMPLES = [
     TrainConfig(),
@@ -155,7 +155,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(kind, name, needed, tmp_p
 
 
 def test_every_method_can_be_named():
-    assert set(BASELINES) == {"untrained", *METHODS, *ONLINE_METHODS}
+    assert set(BASELINES) == {"untrained", *METHODS, *REPLANNING_METHODS}
 
 
 def test_unknown_names_in_a_file_are_refused():

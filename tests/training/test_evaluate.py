@@ -8,7 +8,7 @@ import pytest
 from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planners.baselines import make_method
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import BANDS
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -42,13 +42,13 @@ def test_every_method_meets_the_same_scenes(small_scenes):
         assert [len(goals) for goals in method.goals] == [16, 16, 8]
         np.testing.assert_array_equal(np.concatenate(method.goals), small_scenes.scenes.goal)
         np.testing.assert_allclose(np.concatenate(method.observed), small_scenes.scenes.goal, atol=1e-6)
-    trial = Trial(ENV, 8, threads=1)
+    simulation = SceneSimulation(ENV, 8, threads=1)
     for result, method in zip(evaluation.results, methods, strict=True):
-        direct = trial(small_scenes.scenes, method.actions)
+        direct = simulation(small_scenes.scenes, method.actions)
         for name, values in direct.info.items():
             np.testing.assert_array_equal(result.outcomes[name], values, err_msg=name)
         np.testing.assert_array_equal(result.outcomes["reward"], direct.reward)
-    trial.close()
+    simulation.close()
     assert evaluation.sha256 == small_scenes.sha256
     assert evaluation.results[0].success.sum() == 0  # the straight line always hits something
 

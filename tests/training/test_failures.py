@@ -16,7 +16,7 @@ from viapoint.training.plotting.failure_report import (
     proposals,
     write_failures,
 )
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.trainer import new_model, resolved
 
@@ -53,14 +53,14 @@ class Chosen:
 
     name = "agent"
 
-    def __init__(self, model, trial):
-        self.model, self.trial = model, trial
+    def __init__(self, model, simulation):
+        self.model, self.simulation = model, simulation
 
     def decide(self, observation, scenes):
-        actions = proposals(self.model.policy, self.trial.observe(scenes))
+        actions = proposals(self.model.policy, self.simulation.observe(scenes))
         number, count, size = actions.shape
         every = scenes.take(np.repeat(np.arange(number), count))
-        reward = self.trial(every, actions.reshape(-1, size)).reward.reshape(number, count)
+        reward = self.simulation(every, actions.reshape(-1, size)).reward.reshape(number, count)
         return actions[np.arange(number), reward.argmin(axis=-1)]
 
 
@@ -68,9 +68,9 @@ class Chosen:
 def sorted_out(small_scenes):
     env = ViaVecEnv(ENV, 1, threads=1)
     model = new_model(resolved(TrainConfig(env=ENV)), env)  # untrained
-    trial = Trial(ENV, 64, threads=1)
+    simulation = SceneSimulation(ENV, 64, threads=1)
     result = evaluate_methods(
-        [Chosen(model, trial)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
+        [Chosen(model, simulation)], small_scenes, ENV, env_kwargs={"threads": 1}, time_decisions=False
     ).results[0]
     return result, classify_failures(result, small_scenes, model, ENV, threads=1)
 

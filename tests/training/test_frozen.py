@@ -13,7 +13,7 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planners.baselines import METHODS, make_method
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget, screen
 from viapoint.training.planners.difficulty import planned_share, solution_share
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.generate import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake
 from viapoint.training.scene_sets.scene_search import Kinds, Source, redrawn, search
@@ -24,10 +24,10 @@ ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 
 
 @pytest.fixture(scope="module")
-def trial():
-    trial = Trial(ENV_ID, 256)
-    yield trial
-    trial.close()
+def simulation():
+    simulation = SceneSimulation(ENV_ID, 256)
+    yield simulation
+    simulation.close()
 
 
 SHIPPED = [(env_id, name) for env_id, names in SETS.items() for name in names]
@@ -45,9 +45,9 @@ def shipped(request):
 
 
 @pytest.fixture(scope="module")
-def trials():
+def results():
     made = {}
-    yield lambda env_id: made.setdefault(env_id, Trial(env_id, 128, threads=1))
+    yield lambda env_id: made.setdefault(env_id, SceneSimulation(env_id, 128, threads=1))
     for each in made.values():
         each.close()
 
@@ -59,10 +59,10 @@ def test_shipped_sets_are_whole_and_distinct_and_every_share_is_known(shipped):
     assert len(np.unique(shipped.scenes.start, axis=0)) == size
 
 
-def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_family(shipped, trials):
+def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_family(shipped, results):
     if shipped.name == "hard":
         names, counts = np.unique(shipped.family, return_counts=True)
-        families = hard_families(trials(shipped.env_id).task)
+        families = hard_families(results(shipped.env_id).task)
         assert set(names) == set(families)
         assert set(counts) == {len(shipped.share) // len(families)}
         assert set(shipped.family[: len(families)]) == set(families)  # in turn, so that any part is mixed
@@ -79,13 +79,13 @@ def test_no_scene_is_in_two_sets(env_id):
     assert len(set(starts)) == len(starts)
 
 
-def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, trials):
+def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, results):
     """The first of each set, and those that the straight line may solve, which is only where nothing is in the way."""
-    trial = trials(shipped.env_id)
-    check_scenes(shipped.scenes, trial.task.collision_model)
+    simulation = results(shipped.env_id)
+    check_scenes(shipped.scenes, simulation.task.collision_model)
     some = shipped.take(slice(0, 120))
-    assert trial(some.scenes, some.solution).success.all()
-    straight = trial(some.scenes, np.zeros_like(some.solution)).success
+    assert simulation(some.scenes, some.solution).success.all()
+    straight = simulation(some.scenes, np.zeros_like(some.solution)).success
     assert straight.all() if "Reach" in shipped.env_id else not straight.any()
 
 
@@ -94,35 +94,35 @@ def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads():
     assert remake(some, threads=1).sha256 == some.sha256
 
 
-def test_scenes_that_are_searched_for_are_of_the_kind_asked_for_and_solved_and_can_be_drawn_again(trial):
+def test_scenes_that_are_searched_for_are_of_the_kind_asked_for_and_solved_and_can_be_drawn_again(simulation):
     def gates():
-        return next(lot for lot in lots(trial.task, "hard", 500) if lot.family == "gate")
+        return next(lot for lot in lots(simulation.task, "hard", 500) if lot.family == "gate")
 
     lot = gates()
-    found = search(trial, lot.source, dataclasses.replace(lot.kinds, quota=2), seed=1, label="gates")
+    found = search(simulation, lot.source, dataclasses.replace(lot.kinds, quota=2), seed=1, label="gates")
     assert len(found.share) == 2
     assert ((found.share > 0.0) & (found.share < 0.05)).all()
-    assert trial(found.scenes, found.solution).success.all()
+    assert simulation(found.scenes, found.solution).success.all()
     for one, other in zip(redrawn(gates().source, found.number), found.scenes, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_is_too_rare_is_said_to_be_missing(trial):
+def test_what_is_too_rare_is_said_to_be_missing(simulation):
     impossible = Kinds(
         of_share=lambda share: np.where(share > 2.0, 1, 0), names=("any", "more than all"), quota=1
     )
-    sampler, generator = trial.task.sampler(), np.random.default_rng(0)
+    sampler, generator = simulation.task.sampler(), np.random.default_rng(0)
     source = Source(draw=lambda number: sampler([generator] * number), block=64)
     with pytest.raises(RuntimeError, match="2 more than all scenes by estimate after 128 drawn"):
-        search(trial, source, impossible, seed=0, label="some", most_drawn=128)
+        search(simulation, source, impossible, seed=0, label="some", most_drawn=128)
 
 
 @pytest.mark.parametrize("env_id", [ENV_ID, "viapoint/PlanarWholeArm-v0", IN_SPACE])
-def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, trials):
+def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, results):
     """With estimated shares, a little too high."""
-    task = trials(env_id).task
+    task = results(env_id).task
     scenes = task.sampler()([np.random.default_rng(1_000 + i) for i in range(300)])
-    share = planned_share(trials(env_id), scenes, draws=128)
+    share = planned_share(results(env_id), scenes, draws=128)
     found = np.bincount(bands(share), minlength=len(BANDS)) / 300
     (row,) = re.findall(rf"^\| `{env_id}` \|((?: [0-9]+ % \|)+)$", PAGE, flags=re.MULTILINE)
     stated = np.array([float(part) for part in re.findall(r"[0-9]+", row)]) / 100.0
@@ -134,45 +134,47 @@ def test_the_families_are_documented():
     assert all(f"`{name}` (" in PAGE.replace("\n", " ") for name in scene_families(2))
 
 
-def test_the_stated_share_is_what_one_measures(frozen, trial):
+def test_the_stated_share_is_what_one_measures(frozen, simulation):
     """Other draws than those of the file give the same shares, within what chance allows."""
     some = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (200, 3))
     rows = np.repeat(np.arange(12), 200)
-    measured = trial(some.scenes.take(rows), np.tile(draws, (12, 1))).success.reshape(12, 200).mean(axis=-1)
+    measured = (
+        simulation(some.scenes.take(rows), np.tile(draws, (12, 1))).success.reshape(12, 200).mean(axis=-1)
+    )
     spread = np.sqrt(some.share * (1.0 - some.share) * (1.0 / 200 + 1.0 / 512))
     assert (np.abs(measured - some.share) < 4.5 * spread).all()
 
 
-def test_share_counts_only_what_fails_for_certain_as_failed(trial):
-    scenes = trial.task.sampler()([np.random.default_rng(i) for i in range(40)])
+def test_share_counts_only_what_fails_for_certain_as_failed(simulation):
+    scenes = simulation.task.sampler()([np.random.default_rng(i) for i in range(40)])
     rows = np.repeat(np.arange(40), 32)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (len(rows), 3))
-    fails = screen(trial.task, scenes.take(rows), actions).fails
-    assert not trial(scenes.take(rows), actions).success[fails].any()
+    fails = screen(simulation.task, scenes.take(rows), actions).fails
+    assert not simulation(scenes.take(rows), actions).success[fails].any()
     assert 0.3 < fails.mean() < 0.98
-    assert solution_share(trial, scenes.take(slice(0, 2))).shape == (2,)
+    assert solution_share(simulation, scenes.take(slice(0, 2))).shape == (2,)
 
 
-def test_what_succeeds_for_certain_does_and_only_in_space_it_is_known(trial, trials):
-    scenes = trials(IN_SPACE).task.sampler()([np.random.default_rng(i) for i in range(40)])
+def test_what_succeeds_for_certain_does_and_only_in_space_it_is_known(simulation, results):
+    scenes = results(IN_SPACE).task.sampler()([np.random.default_rng(i) for i in range(40)])
     rows = np.repeat(np.arange(40), 16)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (len(rows), 4))
-    screened = screen(trials(IN_SPACE).task, scenes.take(rows), actions)
+    screened = screen(results(IN_SPACE).task, scenes.take(rows), actions)
     assert 40 < screened.succeeds.sum() < 300
-    assert trials(IN_SPACE)(scenes.take(rows[screened.succeeds]), actions[screened.succeeds]).success.all()
-    planar = trial.task.sampler()([np.random.default_rng(i) for i in range(40)])
-    assert not screen(trial.task, planar, np.ones((40, 3))).succeeds.any()
+    assert results(IN_SPACE)(scenes.take(rows[screened.succeeds]), actions[screened.succeeds]).success.all()
+    planar = simulation.task.sampler()([np.random.default_rng(i) for i in range(40)])
+    assert not screen(simulation.task, planar, np.ones((40, 3))).succeeds.any()
 
 
-def test_the_planner_solves_unseen_scenes_better_than_chance_could(trial):
-    scenes = trial.task.sampler()([np.random.default_rng(500 + i) for i in range(40)])
-    planned = Planner(trial, budget=PlannerBudget(first=32, generations=4))(scenes)
+def test_the_planner_solves_unseen_scenes_better_than_chance_could(simulation):
+    scenes = simulation.task.sampler()([np.random.default_rng(500 + i) for i in range(40)])
+    planned = Planner(simulation, budget=PlannerBudget(first=32, generations=4))(scenes)
     assert planned.success.all()
-    done = trial(scenes, planned.action)
+    done = simulation(scenes, planned.action)
     assert done.success.all()
     np.testing.assert_allclose(done.reward, planned.reward)
-    again = Planner(trial, budget=PlannerBudget(first=32, generations=4))(scenes.take(slice(3, 5)))
+    again = Planner(simulation, budget=PlannerBudget(first=32, generations=4))(scenes.take(slice(3, 5)))
     np.testing.assert_array_equal(again.action, planned.action[3:5])
 
 
@@ -260,9 +262,9 @@ def test_arrays_that_do_not_fit_together_are_refused_whatever_their_hash(frozen,
 
 
 @pytest.mark.parametrize("name", ["straight", "random", "random16"])
-def test_baselines_decide_for_any_number_of_scenes(name, trial):
-    scenes = trial.task.sampler()([np.random.default_rng(i) for i in range(7)])
-    actions = METHODS[name](trial).decide(trial.observe(scenes), scenes)
+def test_baselines_decide_for_any_number_of_scenes(name, simulation):
+    scenes = simulation.task.sampler()([np.random.default_rng(i) for i in range(7)])
+    actions = METHODS[name](simulation).decide(simulation.observe(scenes), scenes)
     assert actions.shape == (7, 3)
     assert (np.abs(actions) <= 1.0).all()
 

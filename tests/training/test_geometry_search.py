@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-from viapoint.envs.registration import ONLINE_TASKS, TASKS
-from viapoint.training.planners.baselines import METHODS, ONLINE_METHODS, make_method
-from viapoint.training.rollouts.rollout import new_trial
+from viapoint.envs.registration import REPLANNING_TASKS, TASKS
+from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS, make_method
+from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.search import geometry_search
 from viapoint.training.search.geometry_search import GeometrySearch
@@ -47,7 +47,7 @@ def under_way(env_id, number=24, decisions=2):
         observation, *_ = env.step(0.3 * random_actions(env.task, number, seed=each))
     default = env.default
     far = np.linalg.norm(default.goal - default.state.position, axis=-1) > MIN_GOAL_DISTANCE
-    free = default.changed | ~default.begun | (default.remaining >= env.reviser.least_remaining)
+    free = default.changed | ~default.begun | (default.remaining >= env.decoder.least_remaining)
     return env, observation, far & free
 
 
@@ -87,12 +87,12 @@ def test_a_via_point_on_an_end_is_a_straight_movement(at_end):
     np.testing.assert_allclose(found.path, straight.path, atol=1e-3)
 
 
-@pytest.mark.parametrize("env_id", ONLINE_TASKS)
+@pytest.mark.parametrize("env_id", REPLANNING_TASKS)
 @pytest.mark.parametrize("decisions", [0, 2])
 def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, decisions):
     env, observation, some = under_way(env_id, decisions=decisions)
     actions = random_actions(env.task, len(some))
-    plan, _ = env.reviser.revise(env.default, env._plan, actions.astype(np.float64))
+    plan, _ = env.decoder.revise(env.default, env._plan, actions.astype(np.float64))
     found = plan_movements(observation, actions[:, None], env.task, SHARES)
     commanded = plan.trajectory()(plan.duration[:, None] * SHARES)
     assert some.sum() > 4
@@ -129,7 +129,7 @@ def test_clearance_is_that_of_many_instants(env_id):
 def test_clearance_of_obstacles_that_move_is_that_of_constant_velocities():
     env, observation, some = under_way("viapoint/PlanarMovingObstacles-v0", 32, 1)
     actions = random_actions(env.task, 32)
-    plan, _ = env.reviser.revise(env.default, env._plan, actions.astype(np.float64))
+    plan, _ = env.decoder.revise(env.default, env._plan, actions.astype(np.float64))
     ahead, now = plan.duration[:, None] * np.linspace(0.0, 1.0, 800), env._episodes.time
     rows = env.scenes.places(now[:, None] + ahead, unturned=now)
     hand = plan.trajectory()(ahead)
@@ -266,15 +266,15 @@ def test_the_order_of_obstacles_does_not_matter(env_id):
 def test_the_search_succeeds(env_id, name, number, least):
     every = load("validation", env_id).scenes
     scenes = every.take(np.linspace(0, len(every.start) - 1, number).astype(int))
-    trial = new_trial(env_id, number, threads=1)
-    method = (ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS)[name](trial)
+    simulation = new_simulation(env_id, number, threads=1)
+    method = (REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS)[name](simulation)
     assert method.name == f"search, {name.removeprefix('search')} checks"
-    done = trial.play(method, scenes, method.decide(trial.observe(scenes), scenes))
+    done = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
     assert done.success.mean() >= least
-    trial.close()
+    simulation.close()
 
 
-@pytest.mark.parametrize("env_id", [*TASKS, *ONLINE_TASKS])
+@pytest.mark.parametrize("env_id", [*TASKS, *REPLANNING_TASKS])
 def test_it_is_a_method_of_every_task(env_id):
     method = make_method("search16", env_id, num_envs=2, threads=1)
     _, observation = made(env_id, 2)

@@ -8,7 +8,7 @@ import pytest
 from viapoint.training.algorithms.model_io import ALGORITHMS, _argument_names, _encode
 from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.config.checks import HYPERPARAMETERS, PARTICULAR, VIA_POLICY, check_hyperparameters
-from viapoint.training.config.presets import ONLINE_PRESETS, PRESETS, REACH_PRESETS, STEP_PRESETS
+from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 
 
 def test_every_hyperparameter_is_in_the_table():
@@ -20,7 +20,7 @@ def test_every_hyperparameter_is_in_the_table():
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_what_the_algorithms_and_the_presets_use_is_allowed(algo):
-    for table in (PRESETS, STEP_PRESETS, REACH_PRESETS, ONLINE_PRESETS):
+    for table in (PRESETS, STEP_PRESETS, REACH_PRESETS, REPLANNING_PRESETS):
         if algo in table:
             check_hyperparameters(algo, table[algo].arguments())
     defaults = {

@@ -10,7 +10,7 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners import ompl_planner
 from viapoint.training.planners.baselines import make_method
 from viapoint.training.planners.ompl_planner import points_on
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load
 
 WHOLE = "viapoint/PlanarObstacles-v0"
@@ -41,8 +41,8 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 def test_every_link_of_the_whole_arm_clears():
     pytest.importorskip("ompl")
-    trial = Trial("viapoint/PlanarWholeArm-v0", 6)
-    scenes = trial.task.sampler()([np.random.default_rng(0)] * 6)
+    simulation = SceneSimulation("viapoint/PlanarWholeArm-v0", 6)
+    scenes = simulation.task.sampler()([np.random.default_rng(0)] * 6)
     method = make_method("ompl", "viapoint/PlanarWholeArm-v0")
     done = method.execute(scenes, method.decide({}, scenes))
     assert done.success.mean() > 0.5
@@ -55,10 +55,10 @@ def test_where_there_is_no_way_it_gives_up():
     start, goal = np.array([-0.25, 0.35]), np.array([0.15, 0.35])
     ring = [[0.07, 0.0, 0.0, 0.07], [-0.07, 0.0, 0.0, 0.07], [0.0, 0.07, 0.07, 0.0], [0.0, -0.07, 0.07, 0.0]]
     rows = np.array([[*(start + bar[:2]), *bar[2:], 0.01] for bar in ring])
-    trial = Trial(WHOLE, 1)
+    simulation = SceneSimulation(WHOLE, 1)
     scenes = Scenes(start[None], goal[None], np.concatenate((rows, np.zeros((1, 5))))[None])
     budget = ompl_planner.MotionPlannerBudget(attempts=1, seconds=0.05)
-    method = ompl_planner.MotionPlannerMethod(trial, budget=budget)
+    method = ompl_planner.MotionPlannerMethod(simulation, budget=budget)
     done = method.execute(scenes, method.decide({}, scenes))
     assert not done.success.any()
 

@@ -10,7 +10,7 @@ from viapoint.training.scene_sets import generate
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 
 ENV = "viapoint/PlanarReach-v0"
-ONLINE = "viapoint/PlanarTargetJump-v0"
+REPLANNING = "viapoint/PlanarTargetJump-v0"
 
 
 def parsed(*words):
@@ -24,7 +24,7 @@ def changed(frozen):
 
 
 @pytest.mark.parametrize("same", [True, False])
-@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+@pytest.mark.parametrize("env_id", [ENV, REPLANNING])
 def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(env_id, same, monkeypatch, capsys):
     path, frozen = shipped_path("test", env_id), load("test", env_id)
     before, made = path.read_bytes(), frozen if same else changed(frozen)

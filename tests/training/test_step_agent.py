@@ -11,7 +11,7 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners.baselines import Straight, agent_method
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import validation_scenes
@@ -44,7 +44,7 @@ def test_the_task_of_a_step_wise_id_is_its_twin():
     given = {"control_step": 0.02, "n_obstacles": 3, "reward_weights": weights}
     assert whole_task(STEP, given) == (WHOLE, {"n_obstacles": 3, "reward_weights": {"success": 3.0}})
     assert whole_task(WHOLE, {"n_via": 2}) == (WHOLE, {"n_via": 2})
-    Trial(*whole_task(STEP, given)[:1], 2, **whole_task(STEP, given)[1]).close()
+    SceneSimulation(*whole_task(STEP, given)[:1], 2, **whole_task(STEP, given)[1]).close()
 
 
 class Forwards:
@@ -58,8 +58,8 @@ class Forwards:
 def test_what_a_method_carries_out_is_what_the_single_environment_does():
     frozen, model = load("validation", WHOLE).take(slice(0, 6)), Forwards()
     method = StepAgentMethod("forwards", model, STEP, {})
-    trial = Trial(WHOLE, 6)
-    together = method.execute(frozen.scenes, method.decide(trial.observe(frozen.scenes), frozen.scenes))
+    simulation = SceneSimulation(WHOLE, 6)
+    together = method.execute(frozen.scenes, method.decide(simulation.observe(frozen.scenes), frozen.scenes))
     env = gym.make(STEP)
     for i in range(6):
         observation, _ = env.reset(options=frozen.scenes.take([i]).as_options())
@@ -79,7 +79,7 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does():
 def test_it_stands_in_one_table_with_the_others(model):
     assert isinstance(agent_method("agent", model), StepAgentMethod)
     frozen = load("validation", WHOLE).take(slice(0, 12))
-    methods = [agent_method("agent", model), Straight(Trial(WHOLE, 4))]
+    methods = [agent_method("agent", model), Straight(SceneSimulation(WHOLE, 4))]
     result = evaluate_methods(methods, frozen, WHOLE, batch=5, time_decisions=False)
     for each in result.results:
         assert each.summary()["scenes"] == 12

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from decision_chain import SECONDS, Chain
 
-from viapoint.envs.velocity_env import StepReachVectorEnv
+from viapoint.envs.velocity_env import VelocityVectorEnv
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.algorithms.smdp_buffers import unit_of
 from viapoint.training.config.configs import TrainConfig
@@ -17,7 +17,7 @@ from viapoint.training.runs.trainer import train
 STEP = "viapoint/PlanarObstaclesStep-v0"
 
 
-class Uneven(StepReachVectorEnv):
+class Uneven(VelocityVectorEnv):
     """Steps that are said to have taken as long as the hand has moved."""
 
     def execute_actions(self, actions):

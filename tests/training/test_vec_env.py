@@ -11,7 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.search.geometry_search import GeometrySearch
 
@@ -246,7 +246,7 @@ def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
     [
         lambda: ViaVecEnv("viapoint/Nothing-v0", 2),
         lambda: GeometrySearch("viapoint/Nothing-v0"),
-        lambda: Trial("Nothing-v3"),
+        lambda: SceneSimulation("Nothing-v3"),
     ],
 )
 def test_an_unknown_id_is_answered_with_those_that_there_are(make):
@@ -261,7 +261,7 @@ def test_an_unknown_id_is_answered_with_those_that_there_are(make):
     [
         "from viapoint.training.rollouts.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
         "from viapoint.training.search.geometry_search import GeometrySearch; GeometrySearch(ID)",
-        "from viapoint.training.rollouts.rollout import Trial; Trial(ID, 2)",
+        "from viapoint.training.rollouts.rollout import SceneSimulation; SceneSimulation(ID, 2)",
         "from viapoint.training import load_agent; load_agent(ID)",
     ],
 )

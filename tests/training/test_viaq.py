@@ -18,7 +18,7 @@ from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 
-ENV, ONLINE = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
+ENV, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
 SMALL = {
     "learning_starts": 16,
@@ -51,7 +51,7 @@ def weights(model):
     return torch.cat([part.detach().flatten() for part in model.policy.parameters()])
 
 
-@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+@pytest.mark.parametrize("env_id", [ENV, REPLANNING])
 def test_it_learns_in_pieces_is_saved_and_goes_on(made, tmp_path, env_id):
     env = made(env_id)
     model = model_on(env).learn(24)
@@ -87,7 +87,7 @@ def test_any_environment_of_sb3_will_do(env):
     model.get_env().close()
 
 
-@pytest.mark.parametrize("env_id", [ENV, ONLINE])
+@pytest.mark.parametrize("env_id", [ENV, REPLANNING])
 def test_equal_seeds_give_equal_agents(made, env_id):
     one, other = (weights(model_on(made(env_id)).learn(32)) for _ in range(2))
     assert torch.equal(one, other)
@@ -149,7 +149,7 @@ def test_settings_that_make_no_sense_are_refused(made, name, value):
         {"gamma": 0.0},
     ],
 )
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", ENV, ONLINE])
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", ENV, REPLANNING])
 def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id, settings):
     env = made(env_id)
     model = model_on(env, **settings).learn(32)

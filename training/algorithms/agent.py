@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
@@ -68,7 +68,7 @@ class Agent(BaseAlgorithm):
                 agent is not a whole movement.
         """
         env_id = self.env_id
-        if env_id in STEP_TASKS or env_id in ONLINE_TASKS:
+        if env_id in STEP_TASKS or env_id in REPLANNING_TASKS:
             raise ValueError(
                 f"plan() needs an agent whose actions are whole movements; in {env_id} an action depends on the motion "
                 "under way: step the environment with predict()"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from viapoint.envs.registration import ONLINE_TASKS, STEP_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.agent import Agent, load_agent
 from viapoint.training.cli.progress import evenly_spread, progress_bar
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
@@ -94,7 +94,7 @@ def _check_failures(agent: Agent | None) -> None:
         ValueError: Its actions are something else.
     """
     env_id = "" if agent is None else agent.env_id
-    if env_id in STEP_TASKS or env_id in ONLINE_TASKS:
+    if env_id in STEP_TASKS or env_id in REPLANNING_TASKS:
         raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
 
 

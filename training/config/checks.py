@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from viapoint.envs.registration import ENV_IDS, ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 SHIPPED = Path(str(files("viapoint.training") / "pretrained"))
@@ -57,7 +57,7 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
 
 def check_whole_movements(env: str) -> None:
     """Check that an action of the task is a whole movement."""
-    if env in STEP_TASKS or env in ONLINE_TASKS:
+    if env in STEP_TASKS or env in REPLANNING_TASKS:
         like = STEP_TASKS.get(env, DEFAULT_ENV)
         raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 
 ELAPSED = "elapsed"
 """Name of the duration of a decision in infos, [s]."""
@@ -63,7 +63,7 @@ def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
         ValueError: The unit is no positive number, or the algorithm's episodes are one decision there.
     """
     _check_unit("discount_unit", unit)
-    if algorithm == "viaq" and env_id not in ONLINE_TASKS:
+    if algorithm == "viaq" and env_id not in REPLANNING_TASKS:
         raise ValueError(f"discount_unit must be None for viaq: episodes of {env_id} are one decision")
 
 

@@ -7,7 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.registration import OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS, TASKS
 
 Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
 
@@ -128,7 +128,7 @@ REACH_PRESETS: dict[str, Preset] = {
 }
 """Presets of tasks without obstacles, which need fewer decisions."""
 
-ONLINE_PRESETS: dict[str, Preset] = {
+REPLANNING_PRESETS: dict[str, Preset] = {
     name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
 } | {
     "viaq": dataclasses.replace(
@@ -147,8 +147,8 @@ def preset_of(env_id: str, algo: Algorithm) -> Preset:
     """Return the default settings of an algorithm in an environment."""
     if env_id in STEP_TASKS:
         return STEP_PRESETS[algo]
-    if env_id in ONLINE_TASKS:
-        return ONLINE_PRESETS[algo]
+    if env_id in REPLANNING_TASKS:
+        return REPLANNING_PRESETS[algo]
     task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
     presets = REACH_PRESETS if task.get("n_obstacles") == 0 else PRESETS
     return presets.get(algo, PRESETS[algo])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.registration import ONLINE_TASKS, check_registered
+from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms.agent import load_agent
@@ -24,7 +24,7 @@ from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
-from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
+from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
 from viapoint.training.rollouts.step_rollout import whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
@@ -290,9 +290,9 @@ def _baselines(
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
             methods += _rows_of(untrained(agent), checks, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and env_id in ONLINE_TASKS:
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and env_id in REPLANNING_TASKS:
             first = agent_method("agent", agent, None if checks is None else 0)
-            methods.append(OpenLoopBaseline(first, OnlineTrial(env_id, **env_kwargs)))
+            methods.append(OpenLoopBaseline(first, EpisodeSimulation(env_id, **env_kwargs)))
         else:
             methods.append(make_method(each, env_id, **env_kwargs))
     return methods
@@ -322,9 +322,9 @@ def evaluate_methods(
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
-    with one_thread(), _trial(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as trial:
+    with one_thread(), _simulation(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as simulation:
         for method in methods:
-            result = _evaluate_one(method, frozen, trial, batch, time_decisions, progress)
+            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
             results.append(result)
             if result.interrupted:
                 break
@@ -337,7 +337,7 @@ def evaluate_methods(
 def _evaluate_one(
     method: Method,
     frozen: FrozenScenes,
-    trial: Trial,
+    simulation: SceneSimulation,
     batch: int,
     time_decisions: bool,
     progress: Progress | None,
@@ -350,15 +350,15 @@ def _evaluate_one(
         for first in range(0, number, batch):
             scenes = frozen.scenes.take(slice(first, first + batch))
             began = time.perf_counter()
-            decided = method.decide(trial.observe(scenes), scenes)
+            decided = method.decide(simulation.observe(scenes), scenes)
             seconds += time.perf_counter() - began
-            outcome = trial.play(method, scenes, decided)
+            outcome = simulation.play(method, scenes, decided)
             action = np.asarray(decided, dtype=np.float64)
             pieces.append({**outcome.info, "reward": outcome.reward, "": action})
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
         if time_decisions and getattr(method, "timed", True):
-            times = _decision_times(method, frozen.scenes, trial, seconds / number)
+            times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True
     actions = [piece[""] for piece in pieces]  # kept with their outcomes, so that Ctrl-C parts none of them
@@ -367,7 +367,7 @@ def _evaluate_one(
     return MethodResult(
         name=method.name,
         outcomes={name: np.concatenate([piece[name] for piece in pieces]) for name in names} or _nothing(),
-        actions=np.concatenate(actions) if actions else np.zeros((0, trial.task.action.size)),
+        actions=np.concatenate(actions) if actions else np.zeros((0, simulation.task.action.size)),
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
@@ -384,13 +384,13 @@ def _distances(scenes: Scenes | ChangingScenes) -> Float:
     return np.asarray(away)
 
 
-def _decision_times(method: Method, scenes: Scenes, trial: Trial, in_batch: float) -> Float:
+def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:
     """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch."""
     times: list[float] = []
     began = time.perf_counter()
     for row in range(min(TIMED_DECISIONS + 1, len(scenes.start))):
         one = scenes.take(slice(row, row + 1))
-        observation = trial.observe(one)
+        observation = simulation.observe(one)
         before = time.perf_counter()
         method.decide(observation, one)
         times.append(time.perf_counter() - before)
@@ -414,12 +414,12 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _trial(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Iterator[Trial]:
-    trial = new_trial(env_id, num_envs, **kwargs)
+def _simulation(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Iterator[SceneSimulation]:
+    simulation = new_simulation(env_id, num_envs, **kwargs)
     try:
-        yield trial
+        yield simulation
     finally:
-        trial.close()
+        simulation.close()
 
 
 def _nothing() -> dict[str, NDArray[Any]]:

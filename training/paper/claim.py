@@ -111,7 +111,7 @@ SUBJECTS = {
     8: "Scaling with time",
     9: "Alternatives to minimum jerk",
     10: "Repetitive and performance-limited movements",
-    11: "The primer and its online version",
+    11: "The primer and its replanned version",
     12: "Obstacle avoidance",
     13: "A target that jumps on the way (Flash & Henis 1991)",
 }

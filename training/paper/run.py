@@ -42,7 +42,7 @@ ROWS: dict[int, Callable[[], list[Claim]]] = {
     8: timing.scaling_claims,
     9: alternatives.alternative_claims,
     10: limits.limit_claims,
-    11: double_step.online_claims,
+    11: double_step.replanning_claims,
     13: double_step.double_step_claims,
 }
 """Functions of the rows without an agent; row 12 needs its movements."""

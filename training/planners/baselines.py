@@ -10,12 +10,12 @@ import numpy as np
 from tqdm import tqdm
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner
 from viapoint.training.planners.ompl_planner import MotionPlannerMethod
-from viapoint.training.planners.replanning_baselines import OnlinePlanner, OpenLoopBaseline
-from viapoint.training.rollouts.rollout import Trial, new_trial
+from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
+from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.search.geometry_search import GeometrySearch
@@ -25,7 +25,7 @@ class Method(Protocol):
     """Decision maker that chooses a movement in each of N scenes.
 
     A method whose movements are no actions of the environment has `execute(scenes, decisions)` as well, which simulates
-    them and returns :class:`~viapoint.training.rollouts.rollout.Trials`.
+    them and returns :class:`~viapoint.training.rollouts.rollout.SimulationResults`.
     """
 
     @property
@@ -41,8 +41,8 @@ class Straight:
 
     name = "straight line"
 
-    def __init__(self, trial: Trial) -> None:
-        self._size = trial.task.action.size
+    def __init__(self, simulation: SceneSimulation) -> None:
+        self._size = simulation.task.action.size
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return zero actions, see :class:`Method`."""
@@ -54,12 +54,14 @@ class Constant:
 
     name = "best constant action"
 
-    def __init__(self, trial: Trial, *, seed: int = 0, candidates: int = 256, number: int = 256) -> None:
+    def __init__(
+        self, simulation: SceneSimulation, *, seed: int = 0, candidates: int = 256, number: int = 256
+    ) -> None:
         generator = np.random.default_rng(seed)
-        scenes = trial.task.sampler()([generator] * number)
-        actions = generator.uniform(-1.0, 1.0, (candidates, trial.task.action.size))
+        scenes = simulation.task.sampler()([generator] * number)
+        actions = generator.uniform(-1.0, 1.0, (candidates, simulation.task.action.size))
         progress = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
-        solved = [trial(scenes, np.tile(action, (number, 1))).success.sum() for action in progress]
+        solved = [simulation(scenes, np.tile(action, (number, 1))).success.sum() for action in progress]
         self._action = actions[np.argmax(solved)]
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -70,19 +72,19 @@ class Constant:
 class RandomVias:
     """Best of some random actions by simulated reward; a single one is not simulated."""
 
-    def __init__(self, trial: Trial, count: int, *, seed: int = 0) -> None:
-        self._trial, self._count = trial, count
+    def __init__(self, simulation: SceneSimulation, count: int, *, seed: int = 0) -> None:
+        self._simulation, self._count = simulation, count
         self._generator = np.random.default_rng(seed)
         self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the best of the random actions, see :class:`Method`."""
-        number, size = len(scenes.start), self._trial.task.action.size
+        number, size = len(scenes.start), self._simulation.task.action.size
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
             return actions[:, 0]
         every = scenes.take(np.repeat(np.arange(number), self._count))
-        reward = self._trial(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
+        reward = self._simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
@@ -127,34 +129,34 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     return AgentMethod(name, model, checks)
 
 
-def _search(total: int) -> Callable[[Trial], Method]:
+def _search(total: int) -> Callable[[SceneSimulation], Method]:
     """Return a factory of searches; half of the checks on refinement solve more scenes (docs/geometry-search.md)."""
     rounds = 2 if total < 256 else 4
-    return lambda trial: GeometrySearch(
-        trial.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
+    return lambda simulation: GeometrySearch(
+        simulation.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
     )
 
 
 SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
 """Factories of searches by name; the number is that of the plans checked in a decision."""
 
-METHODS: dict[str, Callable[[Trial], Method]] = {
+METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "constant": Constant,
-    "random": lambda trial: RandomVias(trial, 1),
-    "random16": lambda trial: RandomVias(trial, 16),
-    "random80": lambda trial: RandomVias(trial, 80),
+    "random": lambda simulation: RandomVias(simulation, 1),
+    "random16": lambda simulation: RandomVias(simulation, 16),
+    "random80": lambda simulation: RandomVias(simulation, 80),
     "planner": Planner,
     "ompl": MotionPlannerMethod,
     **SEARCHES,
 }
 """Factories of baselines by their names on the command line."""
 
-ONLINE_METHODS: dict[str, Callable[[Any], Method]] = {
+REPLANNING_METHODS: dict[str, Callable[[Any], Method]] = {
     "straight": Straight,
-    "random": lambda trial: RandomVias(trial, 1),
-    "planner": OnlinePlanner,
-    "unrevised": lambda trial: OpenLoopBaseline(Straight(trial), trial),
+    "random": lambda simulation: RandomVias(simulation, 1),
+    "planner": ReplanningPlanner,
+    "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
     **SEARCHES,
 }
 """Factories of baselines for replanning tasks."""
@@ -180,8 +182,8 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
         ValueError: No baseline has that name.
     """
     check_method(name, env_id)
-    return _known(env_id)[name](new_trial(env_id, **kwargs))
+    return _known(env_id)[name](new_simulation(env_id, **kwargs))
 
 
 def _known(env_id: str) -> dict[str, Callable[[Any], Method]]:
-    return ONLINE_METHODS if env_id in ONLINE_TASKS else METHODS
+    return REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS

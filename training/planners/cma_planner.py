@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.search.plan_checks import check_plans
 
 if TYPE_CHECKING:
@@ -91,16 +91,18 @@ class Planner:
     """Search for the action of the highest simulated reward.
 
     Args:
-        trial: Simulation of the environment.
+        simulation: Simulation of the environment.
         seed: Seed of the random actions and of the evolution strategy.
         budget: Budget of the search.
     """
 
     name = "planner"
 
-    def __init__(self, trial: Trial, *, seed: int = 0, budget: PlannerBudget | None = None) -> None:
-        self._trial, self._budget, self._seed = trial, budget or PlannerBudget(), seed
-        self._size = trial.task.action.size
+    def __init__(
+        self, simulation: SceneSimulation, *, seed: int = 0, budget: PlannerBudget | None = None
+    ) -> None:
+        self._simulation, self._budget, self._seed = simulation, budget or PlannerBudget(), seed
+        self._size = simulation.task.action.size
 
     def __call__(self, scenes: Scenes) -> PlannedActions:
         """Return the best action found in each of N scenes; each depends on its scene and the seed alone."""
@@ -131,11 +133,11 @@ class Planner:
         """Simulate actions, shape (n, count, m), in some scenes, keep improvements, and return their rewards."""
         count = actions.shape[1]
         every, flat = scenes.take(np.repeat(rows, count)), actions.reshape(-1, self._size)
-        screening = screen(self._trial.task, every, flat)
+        screening = screen(self._simulation.task, every, flat)
         rewards, success = FAILURE_REWARD + screening.margin, np.zeros(len(flat), dtype=bool)
         if not screening.fails.all():
-            trials = self._trial(every.take(~screening.fails), flat[~screening.fails])
-            rewards[~screening.fails], success[~screening.fails] = trials.reward, trials.success
+            results = self._simulation(every.take(~screening.fails), flat[~screening.fails])
+            rewards[~screening.fails], success[~screening.fails] = results.reward, results.success
         rewards = rewards.reshape(-1, count)
         best = rewards.argmax(axis=-1)
         each = np.arange(len(rows))

@@ -21,7 +21,7 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import Trial, Trials
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -151,9 +151,11 @@ class MotionPlannerMethod:
 
     name = "motion planner (OMPL)"
 
-    def __init__(self, trial: Trial, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
-        self._trial = trial
-        self._planner = MotionPlanner(trial.task, seed=seed, budget=budget)
+    def __init__(
+        self, simulation: SceneSimulation, *, seed: int = 1, budget: MotionPlannerBudget | None = None
+    ) -> None:
+        self._simulation = simulation
+        self._planner = MotionPlanner(simulation.task, seed=seed, budget=budget)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return plans as rows, see :class:`~viapoint.training.planners.baselines.Method`."""
@@ -166,7 +168,7 @@ class MotionPlannerMethod:
             row[2 : 2 + vias.size] = vias.ravel()
         return rows
 
-    def execute(self, scenes: Scenes, decisions: Float) -> Trials:
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Simulate the plans; those with equally many via-points run together."""
         d, counts = scenes.start.shape[-1], decisions[:, 0].astype(np.int64)
         reward, info = np.zeros(len(decisions)), dict[str, NDArray[Any]]()
@@ -176,11 +178,11 @@ class MotionPlannerMethod:
             vias = decisions[rows, 2 : 2 + count * d].reshape(len(rows), count, d)
             waypoints = np.concatenate((some.start[:, None], vias, some.goal[:, None]), axis=1)
             durations = np.asarray(primitives.passage_durations(waypoints, decisions[rows, 1]))
-            result = self._trial.execute_plan(some, Plan(waypoints, durations))
+            result = self._simulation.execute_plan(some, Plan(waypoints, durations))
             reward[rows] = result.reward
             for name, values in result.info.items():
                 info.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
-        return Trials(reward, info)
+        return SimulationResults(reward, info)
 
 
 def points_on(path: Float, count: int) -> Float:

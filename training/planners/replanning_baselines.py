@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.training.rollouts.rollout import OnlineTrial, Trials
+from viapoint.training.rollouts.rollout import EpisodeSimulation, SimulationResults
 from viapoint.training.search.candidates import sobol_actions
 from viapoint.training.search.planned_movements import plan_movements
 
@@ -29,37 +29,37 @@ class OpenLoopBaseline:
 
     Args:
         method: Method that decides.
-        trial: Simulation of the environment.
+        simulation: Simulation of the environment.
     """
 
-    def __init__(self, method: Any, trial: OnlineTrial) -> None:
+    def __init__(self, method: Any, simulation: EpisodeSimulation) -> None:
         self.name, self._method = f"{method.name}, no revision", method
-        self._trial = OnlineTrial(trial.env_id, 250, **{**trial.kwargs, "decide_at": ()})
+        self._simulation = EpisodeSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
         """Return the decision of the method, see :class:`viapoint.training.planners.baselines.Method`."""
         decisions: Float = self._method.decide(observation, scenes)
         return decisions
 
-    def execute(self, scenes: Any, decisions: Float) -> Trials:
+    def execute(self, scenes: Any, decisions: Float) -> SimulationResults:
         """Simulate one movement in each scene; it fails where the target has changed by its end."""
-        return self._trial.first(scenes, decisions)
+        return self._simulation.first(scenes, decisions)
 
 
-class OnlinePlanner:
+class ReplanningPlanner:
     """Planner that searches the smoothest clear plan in every decision, with the future motion of the obstacles known.
 
     The search is among the same actions; plans are computed, not simulated.
 
     Args:
-        trial: Simulation of the environment.
+        simulation: Simulation of the environment.
         seed: Seed of the search.
     """
 
     name = "planner, knows all courses"
 
-    def __init__(self, trial: OnlineTrial, seed: int = 0) -> None:
-        self._task, self._limit = trial.task, trial.time_limit
+    def __init__(self, simulation: EpisodeSimulation, seed: int = 0) -> None:
+        self._task, self._limit = simulation.task, simulation.time_limit
         self._generator = np.random.default_rng(seed)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:

@@ -15,7 +15,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.evaluation.evaluator import MethodResult
 from viapoint.training.io.files import write_bytes, write_json
 from viapoint.training.plotting.gallery import Entry, gallery
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 
 MAX_GRAZE = 0.005
@@ -127,11 +127,11 @@ def _another_succeeds(
         return None
     if not number:
         return np.zeros(0, dtype=bool)
-    trial = Trial(env_id, **env_kwargs)
-    actions = proposals(agent.policy, trial.observe(scenes))
+    simulation = SceneSimulation(env_id, **env_kwargs)
+    actions = proposals(agent.policy, simulation.observe(scenes))
     every = scenes.take(np.repeat(np.arange(number), actions.shape[1]))
-    success = trial(every, actions.reshape(-1, actions.shape[-1])).success
-    trial.close()
+    success = simulation(every, actions.reshape(-1, actions.shape[-1])).success
+    simulation.close()
     return np.asarray(success.reshape(number, -1).any(axis=-1))
 
 

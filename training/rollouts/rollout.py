@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import ONLINE_TASKS, check_registered
+from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
-class Trials(NamedTuple):
+class SimulationResults(NamedTuple):
     """Results of N simulated actions or episodes, shape (N,) each."""
 
     reward: Float
@@ -31,13 +31,13 @@ class Trials(NamedTuple):
         return np.asarray(self.info["is_success"], dtype=bool)
 
     @classmethod
-    def concatenate(cls, pieces: Sequence[Trials]) -> Trials:
+    def concatenate(cls, pieces: Sequence[SimulationResults]) -> SimulationResults:
         """Join the results of several batches."""
         info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
         return cls(np.concatenate([piece.reward for piece in pieces]), info)
 
 
-class Trial:
+class SceneSimulation:
     """Simulation of actions in given scenes, `num_envs` at a time.
 
     Args:
@@ -66,27 +66,31 @@ class Trial:
         joints = np.asarray(self.task.arm.inverse_kinematics(scenes.start))
         return self.task.observation.observe(joints, scenes.start, scenes)
 
-    def __call__(self, scenes: Scenes, actions: Float) -> Trials:
+    def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
         """Simulate one action in each of N scenes, N at least 1."""
         return self._simulate(scenes, (actions,), lambda env, some: env.execute_actions(some))
 
-    def play(self, method: Any, scenes: Scenes, decisions: Float) -> Trials:
+    def play(self, method: Any, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Simulate the decisions of a method in N scenes, by its own `execute` if it has one."""
-        trials: Trials = getattr(method, "execute", self)(scenes, decisions)
-        return trials
+        results: SimulationResults = getattr(method, "execute", self)(scenes, decisions)
+        return results
 
-    def execute_plan(self, scenes: Scenes, plan: Plan) -> Trials:
+    def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
         return self._simulate(scenes, plan, lambda env, *some: env.execute_plan(Plan(*some)))
 
-    def _simulate(self, scenes: Scenes, arrays: tuple[Float, ...], act: Callable[..., Decision]) -> Trials:
+    def _simulate(
+        self, scenes: Scenes, arrays: tuple[Float, ...], act: Callable[..., Decision]
+    ) -> SimulationResults:
         pieces = []
         for rows, env in self._groups(len(arrays[0])):
             env.reset(options=_filled(scenes.take(rows), env.num_envs).as_options())
             _, reward, info = act(env, *(repeated(each[rows], env.num_envs) for each in arrays))
             number = rows.stop - rows.start
-            pieces.append(Trials(reward[:number], {name: value[:number] for name, value in info.items()}))
-        return Trials.concatenate(pieces)
+            pieces.append(
+                SimulationResults(reward[:number], {name: value[:number] for name, value in info.items()})
+            )
+        return SimulationResults.concatenate(pieces)
 
     def _groups(self, number: int) -> Iterator[tuple[slice, Any]]:
         """Yield rows of scenes with the smallest vector environment that takes them."""
@@ -105,7 +109,7 @@ def repeated(values: Float, number: int) -> Float:
     return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))
 
 
-class OnlineTrial(Trial):
+class EpisodeSimulation(SceneSimulation):
     """Simulation of whole episodes in given scenes, `num_envs` at a time.
 
     Args:
@@ -137,22 +141,24 @@ class OnlineTrial(Trial):
             pieces.append({name: part[: rows.stop - rows.start] for name, part in observation.items()})
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def __call__(self, scenes: Any, actions: Float) -> Trials:
+    def __call__(self, scenes: Any, actions: Float) -> SimulationResults:
         """Play episodes that begin with one action in each of N scenes; all later actions are zero."""
         return self._play(scenes, actions, None)
 
-    def first(self, scenes: Any, actions: Float) -> Trials:
+    def first(self, scenes: Any, actions: Float) -> SimulationResults:
         """Simulate one decision in each of N scenes."""
         return self._play(scenes, actions, None, single_decision=True)
 
-    def play(self, method: Any, scenes: Any, decisions: Float) -> Trials:
+    def play(self, method: Any, scenes: Any, decisions: Float) -> SimulationResults:
         """Play episodes that begin with the decisions of a method; it makes every later decision, too."""
         if hasattr(method, "execute"):
             return super().play(method, scenes, decisions)
         return self._play(scenes, decisions, method)
 
-    def _play(self, scenes: Any, actions: Float, method: Any, *, single_decision: bool = False) -> Trials:
-        return Trials.concatenate(
+    def _play(
+        self, scenes: Any, actions: Float, method: Any, *, single_decision: bool = False
+    ) -> SimulationResults:
+        return SimulationResults.concatenate(
             [
                 _episodes(env, scenes.take(rows), actions[rows], method, single_decision)
                 for rows, env in self._groups(len(scenes.start))
@@ -160,12 +166,14 @@ class OnlineTrial(Trial):
         )
 
 
-def new_trial(env_id: str, num_envs: int = 512, **kwargs: Any) -> Trial:
+def new_simulation(env_id: str, num_envs: int = 512, **kwargs: Any) -> SceneSimulation:
     """Return the simulation that an environment needs: of actions, or of whole episodes with replanning."""
-    return (OnlineTrial if env_id in ONLINE_TASKS else Trial)(env_id, num_envs, **kwargs)
+    return (EpisodeSimulation if env_id in REPLANNING_TASKS else SceneSimulation)(env_id, num_envs, **kwargs)
 
 
-def _episodes(env: Any, scenes: Any, first_actions: Float, method: Any, single_decision: bool) -> Trials:
+def _episodes(
+    env: Any, scenes: Any, first_actions: Float, method: Any, single_decision: bool
+) -> SimulationResults:
     """Play one episode in each scene; environments that have ended go on with others, which do not count."""
     number, size = len(first_actions), env.num_envs
     env.reset(options=_filled(scenes, size).as_options())
@@ -185,7 +193,7 @@ def _episodes(env: Any, scenes: Any, first_actions: Float, method: Any, single_d
             seen = {name: part[rows] for name, part in observation.items()}
             actions[rows] = method.decide(seen, scenes.take(rows))
     last["decisions"], last["duration"] = decisions, last["time"]
-    return Trials(reward, last)
+    return SimulationResults(reward, last)
 
 
 def _filled(scenes: Any, number: int) -> Any:

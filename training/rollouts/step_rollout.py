@@ -13,10 +13,10 @@ from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import STEP_TASKS, twin_of
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import Trials
+from viapoint.training.rollouts.rollout import SimulationResults
 
 if TYPE_CHECKING:
-    from viapoint.envs.velocity_env import StepReachVectorEnv
+    from viapoint.envs.velocity_env import VelocityVectorEnv
 
 
 def is_step_wise(env_id: str) -> bool:
@@ -50,7 +50,7 @@ class StepAgentMethod:
 
     def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
         self.name, self._model, self._env_id, self._kwargs = name, model, env_id, dict(env_kwargs)
-        self._envs: dict[int, StepReachVectorEnv] = {}
+        self._envs: dict[int, VelocityVectorEnv] = {}
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
@@ -61,7 +61,7 @@ class StepAgentMethod:
         actions, _ = self._model.predict(observation, deterministic=True)
         return np.asarray(actions, dtype=np.float64)
 
-    def execute(self, scenes: Scenes, decisions: Float) -> Trials:
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Play every episode to its end, beginning with the given actions."""
         env = self._env(len(decisions))
         env.reset(options=scenes.as_options())
@@ -73,9 +73,9 @@ class StepAgentMethod:
             last = {name: np.where(running, now, last.get(name, now)) for name, now in info.items()}
             running &= ~(env.terminated | env.truncated)
             decisions = self.decide(observation, scenes)
-        return Trials(reward, last)
+        return SimulationResults(reward, last)
 
-    def _env(self, number: int) -> StepReachVectorEnv:
+    def _env(self, number: int) -> VelocityVectorEnv:
         if number not in self._envs:
             env: Any = gym.make_vec(self._env_id, num_envs=number, **self._kwargs)
             self._envs[number] = env

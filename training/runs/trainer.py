@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.training.algorithms.model_io import build
 from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
@@ -158,7 +158,7 @@ def _check_reports_duration(config: TrainConfig) -> None:
     if ELAPSED not in infos[0]:
         raise ValueError(
             f"discount_unit must be left out for {config.env}: its info does not tell as {ELAPSED!r} how long a "
-            f"decision took; that of {', '.join(ONLINE_TASKS)} does"
+            f"decision took; that of {', '.join(REPLANNING_TASKS)} does"
         )
 
 

@@ -24,11 +24,11 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.mdp.task import Task, family_sampler
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.replanning import SIZES as REPLANNING_SIZES
 from viapoint.training.scene_sets.replanning import make_replanning
 from viapoint.training.scene_sets.scene_search import Kinds, Source, measured, redrawn, search
@@ -58,7 +58,7 @@ SETS = {
     "viapoint/PandaObstacles-v0": ALL,
 }
 """Environments without replanning that have shipped scenes, and their sets."""
-ALL_SETS = {**SETS, **dict.fromkeys(ONLINE_TASKS, ALL[:2])}
+ALL_SETS = {**SETS, **dict.fromkeys(REPLANNING_TASKS, ALL[:2])}
 """All environments that have shipped scenes, and their sets."""
 
 
@@ -119,14 +119,16 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
     Raises:
         RuntimeError: Scenes of some kind are too rare.
     """
-    trial = Trial(env_id, threads=threads)
-    size = size or (SIZES[name] if trial.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
-    parts = lots(trial.task, name, size)
+    simulation = SceneSimulation(env_id, threads=threads)
+    size = size or (SIZES[name] if simulation.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
+    parts = lots(simulation.task, name, size)
     found = [
-        search(trial, lot.source, lot.kinds, seed=lot.seed, label=f"{env_id} {name} {lot.family}".strip())
+        search(
+            simulation, lot.source, lot.kinds, seed=lot.seed, label=f"{env_id} {name} {lot.family}".strip()
+        )
         for lot in parts
     ]
-    trial.close()
+    simulation.close()
     order = np.arange(size).reshape(len(parts), -1).T.ravel()  # families in turn
     return FrozenScenes(
         name=name,
@@ -149,17 +151,17 @@ def remake(frozen: FrozenScenes, threads: int = 0) -> FrozenScenes:
     Raises:
         RuntimeError: A stored solution fails.
     """
-    trial = Trial(frozen.env_id, threads=threads)
+    simulation = SceneSimulation(frozen.env_id, threads=threads)
     starts, goals, obstacles, share = (array.copy() for array in (*frozen.scenes, frozen.share))
-    for lot in lots(trial.task, frozen.name, len(frozen.share)):
+    for lot in lots(simulation.task, frozen.name, len(frozen.share)):
         rows = np.flatnonzero(frozen.family == lot.family)
         scenes = redrawn(lot.source, frozen.number[rows])
         Scenes(starts, goals, obstacles).put(rows, scenes)
         label = f"{frozen.env_id} {frozen.name} {lot.family}".strip()
-        share[rows] = measured(trial, scenes, lot.seed, label)
+        share[rows] = measured(simulation, scenes, lot.seed, label)
     again = dataclasses.replace(frozen, scenes=Scenes(starts, goals, obstacles), share=share)
-    solved = trial(again.scenes, again.solution).success
-    trial.close()
+    solved = simulation(again.scenes, again.solution).success
+    simulation.close()
     if not solved.all():
         raise RuntimeError(
             f"{frozen.env_id} {frozen.name}: the solution of scene {int((~solved).argmax())} fails"
@@ -247,7 +249,7 @@ def main() -> None:
 
 def _made(env_id: str, name: str, *, search_anew: bool, threads: int) -> FrozenScenes:
     """Return a set: searched anew, or drawn again by the numbers of its scenes."""
-    if env_id in ONLINE_TASKS:
+    if env_id in REPLANNING_TASKS:
         return make_replanning(env_id, name, REPLANNING_SIZES[name])
     before = None if search_anew else shipped(name, env_id)
     return make(env_id, name, threads=threads) if before is None else remake(before, threads=threads)

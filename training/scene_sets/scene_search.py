@@ -15,7 +15,7 @@ from viapoint.envs.common.types import Float, Int
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.planners.difficulty import planned_share, solution_share
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 
 SPARE, SAFE = 1.2, 1.1
 """Factors on the number of scenes that are taken by their estimated share, and on this estimate, as it errs."""
@@ -63,12 +63,18 @@ class Found(NamedTuple):
 
 
 def search(
-    trial: Trial, source: Source, kinds: Kinds, *, seed: int, label: str, most_drawn: int = MOST_DRAWN
+    simulation: SceneSimulation,
+    source: Source,
+    kinds: Kinds,
+    *,
+    seed: int,
+    label: str,
+    most_drawn: int = MOST_DRAWN,
 ) -> Found:
     """Return the first scenes of each kind that random actions and the planner solve.
 
     Args:
-        trial: Simulation.
+        simulation: Simulation.
         source: Source of the scenes; the result depends on it and the seed alone.
         kinds: Kinds to search for.
         seed: Seed of the random actions.
@@ -78,9 +84,9 @@ def search(
     Raises:
         RuntimeError: One kind is too rare.
     """
-    pool = _Pool(trial, source, kinds, most_drawn)
+    pool = _Pool(simulation, source, kinds, most_drawn)
     scenes, share, number = pool.empty, np.zeros(0), np.zeros(0, dtype=np.int64)
-    solution, tried, failed = np.zeros((0, trial.task.action.size)), np.zeros(0, bool), np.zeros(0, bool)
+    solution, tried, failed = np.zeros((0, simulation.task.action.size)), np.zeros(0, bool), np.zeros(0, bool)
     for _ in range(MOST_ROUNDS):
         good = np.where((share > 0.0) & ~failed, kinds.of_share(share), -1)
         chosen = _first(good, kinds)
@@ -89,12 +95,12 @@ def search(
             if not len(untried):
                 return Found(scenes.take(chosen), share[chosen], solution[chosen], number[chosen])
             tried[untried] = True
-            solution[untried], solved = _planned(trial, scenes.take(untried), label)
+            solution[untried], solved = _planned(simulation, scenes.take(untried), label)
             failed[untried] = ~solved
             continue
         more, numbers = pool.more(kinds.quota - _counts(good, kinds))
         scenes, number = _joined(scenes, more), np.concatenate((number, numbers))
-        share = np.concatenate((share, measured(trial, more, seed, label)))
+        share = np.concatenate((share, measured(simulation, more, seed, label)))
         solution = np.concatenate((solution, np.zeros((len(more.start), solution.shape[1]))))
         tried, failed = (np.concatenate((each, np.zeros(len(more.start), bool))) for each in (tried, failed))
     missing = kinds.quota - _counts(good, kinds)
@@ -118,8 +124,8 @@ def redrawn(source: Source, number: Int) -> Scenes:
 class _Pool:
     """Pool of scenes that are drawn but not measured, with their estimated kinds."""
 
-    def __init__(self, trial: Trial, source: Source, kinds: Kinds, most_drawn: int) -> None:
-        self._trial, self._source, self._kinds, self._most_drawn = trial, source, kinds, most_drawn
+    def __init__(self, simulation: SceneSimulation, source: Source, kinds: Kinds, most_drawn: int) -> None:
+        self._simulation, self._source, self._kinds, self._most_drawn = simulation, source, kinds, most_drawn
         self._scenes = self.empty = source.draw(0)
         self._kind = self._number = np.zeros(0, dtype=np.int64)
         self._drawn = 0
@@ -147,23 +153,26 @@ class _Pool:
 
     def _estimate(self, scenes: Scenes) -> Float:
         """Return planned shares, more exact where they are small, shape (N,)."""
-        share = planned_share(self._trial, scenes, draws=256)
+        share = planned_share(self._simulation, scenes, draws=256)
         for below, draws in self._source.levels:
             for row in np.flatnonzero(share < below):
-                share[row] = planned_share(self._trial, scenes.take([row]), seed=draws, draws=draws)[0]
+                share[row] = planned_share(self._simulation, scenes.take([row]), seed=draws, draws=draws)[0]
         return share
 
 
-def measured(trial: Trial, scenes: Scenes, seed: int, label: str) -> Float:
+def measured(simulation: SceneSimulation, scenes: Scenes, seed: int, label: str) -> Float:
     """Return solution shares, shape (N,)."""
     return np.concatenate(
-        [solution_share(trial, scenes.take(rows), seed=seed) for rows in _lots(scenes, f"{label}: shares")]
+        [
+            solution_share(simulation, scenes.take(rows), seed=seed)
+            for rows in _lots(scenes, f"{label}: shares")
+        ]
     )
 
 
-def _planned(trial: Trial, scenes: Scenes, label: str) -> tuple[Float, NDArray[np.bool_]]:
+def _planned(simulation: SceneSimulation, scenes: Scenes, label: str) -> tuple[Float, NDArray[np.bool_]]:
     """Return the planner's actions, and which of them are solutions."""
-    planner = Planner(trial, budget=QUICK if trial.task.arm.dimension == 3 else None)
+    planner = Planner(simulation, budget=QUICK if simulation.task.arm.dimension == 3 else None)
     planned = [planner(scenes.take(rows)) for rows in _lots(scenes, f"{label}: planner")]
     return np.concatenate([p.action for p in planned]), np.concatenate([p.success for p in planned])
 

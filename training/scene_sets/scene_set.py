@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.registration import ONLINE_TASKS, OWN_ARM_TASKS
+from viapoint.envs.registration import OWN_ARM_TASKS, REPLANNING_TASKS
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import new_trial
+from viapoint.training.rollouts.rollout import new_simulation
 
 SETS = ("validation", "test", "hard")
 """Names of the sets; an environment need not have all."""
@@ -199,7 +199,7 @@ NUMBERS = {"validation": 500, "test": 1_000}
 
 def scene_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of an environment that its scenes depend on."""
-    others = ACTION_ARGUMENTS if env_id in ONLINE_TASKS else ACTION_ARGUMENTS | {"duration_range"}
+    others = ACTION_ARGUMENTS if env_id in REPLANNING_TASKS else ACTION_ARGUMENTS | {"duration_range"}
     return {name: value for name, value in env_kwargs.items() if name not in others}
 
 
@@ -210,15 +210,15 @@ def frozen_fit(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> bool:
 
 def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) -> FrozenScenes:
     """Draw a set without shares and solutions; equal arguments give equal scenes."""
-    trial = new_trial(env_id, 64 if env_id in ONLINE_TASKS else 1, **env_kwargs)
-    scenes = trial.draw(number, SEEDS[name])
-    trial.close()
+    simulation = new_simulation(env_id, 64 if env_id in REPLANNING_TASKS else 1, **env_kwargs)
+    scenes = simulation.draw(number, SEEDS[name])
+    simulation.close()
     return FrozenScenes(
         name="drawn",
         env_id=env_id,
         scenes=scenes,
         share=np.full(number, np.nan),
-        solution=np.zeros((number, trial.task.action.size)),
+        solution=np.zeros((number, simulation.task.action.size)),
     )
 
 
@@ -248,9 +248,9 @@ def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) ->
 
 def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
     """Raise ValueError if the scenes of a file have another shape than those of the environment."""
-    trial = new_trial(frozen.env_id, 1, **env_kwargs)
-    layout = trial.task.observation
-    trial.close()
+    simulation = new_simulation(frozen.env_id, 1, **env_kwargs)
+    layout = simulation.task.observation
+    simulation.close()
     mine, theirs = (
         (layout.n_rows, layout.dimension),
         (frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]),

@@ -53,7 +53,7 @@ def plan_movements(
     """Compute the movements that actions stand for.
 
     From rest they are those of :meth:`~viapoint.envs.actions.via_points.ActionLayout.decode`; where a movement may be
-    under way (see :func:`is_replanning`) those of :class:`~viapoint.envs.actions.replanning.Reviser`.
+    under way (see :func:`is_replanning`) those of :class:`~viapoint.envs.actions.replanning.ReplanningDecoder`.
 
     Args:
         observation: Parts of B observations, shape (B, .) each.
@@ -180,7 +180,7 @@ def _kernel(tau: Numbers, tau1: Numbers) -> Numbers:
 
 
 def _revised(observation: Observation, actions: Numbers, task: Task, fractions: Numbers) -> PlannedMovements:
-    """Compute movements from the present motion, see :class:`viapoint.envs.actions.replanning.Reviser`."""
+    """Compute movements from the present motion, see :class:`viapoint.envs.actions.replanning.ReplanningDecoder`."""
     layout = task.action
     seen = {name: observation[name].astype(np.float64)[:, None] for name in REVISED_PARTS}
     line = direction(observation).astype(np.float64)[:, None]

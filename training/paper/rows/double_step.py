@@ -6,7 +6,7 @@ of revision s on a second one, from the first target A to the second B, is added
 
     x(t) = x0 + (A - x0) q(t / T) + (B - A) q((t - s) / R),   q(u) = 10 u^3 - 15 u^4 + 6 u^5 in [0, 1], constant beyond
 
-The online plan is the one movement of minimum jerk from the state at s to B. Both have the same state at s and are at
+The new plan is the one movement of minimum jerk from the state at s to B. Both have the same state at s and are at
 rest at B at s + R. If s + R = T both are one quintic with the same six boundary values, so they are the same. If
 s + R > T, subtract the second movement from both: what remains of the sum reaches A at T and waits there, what
 remains of the plan takes the time there is. So the two differ along the first movement alone, by what neither size nor
@@ -42,7 +42,7 @@ class DoubleStep(NamedTuple):
     first: Trajectory
     second: Trajectory
     """Movement that is added at the revision, on its own clock."""
-    online: Trajectory
+    replanned: Trajectory
     """Plan from the revision on, on its own clock."""
     moment: float
     """Moment of revision, [s]."""
@@ -60,7 +60,7 @@ class DoubleStep(NamedTuple):
     def planned(self, time: Float, nu: int = 0) -> Float:
         """Return the plan with its revision, derivative of order `nu`, shape (T, 2)."""
         later = (time >= self.moment)[:, None]
-        return np.asarray(np.where(later, self.online(time - self.moment, nu), self.first(time, nu)))
+        return np.asarray(np.where(later, self.replanned(time - self.moment, nu), self.first(time, nu)))
 
     def cost(self, way: str) -> float:
         """Return half the integral of squared jerk after the revision, [m^2/s^5]; `way` is superposed or planned."""
@@ -228,13 +228,13 @@ def _rest_cost(distance: float, state: Float, time: float) -> float:
     return float(square / (2.0 * time**5))
 
 
-def online_claims(seed: int = 0) -> list[Claim]:
+def replanning_claims(seed: int = 0) -> list[Claim]:
     """Return the claims of row 11: the quintic of the primer, and replanning."""
     movement = double_step(SWITCH, duration=WHOLE_DURATION)
     state = movement.first.sample(np.array([SWITCH]))
     fresh = _solved(state, target("T5"), DURATION)
-    apart = np.abs(fresh - movement.online.sample(201, 0)[0]).max()
-    begun = movement.online.sample(np.array([0.0]))
+    apart = np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
+    begun = movement.replanned.sample(np.array([0.0]))
     jumps = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(state, begun, strict=True)]
     motion = simulate_double(movement)
     missed = float(np.linalg.norm(motion.hand[1, -1] - target("T5")))

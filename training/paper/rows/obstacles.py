@@ -23,7 +23,7 @@ from viapoint.training.paper.rows.timing import FAST, SLOW
 from viapoint.training.paper.simulated import SimulatedMovements, simulate
 from viapoint.training.planners.baselines import Method, agent_method
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
-from viapoint.training.rollouts.rollout import Trial
+from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)
 """Lengths of the rows of lights, [m]; the paper's were up to 25 cm."""
@@ -66,15 +66,15 @@ def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes
 def decide(agent: Path | None) -> ObstacleMovements:
     """Simulate the agent of a run folder, the shipped one, or else the planner, around the rows of lights."""
     scenes = light_scenes()
-    method, trial = _method(agent)
-    check_scenes(scenes, trial.task.collision_model)
-    action = method.decide(trial.observe(_padded(scenes, trial)), _padded(scenes, trial))
-    success = trial(scenes, action).success
-    trial.close()
+    method, simulation = _method(agent)
+    check_scenes(scenes, simulation.task.collision_model)
+    action = method.decide(simulation.observe(_padded(scenes, simulation)), _padded(scenes, simulation))
+    success = simulation(scenes, action).success
+    simulation.close()
     if not success.any():
         raise ValueError(f"{method.name} gets around none of {len(scenes.start)} rows of lights")
     kept = scenes.take(success)
-    plan = trial.task.action.decode(action[success], kept.start, kept.goal)
+    plan = simulation.task.action.decode(action[success], kept.start, kept.goal)
     movement = plan.trajectory()
     motion = simulate(movement)
     number = range(int(success.sum()))
@@ -98,12 +98,12 @@ def check_agent(agent: Path) -> None:
         )
 
 
-def _method(agent: Path | None) -> tuple[Method, Trial]:
+def _method(agent: Path | None) -> tuple[Method, SceneSimulation]:
     if agent is not None or _is_shipped():
         found = load_agent(agent or DEFAULT_ENV)
-        return agent_method("agent", found, 0), Trial(found.env_id, 256, **found.env_kwargs)
-    trial = Trial(DEFAULT_ENV, 256)
-    return Planner(trial, budget=BUDGET), trial
+        return agent_method("agent", found, 0), SceneSimulation(found.env_id, 256, **found.env_kwargs)
+    simulation = SceneSimulation(DEFAULT_ENV, 256)
+    return Planner(simulation, budget=BUDGET), simulation
 
 
 def _is_shipped() -> bool:
@@ -114,9 +114,9 @@ def _is_shipped() -> bool:
     return True
 
 
-def _padded(scenes: Scenes, trial: Trial) -> Scenes:
+def _padded(scenes: Scenes, simulation: SceneSimulation) -> Scenes:
     """Return scenes with as many obstacle rows as the observation; the added ones are absent."""
-    most = trial.task.scenes.n_obstacles[1]
+    most = simulation.task.scenes.n_obstacles[1]
     missing = most - scenes.obstacles.shape[1]
     return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
 

@@ -9,12 +9,12 @@ from revised import DT, GOAL, JUMP, MOVING, NO_ROWS, OTHER, START, make, play
 
 from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.registration import ONLINE_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.sim.replan_triggers import Event
 from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK, groups_of, jerk_cost_between
 
 
-@pytest.mark.parametrize("env_id", ONLINE_TASKS)
+@pytest.mark.parametrize("env_id", REPLANNING_TASKS)
 def test_position_velocity_and_acceleration_do_not_jump_at_a_revision(env_id):
     env, revisions = gym.make(env_id, horizon=0.1).unwrapped, 0
     for seed in range(12):

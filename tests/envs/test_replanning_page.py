@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-from viapoint.envs.mdp.rewards import OnlineRewardWeights
-from viapoint.envs.registration import ONLINE_TASKS
-from viapoint.envs.replanning_env import OnlineReachVectorEnv
+from viapoint.envs.mdp.rewards import ReplanningRewardWeights
+from viapoint.envs.registration import REPLANNING_TASKS
+from viapoint.envs.replanning_env import ReplanningVectorEnv
 from viapoint.envs.scenes.dynamic_scene import FASTEST, MOST_JUMPS
 from viapoint.envs.scenes.motion import ChangeDistribution
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.envs.sim.replan_triggers import FORESIGHT, LOOK, SAMPLED, Event
 from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK
 
-PAGE = (Path(__file__).parents[2] / "docs" / "environments-online.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "environments-replanning.md").read_text(encoding="utf-8")
 WORDS = " ".join(PAGE.split())
 
 
@@ -46,7 +46,7 @@ def test_every_id_is_listed_with_what_it_sets():
     told = {row[0]: row[2] for row in table("# Plans revised on the way")}
     assert told == {
         name: ", ".join(f"{k}={v if k == 'arm' else repr(v)}" for k, v in kwargs.items())
-        for name, kwargs in ONLINE_TASKS.items()
+        for name, kwargs in REPLANNING_TASKS.items()
     }
 
 
@@ -57,7 +57,7 @@ def test_action_space(env):
         [str(i), name, unit] for i, (name, unit) in enumerate(zip(layout.names, layout.units, strict=True))
     ]
     panda = gym.make("viapoint/PandaMovingObstacles-v0").unwrapped
-    least = f"{env.reviser.least_remaining:g} s ({panda.reviser.least_remaining:g} s"
+    least = f"{env.decoder.least_remaining:g} s ({panda.decoder.least_remaining:g} s"
     assert WORDS.count(least) == 2
     assert f"within {MIN_GOAL_DISTANCE} m of it" in WORDS
     assert f"centre duration ({layout.centre_duration:.4g} s)" in WORDS
@@ -73,13 +73,13 @@ def test_observation_space(env):
         for told, side in zip(sides, (box.low, box.high), strict=True):
             one = [float(number) for number in told.split(",")]
             np.testing.assert_allclose(side, np.resize(one, side.shape), atol=1e-4)
-    limits = {i: gym.make(i).unwrapped.batch.time_limit for i in ONLINE_TASKS}
+    limits = {i: gym.make(i).unwrapped.batch.time_limit for i in REPLANNING_TASKS}
     assert f"{limits['viapoint/PlanarTargetJump-v0']:g} s in `PlanarTargetJump`" in WORDS
     assert f"{limits['viapoint/PandaMovingObstacles-v0']:g} s in `PandaMovingObstacles`" in WORDS
 
 
 def test_rewards(env):
-    weights = OnlineRewardWeights()
+    weights = ReplanningRewardWeights()
     assert {row[0]: float(row[1]) for row in table("## Rewards")} == {
         name: getattr(weights, name) for name in weights.__dict__
     }
@@ -116,7 +116,7 @@ def test_episode_end():
 
 
 def test_arguments():
-    parameters = inspect.signature(OnlineReachVectorEnv).parameters
+    parameters = inspect.signature(ReplanningVectorEnv).parameters
     code = {n: p.default for n, p in parameters.items() if n not in ("self", "num_envs", "unknown")}
     stated = {row[0]: row[1] for row in table("## Arguments")}
     assert set(stated) == set(code)

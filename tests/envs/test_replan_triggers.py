@@ -41,7 +41,7 @@ def test_a_resting_hand_may_set_out_again():
     *_, terminated, _, info = env.step(np.array([0.0, 0.5, 0.4], np.float32))
     assert terminated
     assert info["is_success"]
-    least, (low, high) = env.reviser.least_remaining, env.action_layout.duration_range
+    least, (low, high) = env.decoder.least_remaining, env.action_layout.duration_range
     assert env.last_plan.durations.sum() == pytest.approx(least * (high / low) ** 0.2)
     assert np.linalg.norm(env.last_rollout.hand[600:] - GOAL, axis=-1).max() > 0.1
 

@@ -8,7 +8,7 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json
 from viapoint.training.planners.baselines import make_method
-from viapoint.training.rollouts.rollout import OnlineTrial, Trial, new_trial
+from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.replanning import SIZES, solution_shares
@@ -25,8 +25,8 @@ def results(env_id, *names, number=12):
 
 
 def test_the_trial_is_of_the_kind_that_an_environment_needs():
-    assert isinstance(new_trial(MOVING, 2), OnlineTrial)
-    assert type(new_trial("viapoint/PlanarReach-v0", 2)) is Trial
+    assert isinstance(new_simulation(MOVING, 2), EpisodeSimulation)
+    assert type(new_simulation("viapoint/PlanarReach-v0", 2)) is SceneSimulation
 
 
 def test_the_planner_solves_frozen_scenes_and_straight_movements_do_not():
@@ -41,18 +41,18 @@ def test_a_jumping_target_is_reached_by_revision_only():
 
 
 def test_an_episode_is_the_same_alone_and_among_others():
-    trial = OnlineTrial(MOVING, 8)
-    scenes = trial.draw(11, seed=4)
-    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, trial.task.action.size))
-    together = trial(scenes, actions)
+    simulation = EpisodeSimulation(MOVING, 8)
+    scenes = simulation.draw(11, seed=4)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, simulation.task.action.size))
+    together = simulation(scenes, actions)
     for row in (0, 7, 10):
-        alone = trial(scenes.take([row]), actions[[row]])
+        alone = simulation(scenes.take([row]), actions[[row]])
         for name, value in alone.info.items():
             np.testing.assert_array_equal(value[0], together.info[name][row])
 
 
 def test_drawn_scenes_are_the_same_for_the_same_seed():
-    one, other = (OnlineTrial(MOVING, size).draw(5, seed=9) for size in (3, 70))
+    one, other = (EpisodeSimulation(MOVING, size).draw(5, seed=9) for size in (3, 70))
     for mine, theirs in zip(one, other, strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
@@ -64,8 +64,10 @@ def test_shipped_sets_hold_what_they_promise(env_id):
         assert len(frozen.share) == size
         assert len(np.unique(frozen.number)) == size
         if env_id == MOVING:
-            trial, some = OnlineTrial(env_id, 4), frozen.take(slice(0, 4))
-            np.testing.assert_allclose(solution_shares(trial, some.scenes)[:1], some.share[:1], atol=1e-3)
+            simulation, some = EpisodeSimulation(env_id, 4), frozen.take(slice(0, 4))
+            np.testing.assert_allclose(
+                solution_shares(simulation, some.scenes)[:1], some.share[:1], atol=1e-3
+            )
 
 
 def test_files_of_changing_scenes_come_back_whole(tmp_path):
