@@ -14,9 +14,10 @@ from study.plan import ABLATIONS, FREEDOM, FREEDOM_LABELS, WHOLE, Cell, Study, V
 from viapoint.envs.common.types import Bool
 from viapoint.training.evaluation.statistics import across_seeds, mcnemar, probability_of_improvement
 from viapoint.training.io.files import read_json
+from viapoint.training.io.installed import versions
 from viapoint.training.planners.baselines import METHODS as BASELINE_METHODS
 from viapoint.training.plotting.failure_report import KINDS
-from viapoint.training.runs.run_dir import Run, versions
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 
 Numbers = dict[str, Any]

@@ -10,10 +10,8 @@ tensorboard/                      logs
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
-import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -36,10 +34,10 @@ from viapoint.training.io.files import (
     write_folder,
     write_json,
 )
+from viapoint.training.io.installed import versions
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
-PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
 MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """Fields that may differ when a run is resumed."""
@@ -255,14 +253,6 @@ def check_free(folder: Path) -> None:
 def _write_config(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, which makes a folder a run, without the arguments of one call."""
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that results depend on."""
-    return {
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in PACKAGES},
-    }
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:

@@ -20,9 +20,10 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.discount import ELAPSED
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
+from viapoint.training.io.installed import versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, versions
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged
 
 __all__ = [
     "TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train",

@@ -1,0 +1,78 @@
+"""Connection to a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Any
+
+SILENCE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_TQDM_PATCH_PRINT": "0"}
+"""Environment variables of Ray: it sends nothing to its authors."""
+LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+"""Environment variable that makes a Ray of this machine listen on 127.0.0.1 alone."""
+
+
+def import_ray() -> Any:
+    """Import Ray, which is not imported before it is used.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    for name, value in SILENCE.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+    except ImportError:
+        raise ImportError("Ray is not installed: pip install 'viapoint[cluster]'", name="ray") from None
+    return ray
+
+
+def connect(address: str | None = None, cpus: int | None = None) -> bool:
+    """Connect this process to a cluster, unless it is connected.
+
+    Args:
+        address: `ray://HOST:PORT`; None for the cluster of the environment variable RAY_ADDRESS, or without it for a
+            Ray of its own on this machine, which listens on 127.0.0.1 and ends with the process.
+        cpus: Number of cores that a Ray of its own may use; all by default.
+
+    Returns:
+        True if this call connected, so that the caller disconnects.
+
+    Raises:
+        ValueError: There is no cluster at this address.
+    """
+    ray = import_ray()
+    if address is None and ray.is_initialized():
+        return False
+    address = address or os.environ.get("RAY_ADDRESS")
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        for name, value in LOOPBACK.items():
+            os.environ.setdefault(name, value)
+        settings |= {"num_cpus": cpus, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    try:
+        if address is not None:
+            _check_listens(address)
+        ray.init(address=address, **settings)
+    except Exception as error:  # Ray has no common class for what may go wrong here
+        where = "on this machine" if address is None else f"at {address}"
+        text = " ".join(str(error).split())
+        raise ValueError(
+            f"no Ray cluster can be used {where} ({text}); start one with: ray start --head"
+        ) from error
+    return True
+
+
+def _check_listens(address: str) -> None:
+    """Check that something listens at an address, as Ray itself tries for minutes.
+
+    Raises:
+        ValueError: The address is not HOST:PORT.
+        OSError: Nothing listens there.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address in ("auto", "local"):
+        return
+    if not colon or not port.isdigit():
+        raise ValueError("it must be HOST:PORT")
+    socket.create_connection((host, int(port)), timeout=10.0).close()

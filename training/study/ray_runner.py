@@ -1,0 +1,268 @@
+"""Runner of jobs on a Ray cluster. Nodes need no common folder: the driver collects the files of all jobs.
+
+A job works in a temporary folder of its node. It begins with the files that the driver has, and each part of them that
+changes is sent to the driver within seconds. So a job that is lost with its node continues elsewhere from the last
+checkpoint that was written, and everything is in the folder of the driver when it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from filelock import FileLock, Timeout
+
+from viapoint.training.io.installed import installed
+from viapoint.training.io.ray_cluster import connect, import_ray
+from viapoint.training.study.folder_sync import Changes, Sender, pack, unpack
+from viapoint.training.study.job import LINEAR_ALGEBRA, Answer, Job, answer
+
+POLL = 0.5
+"""Time between two looks for files of running jobs, [s]."""
+QUEUED = 2
+"""Jobs that are handed to Ray for each core of the cluster, so that cores never wait and clusters may grow."""
+ONE_THREAD = {"runtime_env": {"env_vars": LINEAR_ALGEBRA}}
+"""Option of all functions that run on nodes; those with equal options share processes."""
+NODE_ID = "ray.io/node-id"
+"""Label that Ray gives to each node."""
+
+
+class Collector:
+    """Actor that holds files of jobs until the driver takes them."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[str, int, Changes]] = []
+
+    def put(self, job: str, attempt: int, changes: Changes) -> None:
+        """Take changes of a job."""
+        self._waiting.append((job, attempt, changes))
+
+    def take(self) -> list[tuple[str, int, Changes]]:
+        """Return what there is, once."""
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+
+class _Task(NamedTuple):
+    """Job that Ray runs."""
+
+    job: Job
+    attempt: int
+
+
+class RayRunner:
+    """Runner on a Ray cluster, see :func:`viapoint.training.study.runner.make_runner`.
+
+    Args:
+        root: Folder of the driver that the folders of jobs are in.
+        address: Address of the cluster; see :func:`viapoint.training.io.ray_cluster.connect`.
+        workers: Number of parallel jobs; all that fit by default.
+    """
+
+    def __init__(self, root: Path, address: str | None = None, workers: int | None = None) -> None:
+        if workers == 0:
+            raise ValueError("workers must be 1 or more on a cluster, got 0")
+        self._ray = import_ray()
+        self._root, self._workers = root, workers
+        self._connected = connect(address, workers)
+        self._full: set[str] = set()
+        try:
+            check_nodes()
+            from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+            here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
+            actor = self._ray.remote(num_cpus=0)(Collector)
+            self._collector = actor.options(scheduling_strategy=here).remote()
+            self._function = self._ray.remote(max_retries=0)(_run_on_node)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._connected:
+            self._ray.shutdown()
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Answer]]:
+        """Run jobs, see :class:`viapoint.training.study.job.Runner`."""
+        queue, again, running = iter(jobs), list[_Task](), dict[Any, _Task]()
+        try:
+            while True:
+                while len(running) < self._room() and (task := _next_task(again, queue)):
+                    running[self._submit(task)] = task
+                if not running:
+                    return
+                ready, _ = self._ray.wait(list(running), timeout=POLL)
+                self._collect(running)
+                for reference in ready:
+                    task = running.pop(reference)
+                    found, lost = self._answer(reference)
+                    if lost and task.attempt < task.job.retries:
+                        again.append(_Task(task.job, task.attempt + 1))
+                    else:
+                        yield task.job, found
+        finally:
+            self._interrupt(running)
+
+    def _room(self) -> int:
+        """Return the number of jobs that may be handed to Ray."""
+        return self._workers or QUEUED * max(int(self._ray.cluster_resources().get("CPU", 1)), 1)
+
+    def _submit(self, task: _Task) -> Any:
+        """Hand a job with the files of its folder to Ray."""
+        job = task.job
+        folder = self._root / job.folder
+        files = pack(folder, {}) if job.folder and folder.is_dir() else {}
+        needs: dict[str, Any] = {"num_cpus": job.cpus, "name": job.label}
+        if "GPU" in job.resources:
+            needs["num_gpus"] = job.resources["GPU"]
+        needs["resources"] = {name: value for name, value in job.resources.items() if name != "GPU"}
+        if self._full:
+            needs["label_selector"] = {NODE_ID: f"!in({','.join(sorted(self._full))})"}
+        return self._function.options(**needs, **ONE_THREAD).remote(
+            job, task.attempt, files, self._collector, installed()
+        )
+
+    def _answer(self, reference: Any) -> tuple[Answer, bool]:
+        """Return the answer of a job that has ended, and whether it may run again."""
+        try:
+            found, full = self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            return Answer(error=" ".join(str(error.cause).split())), False
+        except self._ray.exceptions.RayError as error:
+            return Answer(error=" ".join(f"{type(error).__name__}: {error}".split())), True
+        if not full:
+            return found, False
+        self._full.add(full)
+        print(f"{found.place} has no room left on its disk, and gets no further jobs", file=sys.stderr)
+        others = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]} - self._full
+        return found, bool(others)
+
+    def _collect(self, running: dict[Any, _Task]) -> None:
+        """Write the files that have come from nodes."""
+        tasks = {task.job.label: task for task in running.values()}
+        for label, attempt, changes in self._ray.get(self._collector.take.remote()):
+            if label in tasks and attempt == tasks[label].attempt:  # a node may seem lost and live on
+                unpack(changes, self._root / tasks[label].job.folder)
+
+    def _interrupt(self, running: dict[Any, _Task]) -> None:
+        """Interrupt jobs, and take the files that they save; a second Ctrl-C leaves at once."""
+        if not running:
+            return
+        print(f"saving {len(running)} jobs; Ctrl-C again leaves at once", file=sys.stderr, flush=True)
+        for reference in running:
+            self._ray.cancel(reference)
+        waiting = list(running)
+        while waiting:
+            _, waiting = self._ray.wait(waiting, timeout=POLL)
+            self._collect(running)
+
+
+def _next_task(again: list[_Task], queue: Iterator[Job]) -> _Task | None:
+    """Return the next job, or None if there is none."""
+    if again:
+        return again.pop(0)
+    job = next(queue, None)
+    return None if job is None else _Task(job, 0)
+
+
+def _run_on_node(
+    job: Job, attempt: int, files: Changes, collector: Any, wanted: dict[str, str]
+) -> tuple[Answer, str]:
+    """Run a job in a temporary folder, and return its answer, with the node's id if its disk is full."""
+    import ray
+
+    node = ray.get_runtime_context().get_node_id()
+    place = f"{socket.gethostname()}/{node[:6]}"
+
+    def send(changes: Changes) -> None:
+        ray.get(collector.put.remote(job.label, attempt, changes))
+
+    try:
+        check_versions(installed(), wanted, place)
+        with tempfile.TemporaryDirectory(prefix="viapoint-") as scratch, _own_cores(job.cpus):
+            root = Path(scratch) / "node"
+            root.mkdir()
+            if not job.folder:
+                return answer(job, root)._replace(place=place), ""
+            unpack(files, root / job.folder)
+            with Sender(root / job.folder, send):
+                found = answer(job, root)
+    except (OSError, ValueError) as error:
+        found = Answer(error=str(error))
+    full = os.strerror(errno.ENOSPC) in found.error
+    return found._replace(place=place), node if full else ""
+
+
+@contextlib.contextmanager
+def _own_cores(number: int) -> Iterator[None]:
+    """Restrict this process to cores that no other job of this machine has, as long as there are some."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    folder = Path(tempfile.gettempdir()) / f"viapoint-cores-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        mine: list[int] = []
+        for core in sorted(before):
+            if len(mine) < number:
+                with contextlib.suppress(Timeout):
+                    stack.enter_context(FileLock(folder / str(core)).acquire(timeout=0))
+                    mine.append(core)
+        if mine:
+            os.sched_setaffinity(0, mine)
+        try:
+            yield
+        finally:
+            os.sched_setaffinity(0, before)
+
+
+def check_nodes() -> None:
+    """Check that every node has the packages of this machine.
+
+    Raises:
+        ValueError: One has other versions, or lacks a package; the message names it.
+    """
+    ray = import_ray()
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    there = ray.remote(num_cpus=0, max_retries=0, **ONE_THREAD)(installed)
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    asked = [
+        there.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote()
+        for node in nodes
+    ]
+    for node, reference in zip(nodes, asked, strict=True):
+        name = f"{node['NodeManagerHostname']}/{node['NodeID'][:6]}"
+        try:
+            found = ray.get(reference)
+        except Exception as error:  # such as of a node that lacks a package
+            reason = " ".join(str(error).split())[-300:]
+            raise ValueError(f"node {name} cannot run viapoint: {reason}") from error
+        check_versions(found, installed(), name)
+
+
+def check_versions(found: dict[str, str], wanted: dict[str, str], node: str) -> None:
+    """Check that the packages of a node are those of the driver.
+
+    Raises:
+        ValueError: They are not; the message names them.
+    """
+    others = [
+        f"{name} {found.get(name)}, not {wanted[name]}" for name in wanted if found.get(name) != wanted[name]
+    ]
+    if others:
+        raise ValueError(f"node {node} has {'; '.join(others)}: install the same versions on all nodes")
