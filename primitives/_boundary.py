@@ -16,7 +16,6 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     is_given,
-    is_whole,
     refuse_free,
 )
 
@@ -43,14 +42,18 @@ def read_arguments(
         The namespace, the required and the optional arrays, and the boundary values by name.
     """
     named = dict(zip(END_NAMES, ends, strict=True))
-    refuse_free(start_velocity=ends[0], start_acceleration=ends[1])
-    xp, arrays = as_floats({**(optional or {}), **named}, **required)
+    optional = optional or {}
+    given = {**optional, **dict(zip(END_NAMES[:2], ends[:2], strict=True))}
+    for value in given.values():
+        if value is FREE:
+            refuse_free(**given)
+    xp, arrays = as_floats({**optional, **named}, **required)
     return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
 
 
 def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Boundary) -> None:
     """Raise ValueError for an unknown order, or for order 2 with boundary accelerations."""
-    if not is_whole(order) or order not in ORDERS:
+    if not isinstance(order, int | np.integer) or order not in ORDERS:
         raise ValueError(f"order must be 2 (acceleration), 3 (jerk) or 4 (snap), got {order!r}")
     given = {"start_acceleration": start_acceleration, "goal_acceleration": goal_acceleration}
     for name, value in given.items():
@@ -97,8 +100,10 @@ def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
     Order 4 (snap) has the jerk zero at both ends.
     """
     values = list(ends.values())
-    first, last = ([*values[i : i + 2], None][: order - 1] for i in (0, 2))
-    return [first, *([FREE] * (order - 1) for _ in range(vias)), last]
+    states = [[*values[:2], None][: order - 1]]
+    for _ in range(vias):
+        states.append([FREE] * (order - 1))
+    return [*states, [*values[2:], None][: order - 1]]
 
 
 def unit_time_ends(ends: Ends, duration: Array) -> list[Any]:

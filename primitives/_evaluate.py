@@ -14,13 +14,13 @@ spent. Without the buffer 4,096 movements with 200 samples each take 17 % (K = 1
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ._hermite_tables import derivative_factors
-from .array_api import Array, Namespace, constant, power
+from .array_api import Array, Namespace, constant
 
 _BLOCK_BYTES = 1_200_000
 """Size of the basis of one block of trajectories, which stays in a core's second-level cache."""
@@ -115,7 +115,10 @@ def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array
     if nu == 0:
         return coefficients
     table = derivative_factors(coefficients.shape[-3] // 2, nu)
-    factors = constant(table, coefficients) * power(rates, nu)[..., None, :]
+    factors = (
+        constant(table, coefficients.dtype, coefficients.device)
+        * math.prod([rates] * (nu - 1), start=rates)[..., None, :]
+    )
     return coefficients[..., nu:, :, :] * factors[..., None]
 
 
@@ -146,43 +149,36 @@ def evaluate(
         weights.append(weight.reshape(*weight.shape[:-3], (powers - nu) * segments, dimension))
     degree = max(1, powers - 1 - min(orders))
     if xp is not np:
-        return _products(_power_basis(time, starts, rates, degree, xp), weights, out, xp)
+        basis = _power_basis(time, starts, rates, degree, xp)
+        results = [xp.matmul(basis[..., : weight.shape[-2], :].mT, weight) for weight in weights]
+        if out is None:
+            return results
+        for buffer, result in zip(out, results, strict=True):
+            buffer[...] = result
+        return list(out)
     if out is None:
         batch = np.broadcast(coefficients[..., 0, 0, :1], time[..., :1]).shape[:-1]
         out = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
     buffer = None
-    for where, own in _blocks(coefficients, starts, time):
-        at, begin, rate = time[own[0]], starts[own[1]], rates[own[1]]
+    for where, where_time, where_starts in _blocks(coefficients, starts, time):
+        at, begin, rate = time[where_time], starts[where_starts], rates[where_starts]
         shape = np.broadcast(at[..., :1], begin[..., :1]).shape[:-1]
         if buffer is None or buffer.shape[2:-1] != shape:  # one buffer for all blocks but a shorter last one
             buffer = _buffer((degree + 1, segments, *shape, time.shape[-1]), starts.dtype)
         basis = _power_basis_into(buffer, at, begin, rate)
-        _products(basis, [weight[where] for weight in weights], [array[where] for array in out], np)
+        for weight, result in zip(weights, out, strict=True):
+            np.matmul(basis[..., : weight.shape[-2], :].mT, weight[where], out=result[where])
     return list(out)
 
 
-def _products(basis: Array, weights: list[Array], out: Sequence[Array] | None, xp: Namespace) -> list[Array]:
-    """Return the products of the basis with the coefficients of each derivative, which use its first rows."""
-    factors = [(basis[..., : weight.shape[-2], :].mT, weight) for weight in weights]
-    if out is None:
-        return [xp.matmul(*pair) for pair in factors]
-    for buffer, pair in zip(out, factors, strict=True):
-        if xp is np:
-            np.matmul(*pair, out=buffer)
-        else:
-            buffer[...] = xp.matmul(*pair)
-    return list(out)
-
-
-def _blocks(coefficients: Any, starts: Any, time: Any) -> Iterator[tuple[Any, tuple[Any, Any]]]:
-    """Return indices of each block of the batch, and of the block in `time` and `starts` (all, if shared)."""
-    count, own = len(coefficients), [array.ndim == 2 and len(array) > 1 for array in (time, starts)]
-    plain = coefficients.ndim == 4 and all(array.ndim <= 2 for array in (time, starts))
-    fitting = all(len(array) in (1, count) for array in (time, starts) if array.ndim == 2)
-    if not plain or not fitting or not any(own):
-        yield ..., (..., ...)
-        return
+def _blocks(coefficients: Any, starts: Any, time: Any) -> list[tuple[Any, Any, Any]]:
+    """Return indices of each block of the batch, and of the block in `time` and in `starts` (all, if shared)."""
+    batch, shared = coefficients.shape[:-3], ((), (1,))
+    own_time, own_starts = time.shape[:-1] not in shared, starts.shape[:-1] not in shared
+    fitting = time.shape[:-1] in (*shared, batch) and starts.shape[:-1] in (*shared, batch)
+    if len(batch) != 1 or not fitting or not (own_time or own_starts):
+        return [(..., ..., ...)]
     each = math.prod(coefficients.shape[1:3]) * time.shape[-1] * coefficients.itemsize
     size = max(1, _BLOCK_BYTES // max(1, each))
-    for where in (slice(first, first + size) for first in range(0, count, size)):
-        yield where, (where if own[0] else ..., where if own[1] else ...)
+    slices = (slice(first, first + size) for first in range(0, batch[0], size))
+    return [(rows, rows if own_time else ..., rows if own_starts else ...) for rows in slices]

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, product, repeat
+from operator import mul
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -30,7 +32,6 @@ from .array_api import (
     constant,
     is_given,
     like,
-    own,
     to_numpy,
     unit_factors,
 )
@@ -77,8 +78,9 @@ def _factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
     for p, row in enumerate(upper):
         pivot = row.pop(p)
         pivots.append(pivot)
-        factors = {q: entry / pivot for q, entry in row.items()}
-        for q, factor in factors.items():
+        factors = {}
+        for q, divided in row.items():
+            factors[q] = factor = divided / pivot
             for r, entry in row.items():
                 if r >= q:
                     below = upper[q].get(r)
@@ -101,14 +103,17 @@ def solve_states(
     Returns:
         The states with every FREE replaced, the rows of the unknowns, and the factorisation of A.
     """
-    unknown = [(k, i) for k, state in enumerate(states) for i, value in enumerate(state) if value is FREE]
-    if not unknown:
+    nodes: Nodes = {}
+    for k, state in enumerate(states):
+        for i, value in enumerate(state):
+            if value is FREE:
+                nodes[k, i] = len(nodes)
+    if not nodes:
         return states, {}, BandedFactor([], [], [])
-    nodes = {node: row for row, node in enumerate(unknown)}
     upper, right = _assemble(order, durations, steps, states, nodes)
     factor = _factorise(upper)
-    solved = [list(state) for state in states]
-    for (k, i), value in zip(unknown, factor.solve(right), strict=True):
+    solved = list(map(list, states))
+    for (k, i), value in zip(nodes, factor.solve(right), strict=True):
         solved[k][i] = value
     return solved, nodes, factor
 
@@ -125,8 +130,9 @@ def _assemble(
     upper: list[dict[int, Entry]] = [{} for _ in nodes]
     right: list[Any] = [None] * len(nodes)
     for s, (duration, step) in enumerate(zip(durations, steps, strict=True)):
-        powers = _inverse_powers(duration, 2 * order - 2)
-        local = [(s, i) for i in range(order - 1)] + [(s + 1, i) for i in range(order - 1)]
+        # 1, 1/h, 1/h^2, ...; index = exponent
+        powers = [1.0, *accumulate(repeat(1.0 / duration, 2 * order - 2), mul)]
+        local = list(product((s, s + 1), range(order - 1)))
         for a, node in enumerate(local):
             p = nodes.get(node)
             if p is None:
@@ -146,15 +152,6 @@ def _assemble(
     return upper, right
 
 
-def _inverse_powers(duration: Entry, highest: int) -> list[Entry]:
-    """Return [1, 1/h, 1/h^2, ...]; index = exponent."""
-    inverse = 1.0 / duration
-    powers = [1.0, inverse]
-    while len(powers) <= highest:
-        powers.append(powers[-1] * inverse)
-    return powers
-
-
 def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
     """Return the least-cost trajectory through all waypoints at fixed times.
 
@@ -165,7 +162,7 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
         durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
         states: per knot, its derivatives (see States).
     """
-    durations = own(durations)
+    durations = 1.0 * durations  # a copy of its own
     if (durations <= 0).any():
         return _connect_with_empty(xp, order, waypoints, durations, states)
     return Trajectory.from_segments(
@@ -180,8 +177,7 @@ def _scaled_coefficients(
 
     The scale is a power of two: x^(i) / scale^i is exact.
     """
-    sizes = to_numpy(durations)
-    if sizes.size and not (sizes.min() >= _SHORT and sizes.max() <= _LONG):
+    if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
         scale = unit_factors(xp, durations)
         scaled: States = []
         for state in states:
@@ -205,28 +201,23 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
         lengths = [durations[..., s : s + 1] for s in range(segments)]
     states = solve_states(order, lengths, pieces, states)[0]
     rest = 0.0 * pieces[0]
-    # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables, segment by segment.
-    rows = [waypoints[..., s, :] for s in range(segments)]
-    rows += _unit_time_states(states[:-1], lengths, rest, order)
-    rows += pieces
-    rows += _unit_time_states(states[1:], lengths, rest, order)
-    shape = rest.shape
-    data = xp.stack([row if row.shape == shape else xp.broadcast_to(row, shape) for row in rows], axis=-2)
+    # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
+    first, last = [waypoints[..., :-1, :]], [steps]
+    power = length = durations[..., None]
+    for i in range(order - 1):
+        knots = []
+        for state in states:
+            value = rest if state[i] is None else state[i]
+            knots.append(value if value.shape == rest.shape else xp.broadcast_to(value, rest.shape))
+        derivative = xp.stack(knots, axis=-2)
+        first.append(power * derivative[..., :-1, :])
+        last.append(power * derivative[..., 1:, :])
+        power = power * length
+    data = xp.concat(first + last, axis=-2)
     batch = data.shape[:-2]
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
-    coefficients = xp.matmul(constant(coefficient_table(order), data), data)
-    return xp.reshape(coefficients, (*batch, 2 * order, segments, shape[-1]))
-
-
-def _unit_time_states(states: States, lengths: Sequence[Any], rest: Array, order: int) -> list[Array]:
-    """Return V_i = h^i x^(i) for i = 1 ... m - 1, all segments of one i together."""
-    rows = []
-    powers: Sequence[Any] = lengths
-    for i in range(order - 1):
-        for state, power in zip(states, powers, strict=True):
-            rows.append(rest if state[i] is None else power * state[i])
-        powers = [power * length for power, length in zip(powers, lengths, strict=True)]
-    return rows
+    coefficients = xp.matmul(constant(coefficient_table(order), data.dtype, data.device), data)
+    return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
 def _connect_with_empty(

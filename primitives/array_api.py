@@ -205,10 +205,14 @@ def whole_order(nu: int) -> int:
 
 def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
     """Return orders of derivative as a tuple, or raise ValueError."""
-    orders = tuple(nu) if isinstance(nu, Sequence) or (isinstance(nu, np.ndarray) and nu.ndim) else (nu,)
-    if not orders or not all(map(is_whole, orders)):
+    try:
+        given = (nu,) if isinstance(nu, int | np.integer) else tuple(nu)
+        orders = tuple(map(operator.index, given))
+    except TypeError:
+        given = orders = ()
+    if not orders or min(orders) < 0 or bool in map(type, given):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
-    return tuple(map(int, orders))
+    return orders
 
 
 def as_number(value: Any) -> float:
@@ -251,11 +255,6 @@ def ordered_sum(array: Any, axis: int = 0) -> Any:
     item alone in the last bit.
     """
     return functools.reduce(operator.add, np.moveaxis(array, axis, 0) if axis else array)
-
-
-def power(base: Any, exponent: int) -> Any:
-    """Return base^exponent, exponent >= 1, by repeated multiplication: faster than `pow` on arrays."""
-    return functools.reduce(operator.mul, [base] * exponent)
 
 
 def to_numpy(array: Array) -> np.ndarray[Any, Any]:
@@ -301,20 +300,11 @@ def unit_factors(xp: Namespace, array: Array) -> Array:
     return like(xp, np.ldexp(1.0, -exponent), array)
 
 
-def constant(table: tuple[tuple[float, ...], ...], other: Array) -> Array:
-    """Return a constant matrix in the library, dtype and device of `other`, from a cache."""
-    if isinstance(other, np.ndarray):
-        return _numpy_constant(table, other.dtype)
-    return _tensor_constant(table, other.dtype, other.device)
-
-
-@lru_cache(maxsize=256)
-def _numpy_constant(table: tuple[tuple[float, ...], ...], dtype: Any) -> Array:
-    return np.array(table, dtype=dtype)
-
-
-@lru_cache(maxsize=256)
-def _tensor_constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: Any) -> Array:
+@lru_cache(maxsize=512)
+def constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: Any) -> Array:
+    """Return a constant matrix in the library, dtype and device of an array with this dtype and device."""
+    if isinstance(dtype, np.dtype):
+        return np.array(table, dtype=dtype)
     import array_api_compat.torch
 
     torch: Any = array_api_compat.torch

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import factorial, perm
+from math import factorial, perm, prod
 from typing import Any
 
-from .array_api import Array, power
+from .array_api import Array
 from .trajectory import Trajectory, require_trajectory
 
 
@@ -97,7 +97,7 @@ def duration_gradient(coefficients: Array, rates: Array) -> Array:
         weight = (0.5 if i == 0 else (-1.0) ** i) * factorial(order + i) * factorial(order - i)
         product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
         total = total + weight * product.sum(-1)
-    return -total * power(rates * rates, order)
+    return -total * prod([rates * rates] * order)
 
 
 def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Array:
@@ -105,4 +105,4 @@ def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Arr
     total: Any = 0.0
     for k in range(nu, 2 * trajectory.order if at_end else nu + 1):
         total = total + perm(k, nu) * trajectory.coefficients[..., k, :, :]
-    return total * power(trajectory.rates, nu)[..., None]
+    return total * prod([trajectory.rates] * (nu - 1), start=trajectory.rates)[..., None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ._boundary import END_NAMES, check_end_shapes, check_order, check_waypoints, knot_states, read_arguments
@@ -13,8 +14,6 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
-    power,
-    refuse_free,
     require,
     require_vectors,
 )
@@ -121,7 +120,6 @@ def through(
         [0.2, 0.1]
     """
     check_order(order, start_acceleration, goal_acceleration)
-    refuse_free(via_velocities=via_velocities)
     xp, (waypoints, durations, via_velocities), ends = read_arguments(
         (start_velocity, start_acceleration, goal_velocity, goal_acceleration),
         {"via_velocities": via_velocities},
@@ -129,7 +127,8 @@ def through(
         durations=durations,
     )
     batch = check_waypoints(waypoints, ends, durations=durations)
-    batch = _check_via_velocities(batch, waypoints, via_velocities)
+    if via_velocities is not None:
+        batch = _check_via_velocities(batch, waypoints, via_velocities)
     waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
     _check_durations(xp, waypoints, durations)
     states = knot_states(order, ends, waypoints.shape[-2] - 2)
@@ -139,12 +138,8 @@ def through(
     return connect(xp, order, waypoints, durations, states)
 
 
-def _check_via_velocities(
-    batch: tuple[int, ...], waypoints: Array, velocities: Array | None
-) -> tuple[int, ...]:
+def _check_via_velocities(batch: tuple[int, ...], waypoints: Array, velocities: Array) -> tuple[int, ...]:
     """Return the common leading shape, or raise ValueError."""
-    if velocities is None:
-        return batch
     expected = (waypoints.shape[-2] - 2, waypoints.shape[-1])
     if velocities.ndim < 2 or tuple(velocities.shape[-2:]) != expected:
         wanted = f"(..., {expected[0]}, {expected[1]})"
@@ -205,6 +200,6 @@ def minimum_jerk_coefficients(
     movement = point_to_point(x0, xT, T[..., 0], **ends)
     unit = movement.coefficients[..., 0, :]
     rate = 1.0 / T
-    upper = [unit[..., k, :] * power(rate, k) for k in range(3, 6)]
+    upper = [unit[..., k, :] * math.prod([rate] * k) for k in range(3, 6)]
     # a_1 and a_2 are given: conversion to unit time and back would round them.
     return xp.concat([unit[..., 0, :], dx0, ddx0 / 2, *upper], axis=-1)

@@ -88,7 +88,8 @@ def passage_durations(
 
 def _flat(array: Array, batch: tuple[int, ...], own: int) -> Any:
     """Return NumPy float64 with the full batch in one axis; the last `own` axes stay."""
-    numbers = to_numpy(array).astype(np.float64, copy=False)
+    array = array if isinstance(array, np.ndarray) else to_numpy(array)
+    numbers = array.astype(np.float64, copy=False)
     shape = numbers.shape[numbers.ndim - own :] if own else ()
     return np.broadcast_to(numbers, (*batch, *shape)).reshape(-1, *shape)
 

@@ -76,7 +76,7 @@ def retarget(
     refuse_free(via=via)
     if not 0 <= as_number(freeze) < inf:
         raise ValueError(f"freeze must be a finite number of at least 0, got {freeze!r}")
-    arrays = trajectory.floats({"via": via, **named}, time=time, goal=goal, arrival=arrival)
+    arrays = trajectory.floats({"via": via, **named}, widest=True, time=time, goal=goal, arrival=arrival)
     xp, (time, goal, arrival, via, *ends) = trajectory.namespace, arrays
     targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
     batch = _common_batch(trajectory, time, arrival, targets, via)

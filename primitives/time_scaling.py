@@ -45,7 +45,7 @@ def minimum_duration(
     if all(limit is None for limit in named.values()):
         raise ValueError("give at least one limit: velocity, acceleration or jerk")
     refuse_free(**named)
-    xp, limits = trajectory.namespace, trajectory.floats(named)
+    xp, limits = trajectory.namespace, trajectory.floats(named, widest=True)
     factor = 0.0 * trajectory.duration
     for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):
         if limit is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -22,7 +23,6 @@ from .array_api import (
     error_state,
     namespace_of,
     own,
-    power,
     refuse_free,
     require,
     require_vectors,
@@ -176,16 +176,16 @@ class Trajectory:
         xp = self.namespace
         orders = whole_orders(nu)
         time, inside = self._times(time, xp)
-        batch = broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
-        shape = (*batch, time.shape[-1], self.dimension)
+        batch = self.batch_shape
+        if time.ndim > 1:
+            batch = broadcast_batch(trajectory=batch, time=tuple(time.shape[:-1]))
         if out is not None:
-            check_buffers(out, len(orders), shape, xp)
+            check_buffers(out, len(orders), (*batch, time.shape[-1], self.dimension), xp)
         kept = [min(order, 2 * self.order - 1) for order in orders]
         results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
-        return tuple(
-            self._held(value, order, inside, out is not None)
-            for value, order in zip(results, orders, strict=True)
-        )
+        if inside is not None or max(orders) >= 2 * self.order:
+            self._hold(xp, results, orders, inside, xp is np or out is not None)
+        return tuple(results)
 
     def _times(self, time: Array | int, xp: Namespace) -> tuple[Array, Array | None]:
         """Return times (..., T) clipped to the movement, and True where they were inside (None: all)."""
@@ -195,7 +195,7 @@ class Trajectory:
                 raise ValueError(f"time as a number of samples must be at least 2, got {time}")
             count = xp.arange(int(time), dtype=end.dtype, device=getattr(end, "device", None))
             return end * (count / (int(time) - 1)), None
-        (time,) = self._own_floats(time=time)
+        (time,) = self.floats(time=time)
         if time.ndim < 1:
             raise ValueError(f"time must have shape (T,) or (..., T), got shape {tuple(time.shape)}")
         inside = (time >= 0) & (time <= end)
@@ -203,31 +203,38 @@ class Trajectory:
             return time, None
         return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
 
-    def floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
-        """Convert arguments to arrays of the trajectory's library, required ones first (see as_floats)."""
-        optional = optional or {}
-        reference = {"coefficients": self.coefficients[..., 0, 0, 0]}
+    def floats(
+        self, optional: Mapping[str, Any] | None = None, /, *, widest: bool = False, **required: Any
+    ) -> list[Any]:
+        """Convert arguments to arrays of the trajectory's library, required ones first (see as_floats).
+
+        Their dtype is the trajectory's, or with `widest` the widest of all.
+        """
+        optional, coefficients = optional or {}, self.coefficients
+        reference = {"coefficients": coefficients[..., 0, 0, 0]}
         xp, (*arrays, _) = as_floats({**optional, **reference}, **required)
-        if xp is not self.namespace:
+        if (xp is np) != isinstance(coefficients, np.ndarray):
             given = [*required, *(name for name, value in optional.items() if value is not None)]
             raise ValueError(f"{', '.join(given)} must be of the trajectory's own kind, not of {xp.__name__}")
+        if not widest:
+            for i, array in enumerate(arrays):
+                if array is not None and array.dtype != coefficients.dtype:
+                    arrays[i] = xp.astype(array, coefficients.dtype)
         return arrays
 
-    def _own_floats(self, optional: Mapping[str, Any] | None = None, /, **required: Any) -> list[Any]:
-        """Convert arguments to the trajectory's library and dtype."""
-        xp, dtype = self.namespace, self.coefficients.dtype
-        arrays = self.floats(optional, **required)
-        return [a if a is None or a.dtype == dtype else xp.astype(a, dtype) for a in arrays]
-
-    def _held(self, value: Array, order: int, inside: Array | None, in_place: bool) -> Array:
-        """Return values with zero derivatives outside the movement and beyond the polynomial's degree."""
-        if order == 0 or (inside is None and order < 2 * self.order):
-            return value
-        factor = 0.0 if order >= 2 * self.order else self.namespace.astype(inside, value.dtype)[..., None]
-        if in_place:
-            value *= factor
-            return value
-        return value * factor
+    def _hold(
+        self, xp: Namespace, values: list[Array], orders: Sequence[int], inside: Array | None, in_place: bool
+    ) -> None:
+        """Set derivatives to zero outside the movement and beyond the polynomial's degree."""
+        mask = None if inside is None else xp.astype(inside, self.coefficients.dtype)[..., None]
+        for i, order in enumerate(orders):
+            factor = 0.0 if order >= 2 * self.order else mask
+            if order == 0 or factor is None:
+                continue
+            if in_place:
+                values[i] *= factor
+            else:
+                values[i] = values[i] * factor
 
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
@@ -244,8 +251,10 @@ class Trajectory:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
-        modes = xp.reshape(xp.matmul(constant(energy_table(self.order, nu), flat), flat), upper.shape)
-        scale = self.durations if nu == 0 else power(self.rates, 2 * nu - 1)
+        modes = xp.reshape(
+            xp.matmul(constant(energy_table(self.order, nu), flat.dtype, flat.device), flat), upper.shape
+        )
+        scale = self.durations if nu == 0 else math.prod([self.rates] * (2 * nu - 1))
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
     def extrema(self, nu: int = 0) -> Extrema:
@@ -287,7 +296,7 @@ class Trajectory:
             ValueError: duration is not finite, not positive, or does not broadcast.
         """
         xp = self.namespace
-        (duration,) = self._own_floats(duration=duration)
+        (duration,) = self.floats(duration=duration)
         require(xp, duration > 0, "duration", duration, "must be positive")
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
         end = own(duration)[..., None]
@@ -313,7 +322,7 @@ class Trajectory:
         named = {"rotation": rotation, "translation": translation, "scale": scale}
         refuse_free(**named)
         xp, moved = self.namespace, self.coefficients
-        rotation, translation, scale = self._own_floats(named)
+        rotation, translation, scale = self.floats(named)
         if rotation is not None:
             if rotation.ndim < 2 or rotation.shape[-1] != self.dimension or rotation.shape[-2] < 1:
                 raise ValueError(

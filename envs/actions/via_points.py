@@ -11,7 +11,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.types import Float
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 Timing = Literal["optimal", "learned"]
 
@@ -110,7 +110,7 @@ class ActionLayout:
         low, high = self.duration_range
         object.__setattr__(self, "duration_range", (float(low), float(high)))
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Number of components m."""
         return len(self.names)
@@ -133,7 +133,7 @@ class ActionLayout:
         )
         return (*scale, f"factor {(high / low) ** 0.5:.4g} on {self.centre_duration:.4g} s", *splits)
 
-    @property
+    @functools.cached_property
     def centre_duration(self) -> float:
         """Duration of the zero action, [s]."""
         low, high = self.duration_range
@@ -161,7 +161,7 @@ class ActionLayout:
         self._check_shapes(action.shape, start.shape, goal.shape)
         xp = namespace_of(action)
         line = goal - start
-        axes = frame(line)
+        axes = frame(line, xp)
         ends = self.n_via * self.dimension
         waypoints = [start]
         for k in range(self.n_via):
@@ -237,7 +237,7 @@ class ActionLayout:
                 f"starts {tuple(start)}"
             )
 
-    @property
+    @functools.cached_property
     def _log_half_range(self) -> float:
         low, high = self.duration_range
         return float(np.log(high / low) / 2.0)
@@ -253,12 +253,12 @@ class ActionLayout:
         return duration[..., None] * shares / xp.sum(shares, axis=-1, keepdims=True)
 
 
-def frame(line: Array) -> list[Array]:
+def frame(line: Array, xp: Namespace = None) -> list[Array]:
     """Return unit vectors along a line, across it (to its left, horizontal) and above it, each of shape (..., D).
 
-    A vertical line in space has no left; the x axis replaces it.
+    A vertical line in space has no left; the x axis replaces it. `xp` is the namespace of `line`, if it is known.
     """
-    xp = namespace_of(line)
+    xp = xp or namespace_of(line)
     along = line / xp.sqrt(xp.sum(line * line, axis=-1, keepdims=True))
     x, y = along[..., 0], along[..., 1]
     if line.shape[-1] == 2:

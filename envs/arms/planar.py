@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.mjcf import add_obstacles, read_spec
-from viapoint.envs.common.arrays import clamp
 from viapoint.envs.common.types import Box
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +133,7 @@ class PlanarArm:
         elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
         zero = xp.zeros_like(upper)
         ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
-        return _batch_first(xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
+        return _batch_first(xp, xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
         """Return both ends of each link for the hand at `hand`, shape (..., 2), [m], without computing angles.
@@ -144,12 +143,12 @@ class PlanarArm:
         double precision (1,280 positions in each of 64 scenes).
         """
         xp = namespace_of(hand)
-        (c1, s1), _ = self._directions(hand)
+        (c1, s1), _ = self._directions(hand, xp)
         square = c1 * c1 + s1 * s1
         # With the hand at the shoulder every direction is a solution: take that of the inverse kinematics.
         c1, square = (xp.where(square > 0.0, each, xp.ones_like(each)) for each in (c1, square))
         upper = self.lengths[0] / xp.sqrt(square)
-        elbow = _batch_first(xp.stack((c1 * upper, s1 * upper)))
+        elbow = _batch_first(xp, xp.stack((c1 * upper, s1 * upper)))
         return (xp.zeros_like(elbow), elbow), (elbow, hand)
 
     def inverse_kinematics(self, hand: Array) -> Array:
@@ -157,7 +156,7 @@ class PlanarArm:
 
         Out of reach, the elbow is as straight or as bent as it can be.
         """
-        return self._configurations(hand)[0]
+        return self._configurations(hand, namespace_of(hand))[0]
 
     def reach_margin(self, hand: Array) -> Array:
         """Return the distance inside the reach; see :meth:`viapoint.envs.arms.base.Arm.reach_margin`.
@@ -168,7 +167,7 @@ class PlanarArm:
         distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
         near, far = self.reach
         low, high = self.joint_range[0]
-        (cosine, sine), _ = self._directions(hand)
+        (cosine, sine), _ = self._directions(hand, xp)
         shoulder = xp.atan2(sine, cosine)
         arc = xp.minimum(shoulder - low, high - shoulder) * distance
         return xp.minimum(xp.minimum(distance - near, far - distance), arc)
@@ -188,7 +187,7 @@ class PlanarArm:
         control is the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
         """
         xp = namespace_of(position)
-        joints, upper_arm, forearm, sine = self._configurations(position)
+        joints, upper_arm, forearm, sine = self._configurations(position, xp)
         rates = self._rates(position, upper_arm, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
         # Differentiating J q' = v gives J q'' = a - J' q', and -J' q' is the sum of centripetal terms along the links.
@@ -208,24 +207,24 @@ class PlanarArm:
             axis=-1,
         )
 
-    def _configurations(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
+    def _configurations(
+        self, hand: Array, xp: Namespace
+    ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
         """Return joint angles, unit vectors along upper arm and forearm, and the sine of the elbow's angle."""
-        xp = namespace_of(hand)
-        (c1, s1), (cosine, sine) = self._directions(hand)
-        joints = _batch_first(xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
+        (c1, s1), (cosine, sine) = self._directions(hand, xp)
+        joints = _batch_first(xp, xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
         return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
 
-    def _directions(self, hand: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def _directions(self, hand: Array, xp: Namespace) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Return cosine and sine of the shoulder's angle, and of the elbow's, by the law of cosines.
 
         The hand is at `along`, `across` in the frame of the upper arm; the shoulder turns that point to (x, y).
         """
-        xp = namespace_of(hand)
         l1, l2 = self.lengths
         low, high = self.joint_range[1]
         x, y = hand[..., 0], hand[..., 1]
         cosine = (x * x + y * y - (l1**2 + l2**2)) * (0.5 / (l1 * l2))
-        cosine = clamp(cosine, float(np.cos(high)), float(np.cos(low)))
+        cosine = cosine.clip(float(np.cos(high)), float(np.cos(low)))
         sine = xp.sqrt(1.0 - cosine * cosine)
         along, across = l1 + l2 * cosine, l2 * sine
         scale = 1.0 / (along * along + across * across)
@@ -268,9 +267,9 @@ def _pair(values: Any) -> tuple[float, float]:
     return float(first), float(second)
 
 
-def _batch_first(array: Array, axes: int = 1) -> Array:
+def _batch_first(xp: Namespace, array: Array, axes: int = 1) -> Array:
     """Return a view with the first `axes` axes moved behind the batch."""
-    return namespace_of(array).moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
+    return xp.moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
 
 
 def _lower_into_plane(spec: mujoco.MjSpec) -> None:

@@ -278,11 +278,11 @@ class Executor:
             is_success=at_rest & (goal_error < GOAL_TOLERANCE) & ~collision & ~log.unstable & kept,
             collision=collision,
             first_contact_time=np.where(collision, contact.argmax(axis=-1) * self.simulator.timestep, -1.0),
-            min_clearance=self._recorded_clearance(log, hand, joints, last[1], scenes),
             goal_error=goal_error,
             path_length=sum_in_order(moved),
             peak_speed=moved.max(axis=-1) / self.simulator.timestep,
             tracking_error=np.sqrt(sum_in_order(deviation) / steps),
+            min_clearance=self._recorded_clearance(log, hand, joints, last[1], scenes),
             unstable=log.unstable,
         )
 

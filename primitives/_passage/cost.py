@@ -16,6 +16,7 @@ diagonal matrix E of the degrees (0, 1, 2, 1, 2): h dq/dh = P E s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from .._knot_solver import Nodes, States, solve_states
-from ..array_api import FREE, Floats, ordered_sum, power
+from ..array_api import FREE, Floats, ordered_sum
 
 _MODES: tuple[dict[int, float], ...] = (
     {2: -1.0, 4: 1.0},
@@ -147,7 +148,7 @@ def _segment_derivatives(
     zero, one = _product(q0, q0), _product(q0, q1)
     curve = _product(q1, q1) + _product(q0, q2)
     inverse = 1.0 / h
-    fifth = power(inverse, 5)
+    fifth = math.prod([inverse] * 4, start=inverse)
     phi = 0.5 * fifth * zero
     first = fifth * inverse * (one - 2.5 * zero)
     second = fifth * inverse * inverse * (curve - 11.0 * one + 15.0 * zero)
@@ -160,7 +161,7 @@ def _mixed_derivatives(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[in
     For an entry of degree e, dq/dy = h^e P column, so it is h^(e - 6) sum_i w_i P_i (q1_i + (e - 5) q_i).
     """
     inverse = (1.0 / h)[:, None]
-    fourth = power(inverse, 4)
+    fourth = math.prod([inverse] * 3, start=inverse)
     rows: dict[int, Floats] = {}
     for place in (1, 2, 3, 4):
         degree = _DEGREES[place]

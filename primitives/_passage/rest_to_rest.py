@@ -15,8 +15,10 @@ nearer to x0 than to xf. Only a/b and c/b matter, in any dimension of space.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -31,6 +33,9 @@ SHORTEST = 1e-50
 
 _STEPS = 5
 """Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
+
+_TINY = 1e-300
+"""Bound that keeps a divisor from zero where start, via-point and goal are equal."""
 
 _FLOOR = 1e-5
 """Distance of the via-point from an end, relative to the movement's extent, that clips the gradient."""
@@ -50,7 +55,7 @@ ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
 _FLOATS = Functions(
     lambda condition, yes, no: yes if condition else no,
     math.sqrt,
-    lambda x: float(np.cbrt(x)),
+    lambda x: float(np.cbrt(x)),  # not math.cbrt, which may round differently from NumPy's loops over arrays
     min,
     max,
 )
@@ -60,55 +65,29 @@ def fractions_at_rest(points: Any) -> Any:
     """Return the fractions of the duration before and after the via-point.
 
     Args:
-        points: (N, 3, D) NumPy float64: start, via-point, goal [m].
+        points: (N, 3, D) NumPy float64: start, via-point, goal [m], of a size of about 1.
 
     Returns:
         (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start
         or goal has fraction 0 there.
     """
-    if (
-        len(points) == 1
-    ):  # Python floats: a batch of one would spend its time in the overhead of 200 array operations
-        rows, f = points[0].tolist(), _FLOATS
-    else:
-        rows, f = np.ascontiguousarray(points.transpose(1, 2, 0)), ARRAYS
-    start, via, goal = rows
-    a, b, c, is_late, apart = _invariants(start, via, goal, f)
-    smaller = nearer_fraction(a, b, c, f)
-    smaller = f.where(apart & (smaller < SHORTEST), SHORTEST, smaller)
-    larger = 1.0 - smaller
-    before, after = f.where(is_late, larger, smaller), f.where(is_late, smaller, larger)
-    return np.array([[before, after]]) if len(points) == 1 else np.stack([before, after], axis=-1)
+    places = np.ascontiguousarray(points.transpose(1, 2, 0))
+    legs, whole = places[1:] - places[:-1], places[2] - places[0]
+    first, second = _dot(*[legs.swapaxes(0, 1)] * 2)
+    is_late = second < first
+    near = np.where(is_late, legs[1], legs[0])
+    a, b, c = _dot(near, whole), _dot(whole, whole), np.minimum(first, second)
+    # A batch of one would spend its time in the overhead of array operations: Python floats give the same bits.
+    arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
+    t = nearer_fraction(*arguments)
+    t = np.maximum(t, SHORTEST * near.any(axis=0))
+    fractions = np.stack([t, 1.0 - t], axis=-1)
+    return np.where(is_late[:, None], fractions[:, ::-1], fractions)
 
 
-def _invariants(
-    start: Sequence[Number], via: Sequence[Number], goal: Sequence[Number], f: Functions
-) -> tuple[Number, ...]:
-    """Return a, b, c with E from the nearer end, True if that is the goal, and True if the via-point is apart."""
-    first = [x1 - x0 for x0, x1 in zip(start, via, strict=True)]
-    second = [x1 - x0 for x0, x1 in zip(via, goal, strict=True)]
-    whole = [x1 - x0 for x0, x1 in zip(start, goal, strict=True)]
-    c_first, c_second = _dot(first, first), _dot(second, second)
-    is_late = c_second < c_first
-    a = f.where(is_late, _dot(second, whole), _dot(first, whole))
-    apart = f.where(is_late, _longest(second, f), _longest(first, f)) > 0
-    return a, _dot(whole, whole), f.where(is_late, c_second, c_first), is_late, apart
-
-
-def _longest(vector: Sequence[Number], f: Functions) -> Number:
-    """Return the largest component, which unlike a square does not underflow."""
-    largest = abs(vector[0])
-    for component in vector[1:]:
-        largest = f.where(abs(component) > largest, abs(component), largest)
-    return largest
-
-
-def _dot(x: Sequence[Number], y: Sequence[Number]) -> Number:
-    """Return the scalar product, summed in a fixed order (NumPy's depends on the memory layout)."""
-    total = x[0] * y[0]
-    for p, q in zip(x[1:], y[1:], strict=True):
-        total = total + p * q
-    return total
+def _dot(x: Array, y: Array) -> Array:
+    """Return the scalar product along the first axis, in a fixed order (NumPy's depends on the memory layout)."""
+    return functools.reduce(operator.add, x * y)
 
 
 def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> Number:
@@ -117,31 +96,27 @@ def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> N
     Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
     The term 8 c brings the start to 1/2 for distant via-points.
     """
-    root = f.sqrt(4.0 * a * a + 5.0 * b * c)
-    top = f.where(a >= 0, c, root - 2.0 * a)  # the form of the quadratic formula without cancellation
-    bottom = f.where(a >= 0, 4.0 * a + 2.0 * root + 8.0 * c, 10.0 * b + 8.0 * top)
-    t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
+    total = f.sqrt(4.0 * a * a + 5.0 * b * c) + 2.0 * abs(a)
+    # The form of the quadratic formula without cancellation, for either sign of a.
+    top = f.where(a >= 0, c, total)
+    bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
+    t = f.cube_root(top / f.maximum(bottom, _TINY))
     t = f.minimum(f.maximum(t, 0.0), 0.5)
     for _ in range(_STEPS):
-        value, slope = _residual(t, a, b, c)
-        t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
+        value, slope, _ = _residual(t, a, b, c)
+        t = f.minimum(f.maximum(t - value / f.minimum(slope, -_TINY), 0.5 * t), 0.5)
     return t
 
 
-def _residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number]:
-    """Return F of Eq. 1 and dF/dt."""
+def _residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Number, tuple[Number, ...]]:
+    """Return F of Eq. 1, dF/dt, and s, q and w."""
     square = t * t
-    s, q, w = _basis(t, square)
+    cube = square * t
+    s, q, w = 1.0 - 2.0 * t, cube * (10.0 + t * (6.0 * t - 15.0)), cube * (2.0 - t)
     dw = square * (6.0 - 4.0 * t)
     dq = 30.0 * square * ((1.0 - t) * (1.0 - t))
     m = a * s + b * w
-    return c * s + a * w - q * m, a * dw - 2.0 * c - dq * m - q * (b * dw - 2.0 * a)
-
-
-def _basis(t: Number, square: Number) -> tuple[Number, Number, Number]:
-    """Return s, q and w."""
-    cube = square * t
-    return 1.0 - 2.0 * t, cube * (10.0 + t * (6.0 * t - 15.0)), cube * (2.0 - t)
+    return c * s + a * w - q * m, a * dw - 2.0 * c - dq * m - q * (b * dw - 2.0 * a), (s, q, w)
 
 
 def attach_root_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> Array:
@@ -171,9 +146,8 @@ def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]
     near = np.where(is_late, goal - via, via - start)
     whole = goal - start
     a, b, c = _dot(near, whole), _dot(whole, whole), _dot(near, near)
-    _, slope = _residual(t, a, b, c)
+    _, slope, (s, q, w) = _residual(t, a, b, c)
     extent = b + c
     floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
     sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
-    s, q, w = _basis(t, t * t)
     return (sign * (w - q * s), -sign * q * w, sign * s), is_late
