@@ -115,10 +115,8 @@ def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array
     if nu == 0:
         return coefficients
     table = derivative_factors(coefficients.shape[-3] // 2, nu)
-    factors = (
-        constant(table, coefficients.dtype, coefficients.device)
-        * math.prod([rates] * (nu - 1), start=rates)[..., None, :]
-    )
+    scale: Array = math.prod([rates] * (nu - 1), start=rates)
+    factors = constant(table, coefficients.dtype, coefficients.device) * scale[..., None, :]
     return coefficients[..., nu:, :, :] * factors[..., None]
 
 

@@ -105,4 +105,5 @@ def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Arr
     total: Any = 0.0
     for k in range(nu, 2 * trajectory.order if at_end else nu + 1):
         total = total + perm(k, nu) * trajectory.coefficients[..., k, :, :]
-    return total * prod([trajectory.rates] * (nu - 1), start=trajectory.rates)[..., None]
+    scale: Array = prod([trajectory.rates] * (nu - 1), start=trajectory.rates)
+    return total * scale[..., None]
