@@ -66,7 +66,8 @@ class EnvConfig:
         number = inspect.Parameter("num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1)
         fields = dataclasses.fields(cls)
         named = [inspect.Parameter(f.name, kind, default=f.default, annotation=f.type) for f in fields]
-        return inspect.Signature([number, *named])
+        workers = inspect.Parameter("workers", kind, default=0, annotation="int")
+        return inspect.Signature([number, *named, workers])
 
     def task(self) -> Task:
         """Return the task that these arguments describe.

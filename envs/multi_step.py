@@ -13,7 +13,7 @@ from viapoint.envs.common.types import Bool, Float, Observation
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.executor import Rollout
 from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import ReachVectorEnv
+from viapoint.envs.vector_env import ReachVectorEnv, Transition
 
 
 class MultiStepVectorEnv(ReachVectorEnv):
@@ -37,29 +37,28 @@ class MultiStepVectorEnv(ReachVectorEnv):
         """Running episodes so far at every physics step; empty before the first reset."""
         return () if self.scenes is None else tuple(self._rollout(row) for row in range(self.num_envs))
 
-    def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Make one step in each environment; where an episode ends, start the next.
+    def transition(self, actions: Any) -> Transition:
+        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result.
 
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
         observation, reward, info = self.execute_actions(actions)
-        terminated, truncated = self.terminated, self.truncated
-        ended = terminated | truncated
-        everyone = np.ones(self.num_envs, dtype=bool)
-        infos = {**info, **{f"_{name}": everyone.copy() for name in info}}
-        rows = np.flatnonzero(ended)
+        last, rows = None, np.flatnonzero(self.terminated | self.truncated)
         if rows.size:
-            final = np.full(self.num_envs, None, dtype=object)
-            for i in rows:
-                final[i] = {name: part[i].copy() for name, part in observation.items()}
-            kept = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
-            masks = {f"_{name}": ended.copy() for name in info}
-            infos |= {"final_obs": final, "_final_obs": ended.copy()}
-            infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
             self._start(rows, self._draw(self.generators, rows, {}))
-            observation = self._observe_start()
-        return observation, reward, terminated.copy(), truncated.copy(), infos
+            last, observation = observation, self.observe()
+        return Transition(observation, reward, self.terminated.copy(), self.truncated.copy(), info, last)
+
+    def state(self) -> dict[str, Any]:
+        """Return scenes, episodes, random generators and counters; see :meth:`ReachVectorEnv.state`."""
+        return {**super().state(), "episodes": self.episodes_state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of environments of the same kind and number."""
+        super().restore(state)
+        if state.get("episodes"):
+            self.restore_episodes(state["episodes"])
 
     def episodes_state(self) -> dict[str, Any]:
         """Return the state of the running episodes, without their scenes, as arrays for :meth:`restore_episodes`."""
@@ -69,6 +68,11 @@ class MultiStepVectorEnv(ReachVectorEnv):
         """Continue from what :meth:`episodes_state` returned, after a reset to the same scenes."""
         self._episodes.restore(state)
         self._simulator.batch.state[:] = state["physics"]
+
+    @staticmethod
+    def take_episodes(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
+        """Return the part of :meth:`episodes_state` that belongs to some environments."""
+        return {name: np.asarray(part)[rows] for name, part in state.items()}
 
     def _rollout(self, row: int) -> Rollout:
         """Return the running episode of one environment so far."""

@@ -69,6 +69,8 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
+            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -157,7 +159,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
         self._check_running()
-        actions = checked_actions(actions, self.num_envs, self._action_names)
+        actions = checked_actions(actions, self.num_envs, self.action_names)
         plan, kept = self.decoder.revise(self.default, self._plan, actions)
         return self._execute_decision(plan, ~kept)
 
@@ -196,6 +198,23 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             self._history[row] = [(float(began), plan) for began, plan in zip(time, plans, strict=True)]
             first += int(number)
 
+    @staticmethod
+    def take_episodes(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
+        """See :meth:`MultiStepVectorEnv.take_episodes`."""
+        ends = np.cumsum(state["history_number"])
+        plans = slice(*(int(ends[k - 1]) if k else 0 for k in (rows.start, rows.stop)))
+        history = {f"history_{name}": np.asarray(state[f"history_{name}"])[plans] for name in HISTORY_NAMES}
+        others = {name: part for name, part in state.items() if name not in history}
+        return {**MultiStepVectorEnv.take_episodes(others, rows), **history}
+
+    def parse_options(self, options: Mapping[str, Any], number: int) -> dict[str, Float]:
+        """See :meth:`ReachVectorEnv.parse_options`."""
+        layout = self.task.observation
+        jumps, courses = given_changes(options, number, layout.dimension, layout.n_rows)
+        scene = super().parse_options({k: v for k, v in options.items() if k not in CHANGES}, number)
+        changes = {"jumps": jumps, "courses": courses}
+        return {**scene, **{name: part for name, part in changes.items() if part is not None}}
+
     def _execute_decision(self, plan: MovingPlan, revised: Bool) -> Decision:
         """Run the stages after decoding: scale time, build references, simulate, measure, score and observe."""
         assert self.scenes is not None
@@ -229,7 +248,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         times = {"elapsed": elapsed, "time": episodes.time, "event": event}
         if self.render_mode == "human" and self.terminated[0]:  # shows whole episodes
             self.render()
-        return Decision(self._observe_start(), terms.total(), {**after._asdict(), **terms.as_info(), **times})
+        return Decision(self.observe(), terms.total(), {**after._asdict(), **terms.as_info(), **times})
 
     def _adopt(self, plan: MovingPlan, revised: Bool) -> None:
         """Begin new plans where they were revised, as slow as the arm needs them."""
@@ -313,7 +332,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         for row in rows:
             self._history[row] = []
 
-    def _observe_start(self) -> Observation:
+    def observe(self) -> Observation:
         """Return the present observations."""
         assert self.scenes is not None
         episodes = self._episodes

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.actions.via_points import Plan, checked_plan
-from viapoint.envs.common.types import Float, Int, Observation
+from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import (
     as_given,
     checked_actions,
@@ -27,7 +27,7 @@ from viapoint.envs.common.validation import (
 from viapoint.envs.config import EnvConfig, ViaPointConfig
 from viapoint.envs.mdp.rewards import reward_terms
 from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
-from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.scenes.options import draw_given, given_scenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, Movements, Rollout, join_groups
 from viapoint.envs.sim.scheduler import Scheduler
@@ -46,6 +46,51 @@ class Decision(NamedTuple):
     observation: Observation
     reward: Float
     info: dict[str, Any]
+
+
+class Transition(NamedTuple):
+    """One step of N environments with same-step autoreset."""
+
+    observation: Observation
+    """Observations after the step: where an episode ended, the first ones of the next."""
+    reward: Float
+    """Shape (N,)."""
+    terminated: Bool
+    """Shape (N,)."""
+    truncated: Bool
+    """Shape (N,)."""
+    info: dict[str, Any]
+    """Metrics of the step, shape (N,) each."""
+    last_observation: Observation | None
+    """Observations before autoreset; None if no episode ended."""
+
+    def as_step(self) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
+        """Return the result of `step` in the form of Gymnasium's vector environments."""
+        observation, reward, terminated, truncated, info, last = self
+        ended, everyone = terminated | truncated, np.ones(len(reward), dtype=bool)
+        infos = {**info, **{f"_{name}": everyone.copy() for name in info}}
+        if last is not None:
+            final = np.full(len(reward), None, dtype=object)
+            for i in np.flatnonzero(ended):
+                final[i] = {name: part[i] for name, part in last.items()}
+            kept = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
+            masks = {f"_{name}": ended.copy() for name in info}
+            infos |= {"final_obs": final, "_final_obs": ended.copy()}
+            infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
+        return observation, reward, terminated.copy(), truncated.copy(), infos
+
+
+class NextEpisodes(NamedTuple):
+    """Episodes that were drawn and have not begun."""
+
+    rows: Int
+    """Environments that they belong to."""
+    scenes: Any
+    """Scenes, one for each row."""
+    generators: list[np.random.Generator]
+    """Random generators of all environments after the draw."""
+    first_seed: int | None
+    """Seed of the first generator."""
 
 
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
@@ -69,6 +114,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
+            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -84,7 +131,16 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Class of the keyword arguments, with their defaults."""
     __signature__ = ViaPointConfig.signature()
 
-    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
+    def __new__(cls, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> Any:
+        """Return environments in this process, or in worker processes."""
+        if not whole_number("workers", workers, 0):
+            return super().__new__(cls)
+        from viapoint.envs.worker_env import WorkerVectorEnv
+
+        return WorkerVectorEnv(cls, num_envs, workers, **kwargs)
+
+    def __init__(self, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> None:
+        assert not workers, "__new__ makes the others"
         self.config = config = self.config_kind.of(kwargs)
         EzPickle.__init__(self, num_envs, **as_given(kwargs))
         self.task = config.task()
@@ -110,11 +166,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.scenes: Scenes | None = None
         """Scenes of the running episodes; None before the first reset."""
         self._last: Execution | None = None
-        self._action_names = self.action_layout.names
+        self.action_names = self.action_layout.names
         self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
         self._renderer = self._make_renderer()
         self._build()
-        self.single_action_space = spaces.Box(-1.0, 1.0, (len(self._action_names),), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
         self.single_observation_space = self.observation_layout.space()
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -167,20 +223,57 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
+        self.begin_episodes(self.draw_episodes(seed, rows, options))
+        return self.observe(), {}
+
+    def draw_episodes(
+        self, seed: int | Sequence[int | None] | None, rows: Int, options: Mapping[str, Any]
+    ) -> NextEpisodes:
+        """Draw the next episodes of some environments; the running ones go on.
+
+        Args:
+            seed: Seeds of all environments, see :meth:`reset`.
+            rows: Environments, shape (n,).
+            options: Options of :meth:`reset` without `reset_mask`, one entry for each row where they are batched.
+
+        Raises:
+            ValueError: A given scene is impossible.
+        """
         seeded, first_seed = self._seeded(seed, rows)
-        scenes = self._draw(seeded, rows, options)
-        self.generators = seeded
-        self.use_generator(seeded[0], first_seed)
+        return NextEpisodes(rows, self._draw(seeded, rows, options), seeded, first_seed)
+
+    def begin_episodes(self, episodes: NextEpisodes) -> None:
+        """Begin episodes that :meth:`draw_episodes` returned."""
+        rows, scenes, self.generators, first_seed = episodes
+        self.use_generator(self.generators[0], first_seed)
         self._last = self._last if len(rows) < self.num_envs else None
         self._start(rows, scenes)
-        return self._observe_start(), {}
+
+    def parse_options(self, options: Mapping[str, Any], number: int) -> dict[str, Float]:
+        """Return the options of a reset of `number` environments with one entry for each.
+
+        Raises:
+            ValueError: An option is unknown, or has another shape or type.
+        """
+        d, n = self.arm.dimension, self.task.observation.n_rows
+        empty = Scenes(np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, n, 2 * d + 1)))
+        given = given_scenes(options, empty, self.arm)._asdict()
+        return {name: given[name] for name in options}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
         """Draw the scenes of the first environment from a generator, which was made from `seed`."""
         self._np_random, self._np_random_seed = generator, seed
 
     def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Execute one movement in each environment and start the next episodes.
+        """Execute one action in each environment; where an episode ends, start the next.
+
+        Args:
+            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
+        """
+        return self.transition(actions).as_step()
+
+    def transition(self, actions: Any) -> Transition:
+        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result.
 
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
@@ -191,18 +284,35 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self._decode(actions), lambda: self._draw(self.generators, rows, {})
         )
         assert following is not None
-        final = np.empty(self.num_envs, dtype=object)
-        final[:] = [{name: part[i] for name, part in observation.items()} for i in range(self.num_envs)]
-        masked = {**info, **{f"_{name}": everyone.copy() for name in info}}
-        infos = {
-            **masked,
-            "final_obs": final,
-            "_final_obs": everyone.copy(),
-            "final_info": {name: value.copy() for name, value in masked.items()},
-            "_final_info": everyone.copy(),
-        }
         self._start(rows, following.result())
-        return self._observe_start(), reward, everyone, ~everyone, infos
+        return Transition(self.observe(), reward, everyone, ~everyone, info, observation)
+
+    def state(self) -> dict[str, Any]:
+        """Return scenes, random generators and counters as values and arrays for :meth:`restore`.
+
+        Example:
+            >>> import gymnasium as gym
+            >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=2)
+            >>> first, _ = envs.reset(seed=0)
+            >>> state = envs.unwrapped.state()
+            >>> _ = envs.step(envs.action_space.sample())
+            >>> envs.unwrapped.restore(state)
+            >>> (envs.unwrapped.observe()["goal"] == first["goal"]).all()
+            np.True_
+        """
+        return {
+            "generators": [generator.bit_generator.state for generator in self.generators],
+            "scenes": self._check_running().as_options(),
+            "physics_steps": self.physics_steps,
+            "episodes": None,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of environments of the same kind and number."""
+        self.reset(options=state["scenes"])
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+        self._simulator.physics_steps = int(state["physics_steps"])
 
     def execute_actions(self, actions: Any) -> Decision:
         """Execute one movement in each environment, without a reset.
@@ -240,7 +350,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def _decode(self, actions: Any) -> Movements:
         """Stage 1: return the movements that actions stand for."""
         scenes = self._check_running()
-        actions = checked_actions(actions, self.num_envs, self._action_names)
+        actions = checked_actions(actions, self.num_envs, self.action_names)
         return Movements(scenes, self.action_layout.decode(actions, scenes.start, scenes.goal))
 
     def _execute(
@@ -322,8 +432,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
         self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
 
-    def _observe_start(self) -> Observation:
-        """Return the first observations of the episodes."""
+    def observe(self) -> Observation:
+        """Return the present observations."""
         assert self.scenes is not None
         joints = np.asarray(self.arm.inverse_kinematics(self.scenes.start))
         return self.observation_layout.observe(joints, self.scenes.start, self.scenes)

@@ -100,6 +100,8 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
+            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -129,7 +131,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
             dimension=twin.dimension, joint_range=twin.joint_range, n_rows=twin.n_rows, speed=speed,
             acceleration=acceleration, time_limit=self.control_steps * self.steering.control_step,
         )  # fmt: skip
-        self._action_names = self.steering.names
+        self.action_names = self.steering.names
         self._motion = Motion.at_rest(np.zeros((self.num_envs, arm.dimension)))
         self._rest = RestingSteps(np.zeros(self.num_envs, dtype=np.int64))
         self._episodes = Episodes(
@@ -165,7 +167,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
             actions: Shape (num_envs, D), in [-1, 1]; components beyond are clipped.
         """
         scenes, episodes = self._check_running(), self._episodes
-        actions = checked_actions(actions, self.num_envs, self._action_names)
+        actions = checked_actions(actions, self.num_envs, self.action_names)
         before, first = self._outcome(scenes), episodes.now.steps == 0
         velocity = self.steering.decode(actions, scenes.start, scenes.goal)
         references = self._build_references(velocity)
@@ -183,7 +185,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         if self.render_mode == "human" and (self.terminated | over)[0]:  # shows whole episodes
             self.render()
         info = {**after._asdict(), **terms.as_info(), "reward_progress": progress}
-        return Decision(self._observe_start(), terms.total() + progress, info)
+        return Decision(self.observe(), terms.total() + progress, info)
 
     def _build_references(self, velocity: Float) -> StepReferences:
         """Return references and controls of one control step; where they leave the reach, the arm stays."""
@@ -243,7 +245,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
         self._episodes.begin(rows, joints, scenes.start, clearance)
 
-    def _observe_start(self) -> Observation:
+    def observe(self) -> Observation:
         """Return the present observations."""
         assert self.scenes is not None
         now = self._episodes.now

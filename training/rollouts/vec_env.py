@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ENV_IDS, check_registered
+from viapoint.envs.worker_env import WorkerVectorEnv
 from viapoint.training.config.discount import ELAPSED
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
@@ -49,7 +50,7 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     return spec.id, {
         name: value
         for name, value in spec.kwargs.items()
-        if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
+        if name not in ("render_mode", "threads", "workers") and (name not in usual or usual[name] != value)
     }
 
 
@@ -64,6 +65,7 @@ class ViaVecEnv(VecEnv):
         env_id: Id of a registered environment.
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
+        workers: Processes that share the copies; 0 for none. Results do not depend on it.
         **kwargs: Keyword arguments of the environment.
 
     Raises:
@@ -82,13 +84,15 @@ class ViaVecEnv(VecEnv):
         >>> env.close()
     """
 
-    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, env_id: str, num_envs: int, seed: int | None = None, *, workers: int = 0, **kwargs: Any
+    ) -> None:
         check_registered(env_id)
-        native = gym.spec(env_id).vector_entry_point is not None
-        same_step: dict[str, Any] = (
-            {} if native else {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
-        )
-        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **same_step, **kwargs)
+        if workers and env_id not in ENV_IDS:
+            raise ValueError(
+                f"workers must be 0 for {env_id}; there are worker processes for {', '.join(ENV_IDS)}"
+            )
+        self.venv: Any = self._make(env_id, num_envs, workers, kwargs)
         if self.venv.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise ValueError(
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
@@ -102,14 +106,24 @@ class ViaVecEnv(VecEnv):
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
         self._began = time.monotonic()
-        self._steps_before = 0
         if seed is not None:
             self.seed(seed)
 
+    def _make(self, env_id: str, num_envs: int, workers: int, kwargs: Mapping[str, Any]) -> Any:
+        """Return the vector environment of Gymnasium."""
+        extra: dict[str, Any] = {"workers": workers} if workers else {}
+        if gym.spec(env_id).vector_entry_point is None:
+            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        return gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
+
     @property
     def physics_steps(self) -> int:
-        """Number of physics steps so far; 0 if the environment does not count them."""
-        return self._steps_before + int(getattr(self.venv.unwrapped, "physics_steps", 0))
+        """Number of physics steps so far; 0 if the environment does not count them.
+
+        Movements of similar length are simulated together, each as long as the longest, so the number also depends on
+        the workers.
+        """
+        return int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
     def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
         """Set the options of the next reset.
@@ -195,26 +209,13 @@ class ViaVecEnv(VecEnv):
 
     def state(self) -> dict[str, Any]:
         """Return random generators, running episodes and counters as values and arrays for :meth:`restore`."""
-        env = self.venv.unwrapped
-        return {
-            "generators": [generator.bit_generator.state for generator in env.generators],
-            "scenes": env.scenes.as_options(),
-            "returns": self._returns.copy(),
-            "lengths": self._lengths.copy(),
-            "physics_steps": self.physics_steps,
-            "episodes": env.episodes_state() if hasattr(env, "episodes_state") else None,
-        }
+        counters = {"returns": self._returns.copy(), "lengths": self._lengths.copy()}
+        return {**self.venv.unwrapped.state(), **counters}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of this environment, or of one of the same kind and number of copies."""
-        env = self.venv.unwrapped
-        env.reset(options=state["scenes"])
-        if state.get("episodes"):
-            env.restore_episodes(state["episodes"])
-        for generator, saved in zip(env.generators, state["generators"], strict=True):
-            generator.bit_generator.state = saved
+        self.venv.unwrapped.restore(state)
         self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
-        self._steps_before = int(state["physics_steps"]) - int(env.physics_steps)
 
     def close(self) -> None:
         """Close the environment."""
@@ -230,7 +231,11 @@ class ViaVecEnv(VecEnv):
             raise ValueError(
                 f"the copies share {attr_name}: it can be set for all of them only, not for {indices}"
             )
-        setattr(self.venv.unwrapped, attr_name, value)
+        inner = self.venv.unwrapped
+        if isinstance(inner, WorkerVectorEnv):
+            inner.set_attr(attr_name, value)
+        else:
+            setattr(inner, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
