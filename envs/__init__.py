@@ -14,6 +14,24 @@ if TYPE_CHECKING:
     from viapoint.envs.arm_import.loader import load_arm
     from viapoint.envs.arms import register_arm
     from viapoint.envs.arms.base import Arm
+    from viapoint.envs.geometry.box import Box
+    from viapoint.envs.geometry.convex_mesh import ConvexMesh
+    from viapoint.envs.geometry.cylinder import Cylinder
+    from viapoint.envs.geometry.half_space import HalfSpace
+    from viapoint.envs.geometry.point_cloud import PointCloud
+    from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+    from viapoint.envs.geometry.shape import Shape
+    from viapoint.envs.geometry.shapes import (
+        SHAPES,
+        add_to_model,
+        as_obstacle,
+        as_obstacles,
+        nearest_distance,
+        observation_rows,
+        obstacles_from_json,
+        obstacles_to_json,
+        signed_distances,
+    )
     from viapoint.envs.mdp.task import family_sampler
     from viapoint.envs.record_video import RecordMovements
     from viapoint.envs.replanning_env import ReplanningEnv, ReplanningVectorEnv
@@ -25,20 +43,37 @@ if TYPE_CHECKING:
 else:
     _MODULES = {
         "Arm": "viapoint.envs.arms.base",
-        "ReplanningEnv": "viapoint.envs.replanning_env",
-        "ReplanningVectorEnv": "viapoint.envs.replanning_env",
+        "Box": "viapoint.envs.geometry.box",
+        "Capsule": "viapoint.envs.geometry.round_shapes",
+        "ConvexMesh": "viapoint.envs.geometry.convex_mesh",
+        "Cylinder": "viapoint.envs.geometry.cylinder",
+        "HalfSpace": "viapoint.envs.geometry.half_space",
         "Plan": "viapoint.envs.actions.via_points",
+        "PointCloud": "viapoint.envs.geometry.point_cloud",
         "ReachEnv": "viapoint.envs.single_env",
         "ReachVectorEnv": "viapoint.envs.vector_env",
         "RecordMovements": "viapoint.envs.record_video",
+        "ReplanningEnv": "viapoint.envs.replanning_env",
+        "ReplanningVectorEnv": "viapoint.envs.replanning_env",
+        "SHAPES": "viapoint.envs.geometry.shapes",
+        "Shape": "viapoint.envs.geometry.shape",
+        "Sphere": "viapoint.envs.geometry.round_shapes",
+        "TARGETS": "viapoint.envs.scenes.scene",
         "VelocityEnv": "viapoint.envs.velocity_env",
         "VelocityVectorEnv": "viapoint.envs.velocity_env",
-        "TARGETS": "viapoint.envs.scenes.scene",
+        "add_to_model": "viapoint.envs.geometry.shapes",
+        "as_obstacle": "viapoint.envs.geometry.shapes",
+        "as_obstacles": "viapoint.envs.geometry.shapes",
         "family_sampler": "viapoint.envs.mdp.task",
         "load_arm": "viapoint.envs.arm_import.loader",
+        "nearest_distance": "viapoint.envs.geometry.shapes",
+        "observation_rows": "viapoint.envs.geometry.shapes",
+        "obstacles_from_json": "viapoint.envs.geometry.shapes",
+        "obstacles_to_json": "viapoint.envs.geometry.shapes",
         "register_arm": "viapoint.envs.arms",
         "register_scene_family": "viapoint.envs.scenes.families",
         "rows_of_lights": "viapoint.envs.scenes.scene",
+        "signed_distances": "viapoint.envs.geometry.shapes",
     }
 
     def __getattr__(name):
@@ -54,20 +89,37 @@ register_all()
 
 __all__ = [
     "ENV_IDS",
+    "SHAPES",
     "TARGETS",
     "TASKS",
     "Arm",
+    "Box",
+    "Capsule",
+    "ConvexMesh",
+    "Cylinder",
+    "HalfSpace",
     "Plan",
+    "PointCloud",
     "ReachEnv",
     "ReachVectorEnv",
     "RecordMovements",
     "ReplanningEnv",
     "ReplanningVectorEnv",
+    "Shape",
+    "Sphere",
     "VelocityEnv",
     "VelocityVectorEnv",
+    "add_to_model",
+    "as_obstacle",
+    "as_obstacles",
     "family_sampler",
     "load_arm",
+    "nearest_distance",
+    "observation_rows",
+    "obstacles_from_json",
+    "obstacles_to_json",
     "register_arm",
     "register_scene_family",
     "rows_of_lights",
+    "signed_distances",
 ]

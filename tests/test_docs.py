@@ -49,7 +49,9 @@ def test_the_index_lists_every_page():
         assert path.name == "index.md" or f"]({path.name}" in index, path.name
 
 
-@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/baselines.md", "docs/choosing.md"])
+@pytest.mark.parametrize(
+    "name", ["CONTRIBUTING.md", "docs/baselines.md", "docs/choosing.md", "docs/geometry.md"]
+)
 def test_the_examples_of_a_page_run(name):
     """Each page runs in a process of its own, as some examples register arms, tasks and families."""
     script = "\n".join(examples(ROOT / name))

@@ -15,6 +15,7 @@ Clearance is negative for penetration and at most MAX_CLEARANCE.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 from viapoint.envs.common.arrays import clamp, dot
 from viapoint.primitives.array_api import Array, namespace_of
@@ -58,38 +59,26 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
 def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:
     """Return the squared distance of points from the obstacles' axes, shape (..., n, T), [m^2].
 
-    The nearest point of the segment c + t a, -1 <= t <= 1, to p is at t = (p - c) . a / |a|^2, clamped.
-
     Args:
         points: Positions, shape (..., T, D), [m].
         obstacles: See the module.
         drift: See the module.
     """
-    xp = namespace_of(points)
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
     offset = offset if drift is None else [o - drift[..., i] for i, o in enumerate(offset)]
-    axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
-    square = dot(axis, axis)
-    along = clamp(dot(offset, axis) / xp.where(square > TINY, square, 1.0), -1.0, 1.0)
-    rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
-    return dot(rest, rest)
+    return point_axis_squared(offset, [obstacles[..., :, None, dimension + i] for i in range(dimension)])
 
 
 def segment_distance_squared(first: Array, second: Array, obstacles: Array, drift: Array = None) -> Array:
     """Return the squared distance of segments from the axes of obstacles, shape (..., n, T), [m^2].
 
-    The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
-    Detection, 2005, section 5.1.9, in its notation): the point of the link nearest to the obstacle's line, the point of
-    the obstacle's axis nearest to that, and the point of the link nearest to that.
-
     Args:
         first: One end of each segment, shape (..., T, D), [m].
-        second: Other end of each segment, which must have a length, shape (..., T, D), [m].
+        second: Other end of each segment, shape (..., T, D), [m].
         obstacles: See the module.
         drift: See the module.
     """
-    xp = namespace_of(first)
     dimension = first.shape[-1]
     link = [second[..., None, :, i] - first[..., None, :, i] for i in range(dimension)]
     axis = [2.0 * obstacles[..., :, None, dimension + i] for i in range(dimension)]
@@ -98,17 +87,55 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array, drif
         for i in range(dimension)
     ]
     gap = gap if drift is None else [g - drift[..., i] for i, g in enumerate(gap)]
+    return segment_axis_squared(gap, link, axis)
+
+
+def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
+    """Return the squared distance of points p from segments c + t a, -1 <= t <= 1, [m^2].
+
+    The nearest point of the segment is at t = (p - c) . a / |a|^2, clamped.
+
+    Args:
+        offset: Components of p - c, [m].
+        axis: Components of a, [m].
+    """
+    square = dot(axis, axis)
+    along = clamp(dot(offset, axis) / namespace_of(square).where(square > TINY, square, 1.0), -1.0, 1.0)
+    rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
+    return dot(rest, rest)
+
+
+def segment_axis_squared(gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]) -> Array:
+    """Return the squared distance of segments p + s u from segments q + t v, 0 <= s, t <= 1, [m^2].
+
+    The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
+    Detection, 2005, section 5.1.9, in its notation): the point of the link nearest to the obstacle's line, the point of
+    the obstacle's axis nearest to that, and the point of the link nearest to that.
+
+    Args:
+        gap: Components of p - q, [m].
+        link: Components of u, [m].
+        axis: Components of v, [m].
+    """
+    on_link, on_axis = nearest_on_segments(gap, link, axis)
+    rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
+    return dot(rest, rest)
+
+
+def nearest_on_segments(
+    gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return s and t of the nearest points of two segments; see :func:`segment_axis_squared`."""
+    xp = namespace_of(gap[0])
     a, e, b = dot(link, link), dot(axis, axis), dot(link, axis)
     c, f = dot(link, gap), dot(axis, gap)
-    e = xp.maximum(e, TINY)
+    a, e = xp.maximum(a, TINY), xp.maximum(e, TINY)
     determinant = a * e - b * b
     crosses = determinant > TINY * a * e  # else parallel: any point of the link will do to begin with
     crossing = (b * f - c * e) / xp.where(crosses, determinant, 1.0)
     on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
     on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
-    on_link = clamp((b * on_axis - c) / a, 0.0, 1.0)
-    rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
-    return dot(rest, rest)
+    return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis
 
 
 def _clearance(squared: Array, radii: Array, present: Array) -> Array:

@@ -1,0 +1,109 @@
+"""Boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.arrays import clamp, dot
+from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.shape import (
+    CONTACT,
+    GUARD,
+    Components,
+    Geom,
+    Shape,
+    lowest_of_lines,
+    safe_ratio,
+    spread,
+)
+from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Shape):
+    """Box around its position, with faces along the axes of its frame.
+
+    Example:
+        >>> from viapoint.envs import Box
+        >>> table = Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2), name="table")  # 0.8 m x 1.2 m x 4 cm
+        >>> table.distance([[0.5, 0.0, 0.3], [0.5, 0.1, 0.21]]).round(3).tolist()
+        [0.08, -0.01]
+        >>> table.segment_distance([1.1, 0.0, 0.2], [1.0, 0.0, 0.5], radius=0.05).round(3).item()
+        0.133
+    """
+
+    kind: ClassVar[str] = "box"
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"size": (3,)}
+
+    size: Array
+    """Half lengths along the axes of the frame, shape (..., 3), [m]."""
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Centre and radius, [m]."""
+        return self.position, namespace_of(self.size).sqrt(dot(self._half, self._half))
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo box."""
+        return self._geom(mujoco.mjtGeom.mjGEOM_BOX, *self._half)
+
+    @property
+    def _half(self) -> Components:
+        return [self.size[..., i] for i in range(3)]
+
+    def _signed(self, points: Components) -> Array:
+        return _signed(points, self._half)
+
+    def _nearest(self, start: Components, along: Components) -> Array:
+        """Return t in [0, 1] for which the signed distance is least, exactly.
+
+        Outside, half the derivative of the squared distance is sum_i along_i excess_i(t), where excess_i is how far the
+        point is beyond the box along axis i. It rises with t, and is linear between the six values of t at which the
+        line crosses a plane of a face, so its root follows from the two of these values around it. A segment that
+        enters the box has its deepest point where two of the planes are equally far: a problem of six lines.
+        """
+        xp = namespace_of(start[0])
+        *vectors, x, y, z = spread(*start, *along, *self._half)
+        start, along, half = list(vectors[:3]), list(vectors[3:]), [x, y, z]
+
+        def rise(t: Array) -> Array:
+            places = [p + t * u for p, u in zip(start, along, strict=True)]
+            excess = [q - clamp(q, -h, h) for q, h in zip(places, half, strict=True)]
+            return dot(along, excess)
+
+        low, high = xp.zeros_like(start[0]), xp.ones_like(start[0])
+        falling, rising = rise(low), rise(high)
+        ends = xp.where(falling >= 0.0, low, high)
+        within = (falling < 0.0) & (rising > 0.0)
+        for p, u, h in zip(start, along, half, strict=True):
+            for face in (-h, h):
+                t = clamp(safe_ratio(face - p, u), 0.0, 1.0)
+                at = rise(t)
+                later, sooner = (at < 0.0) & (t > low), (at >= 0.0) & (t < high)
+                low, falling = xp.where(later, t, low), xp.where(later, at, falling)
+                high, rising = xp.where(sooner, t, high), xp.where(sooner, at, rising)
+        t = low + (high - low) * safe_ratio(falling, falling - rising)
+        t = clamp(xp.where(within, t, ends), 0.0, 1.0)
+        inside = _signed([p + t * u for p, u in zip(start, along, strict=True)], half) < CONTACT
+        if inside.any():
+            some = [each[inside] for each in (*start, *along, *half)]
+            lines = [(u, p - h) for p, u, h in zip(some[:3], some[3:6], some[6:], strict=True)]
+            lines += [(-u, -p - h) for p, u, h in zip(some[:3], some[3:6], some[6:], strict=True)]
+            t[inside] = lowest_of_lines(*(xp.stack(each) for each in zip(*lines, strict=True)))
+        return t
+
+    def _support(self, directions: Float) -> Float:
+        return np.asarray(np.sign(directions) * to_numpy(self.size))
+
+
+def _signed(points: Components, half: Components) -> Array:
+    """Return the signed distance of points from a box with given half lengths."""
+    xp = namespace_of(points[0])
+    x, y, z = (xp.abs(p) - h for p, h in zip(points, half, strict=True))
+    outside = [xp.maximum(each, 0.0) for each in (x, y, z)]
+    inside = xp.minimum(xp.maximum(xp.maximum(x, y), z), 0.0)
+    return xp.sqrt(dot(outside, outside) + GUARD) + inside

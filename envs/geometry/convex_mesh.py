@@ -1,0 +1,279 @@
+"""Convex meshes: convex hulls of vertices."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Self
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Index
+from viapoint.envs.common.validation import as_real_array
+from viapoint.envs.geometry.distance import nearest_on_segments
+from viapoint.envs.geometry.shape import (
+    Components,
+    Geom,
+    Shape,
+    best_of,
+    blocks,
+    bounds_of_points,
+    length,
+    lowest_of_lines,
+    nearest_to_origin,
+    spread,
+)
+from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
+
+DENT = 1e-6
+"""Depth of a vertex below the hull, as a share of the mesh's size, from which a mesh is not convex."""
+COPLANAR = 1e-8
+"""Relative difference of planes below which they are one plane."""
+
+
+class Polytope(NamedTuple):
+    """Planes and edges of a convex polytope: all points with normals @ x <= offsets."""
+
+    normals: Float
+    """Outer unit normals of the faces, shape (F, 3)."""
+    offsets: Float
+    """Distances of the faces' planes from the origin, shape (F,), [m]."""
+    starts: Float
+    """One end of each edge, shape (E, 3), [m]."""
+    edges: Float
+    """Vectors to the other end, shape (E, 3), [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexMesh(Shape):
+    """Convex hull of vertices in the shape's frame; the pose may be a batch, the vertices are those of one mesh.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs import ConvexMesh
+        >>> wedge = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 1), (0, 1, 1)]) / 10
+        >>> mesh = ConvexMesh(wedge, position=(0.4, 0.0, 0.2))
+        >>> mesh.distance([[0.5, 0.05, 0.3], [0.45, 0.05, 0.24]]).round(4).tolist()
+        [0.0707, -0.0071]
+        >>> ConvexMesh.hull([*wedge, (0.02, 0.05, 0.05)]).vertices.shape  # without the point inside
+        (6, 3)
+    """
+
+    kind: ClassVar[str] = "convex_mesh"
+
+    vertices: Array
+    """Shape (V, 3), [m]."""
+    faces: Any = None
+    """Triangles as indices of vertices, shape (F, 3); only needed to check that a mesh with these faces is convex."""
+
+    @classmethod
+    def hull(cls, points: Any, **pose: Any) -> Self:
+        """Return the convex hull of points, shape (K, 3), [m]; `pose` are position, quaternion and name."""
+        vertices = _checked_vertices(cls, points, pose.get("name", ""))
+        return cls(vertices[np.unique(hull_triangles(vertices))], **pose)
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Centre and radius, [m]."""
+        return self._placed(*bounds_of_points(self.vertices))
+
+    @functools.cached_property
+    def polytope(self) -> Polytope:
+        """Planes and edges of the hull."""
+        return _polytope(self.vertices)
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo mesh."""
+        (geom,) = self._geom(mujoco.mjtGeom.mjGEOM_MESH)
+        return [geom._replace(vertices=self.vertices)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameters as plain lists; the faces follow from the vertices."""
+        return {name: value for name, value in super().to_dict().items() if name != "faces"}
+
+    def _check(self) -> None:
+        try:
+            vertices = _checked_vertices(type(self), self.vertices, self.name)
+            _check_convex(vertices, self.faces)
+        except ValueError as error:
+            raise self._error(str(error)) from None
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", None)
+
+    def _signed(self, points: Components) -> Array:
+        """Return the signed distance.
+
+        The nearest point of the surface is on a face, if the foot of the perpendicular on the plane with the greatest
+        height lies on that face, and on an edge otherwise. Below all planes the height is the signed distance.
+        """
+        xp = namespace_of(points[0])
+        shape = points[0].shape
+        flat = [p.reshape(-1) for p in spread(*points)]
+        face, edge, on_face = self._features(np.stack([to_numpy(p) for p in flat]))
+        body = self.polytope
+        normal = [like(xp, c, flat[0]) for c in body.normals[face].T]
+        height = sum(p * n for p, n in zip(flat, normal, strict=True)) - like(xp, body.offsets[face], flat[0])
+        along = [like(xp, c, flat[0]) for c in body.edges[edge].T]
+        offset = [p - like(xp, c, flat[0]) for p, c in zip(flat, body.starts[edge].T, strict=True)]
+        share = nearest_to_origin(offset, [-u for u in along])
+        beside = length([o - share * u for o, u in zip(offset, along, strict=True)])
+        chosen = like(xp, on_face.astype(np.float64), flat[0]) > 0.5
+        return xp.where(chosen, height, beside).reshape(shape)
+
+    def _features(self, points: Float) -> tuple[Index, Index, Any]:
+        """Return the highest plane, the nearest edge, and True where the plane's face is nearest, for points (3, M)."""
+        body, number = self.polytope, points.shape[1]
+        face, edge = np.zeros(number, np.intp), np.zeros(number, np.intp)
+        on_face = np.ones(number, dtype=bool)
+        size = COPLANAR * (1.0 + np.abs(body.offsets).max())
+        points = points.astype(np.float64, copy=False)
+        for some in blocks(number, len(body.offsets)):
+            heights = body.normals @ points[:, some] - body.offsets[:, None]
+            highest = heights.argmax(axis=0)
+            height = heights[highest, np.arange(len(highest))]
+            foot = points[:, some] - height * body.normals[highest].T
+            off = (body.normals @ foot - body.offsets[:, None]).max(axis=0) > size
+            face[some], on_face[some] = highest, ~(off & (height > 0.0))
+        others = np.flatnonzero(~on_face)
+        square = (body.edges * body.edges).sum(axis=1)[:, None]
+        for part in blocks(len(others), 3 * len(body.edges)):
+            here = points[:, others[part]]
+            along = body.edges @ here - (body.edges * body.starts).sum(axis=1)[:, None]
+            share = np.clip(along / square, 0.0, 1.0)
+            # |p - s|^2 without |p|^2, which is common to all edges
+            squared = (body.starts * body.starts).sum(axis=1)[:, None] - 2.0 * (body.starts @ here)
+            edge[others[part]] = (squared - share * (2.0 * along - share * square)).argmin(axis=0)
+        return face, edge, on_face
+
+    def _nearest(self, start: Components, along: Components) -> Array:
+        """Return t in [0, 1] for which the signed distance is least, exactly.
+
+        Outside, the nearest point is an end, or it is nearest to an edge. Of a segment that enters the mesh, the
+        deepest point is where the greatest of the heights above all planes is least.
+        """
+        xp = namespace_of(start[0])
+        *vectors, first = spread(*start, *along, start[0] + along[0])
+        flat = np.stack([to_numpy(v).astype(np.float64).reshape(-1) for v in vectors])
+        body, number = self.polytope, flat.shape[1]
+        beside, within = np.zeros(number), np.zeros(number)
+        for some in blocks(number, 8 * len(body.edges)):
+            here, way = flat[:3, some], flat[3:, some]
+            gap = [p - s[:, None] for p, s in zip(here, body.starts.T, strict=True)]
+            edge, link = [e[:, None] for e in body.edges.T], list(way)
+            on_link, on_edge = nearest_on_segments(gap, link, edge)
+            squared = sum(
+                np.square(g + on_link * u - on_edge * e) for g, u, e in zip(gap, link, edge, strict=True)
+            )
+            beside[some] = on_link[squared.argmin(axis=0), np.arange(on_link.shape[1])]
+            within[some] = lowest_of_lines(body.normals @ way, body.normals @ here - body.offsets[:, None])
+
+        def at(t: Float) -> Any:
+            return self._signed(list(flat[:3] + t * flat[3:]))
+
+        t = best_of(np, at, (beside, within, np.zeros(number), np.ones(number)))
+        return like(xp, t.reshape(first.shape), first)
+
+    def _support(self, directions: Float) -> Float:
+        return np.asarray(self.vertices[(directions @ self.vertices.T).argmax(axis=1)])
+
+
+def hull_triangles(vertices: Float) -> Index:
+    """Return the triangles of the convex hull of vertices as indices, shape (F, 3); their order of corners is free.
+
+    MuJoCo computes hulls (Qhull); only the indices are used, because it keeps vertices in single precision.
+
+    Raises:
+        ValueError: The vertices lie in a plane.
+    """
+    different, index = np.unique(vertices, axis=0, return_index=True)
+    size = np.ptp(vertices, axis=0).max()
+    unit = (different - vertices.mean(axis=0)) / (size if size > 0.0 else 1.0)
+    if len(unit) < 4 or np.linalg.svd(unit - unit.mean(axis=0))[1][2] < DENT:
+        raise ValueError("vertices must span a volume, they lie in a plane; use a thin box or a point cloud")
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="hull", uservert=unit.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull", contype=1, conaffinity=1)
+    graph = spec.compile().mesh_graph
+    corners, triangles = graph[:2]
+    faces = graph[2 + 3 * corners + 3 * triangles :].reshape(-1, 3)
+    return np.asarray(index[faces])
+
+
+def _checked_vertices(cls: type[ConvexMesh], points: Any, name: str) -> Float:
+    """Return vertices as an array, shape (V, 3)."""
+    array = as_real_array(points)
+    if array is None or array.ndim != 2 or array.shape[-1] != 3 or len(array) < 4:
+        got = "no real numbers" if array is None else f"shape {array.shape}"
+        raise ValueError(f"vertices must have shape (V, 3) with V at least 4, got {got}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"vertices must be finite, got {array[~np.isfinite(array).all(axis=1)][0].tolist()}")
+    return array.astype(np.float64)
+
+
+def _check_convex(vertices: Float, faces: Any) -> None:
+    """Check that all vertices lie on their hull, and that the faces, if given, enclose all of it."""
+    triangles = hull_triangles(vertices)
+    normals, offsets = _planes(vertices, triangles)
+    depth = (offsets - vertices @ normals.T).min(axis=1)
+    deepest, size = int(depth.argmax()), np.ptp(vertices, axis=0).max()
+    hint = "ConvexMesh.hull(vertices) is the hull"
+    if depth[deepest] > DENT * size:
+        raise ValueError(
+            f"vertices are not those of a convex mesh: vertex {deepest} lies {depth[deepest]:.3g} m inside their hull; "
+            f"{hint}"
+        )
+    if faces is None:
+        return
+    corners = np.asarray(faces)
+    if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
+        raise ValueError(f"faces must be triangles, integers of shape (F, 3), got shape {corners.shape}")
+    if corners.size and not 0 <= corners.min() <= corners.max() < len(vertices):
+        raise ValueError(f"faces must be indices of the {len(vertices)} vertices, got {corners.max()}")
+    enclosed, whole = abs(_volume(vertices, corners)), _hull_volume(vertices, triangles)
+    if abs(enclosed - whole) > 10.0 * DENT * whole:
+        raise ValueError(
+            f"faces are not those of a convex mesh: they enclose {enclosed:.4g} m^3, their hull "
+            f"{whole:.4g} m^3; {hint}"
+        )
+
+
+def _volume(vertices: Float, triangles: Any) -> float:
+    """Return the signed volume within triangles, [m^3]."""
+    a, b, c = (vertices[triangles[:, i]] - vertices.mean(axis=0) for i in range(3))
+    return float((a * np.cross(b, c)).sum() / 6.0)
+
+
+def _hull_volume(vertices: Float, triangles: Index) -> float:
+    """Return the volume of the hull, [m^3]."""
+    a, b, c = (vertices[triangles[:, i]] - vertices.mean(axis=0) for i in range(3))
+    return float(np.abs((a * np.cross(b, c)).sum(axis=1)).sum() / 6.0)
+
+
+def _planes(vertices: Float, triangles: Index) -> tuple[Float, Float]:
+    """Return outer unit normals and offsets of the planes of triangles; no vertex is above a plane."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals = normals / norm(normals)[:, None]
+    normals = (
+        normals * np.where((normals * (a - vertices.mean(axis=0))).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    )
+    return normals, (vertices @ normals.T).max(axis=0)
+
+
+def _polytope(vertices: Float) -> Polytope:
+    """Return the planes and edges of the hull of vertices; triangles of one plane become one face."""
+    triangles = hull_triangles(vertices)
+    normals, offsets = _planes(vertices, triangles)
+    near = np.abs(normals[:, None] - normals).max(axis=-1) < COPLANAR
+    plane = (near & (np.abs(offsets[:, None] - offsets) < COPLANAR)).argmax(axis=1)
+    sides: dict[tuple[int, int], set[int]] = {}
+    for corners, face in zip(triangles, plane, strict=True):
+        for i in range(3):
+            first, second = sorted((int(corners[i - 1]), int(corners[i])))
+            sides.setdefault((first, second), set()).add(int(face))
+    edges = np.array([ends for ends, faces in sides.items() if len(faces) > 1])
+    kept = np.unique(plane)
+    starts = vertices[edges[:, 0]]
+    return Polytope(normals[kept], offsets[kept], starts, vertices[edges[:, 1]] - starts)

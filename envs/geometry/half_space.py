@@ -1,0 +1,78 @@
+"""Half-spaces: floors and walls without an end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.shape import Components, Geom, Shape, quaternion_to
+from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace(Shape):
+    """Solid below the plane through its position; the z axis of its frame is the outward normal.
+
+    Example:
+        >>> from viapoint.envs import HalfSpace
+        >>> floor = HalfSpace(position=(0.0, 0.0, -0.1))
+        >>> wall = HalfSpace.facing((-1.0, 0.0, 0.0), position=(0.8, 0.0, 0.0))  # all points with x > 0.8
+        >>> point = [0.5, 0.0, 0.4]
+        >>> floor.distance(point).item(), wall.distance(point).round(3).item()
+        (0.5, 0.3)
+    """
+
+    kind: ClassVar[str] = "half_space"
+
+    @classmethod
+    def facing(cls, normal: Any, position: Any = (0.0, 0.0, 0.0), name: str = "") -> Self:
+        """Return the half-space of an outward normal.
+
+        Args:
+            normal: Shape (3,), of any length.
+            position: A point of the surface, shape (3,), [m].
+            name: Name for error messages.
+        """
+        return cls(position=position, quaternion=quaternion_to(normal), name=name)
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Position and infinity: no sphere contains a half-space."""
+        return self.position, namespace_of(self.position).full_like(self.position[..., 0], np.inf)
+
+    def footprint(self, extent: float = 2.0) -> list[Float]:
+        """Return the part of a square of half length `extent` that is solid at the height 0; nothing if it is empty."""
+        corners = extent * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+        normal, at = self.rotation[:, 2], to_numpy(self.position)
+        height = corners @ normal[:2] - normal @ at
+        outline = []
+        for i in range(4):  # Sutherland & Hodgman, Reentrant polygon clipping, 1974
+            if height[i] <= 0.0:
+                outline.append(corners[i])
+            if height[i] * height[i - 3] < 0.0:
+                share = height[i] / (height[i] - height[i - 3])
+                outline.append(corners[i] + share * (corners[i - 3] - corners[i]))
+        return [np.array(outline)] if outline else []
+
+    def box(self) -> tuple[Float, Float]:
+        """Return the position and zeros: no box contains a half-space."""
+        return to_numpy(self.position), np.zeros(3)
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo plane."""
+        return self._geom(mujoco.mjtGeom.mjGEOM_PLANE, 0.0, 0.0, 0.01)
+
+    def _relative(self, points: Array) -> Components:
+        offset, normal = self._offset(points), self._axes[2]
+        return [offset[0] * normal[0] + offset[1] * normal[1] + offset[2] * normal[2]]
+
+    def _signed(self, points: Components) -> Array:
+        return points[0]
+
+    def _nearest(self, start: Components, along: Components) -> Array:
+        xp = namespace_of(along[0])
+        return xp.where(along[0] < 0.0, xp.ones_like(along[0]), xp.zeros_like(along[0]))

@@ -1,0 +1,116 @@
+"""Point clouds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import as_real_array
+from viapoint.envs.geometry.distance import TINY
+from viapoint.envs.geometry.shape import (
+    OUTLINE_POINTS,
+    Components,
+    Geom,
+    Shape,
+    blocks,
+    bounds_of_points,
+    length,
+    spread,
+)
+from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud(Shape):
+    """Spheres of one radius around points, as a depth camera sees them; the pose may be a batch.
+
+    The signed distance is that of the nearest sphere. Inside overlapping spheres this is at most the depth below the
+    surface of their union.
+
+    Example:
+        >>> from viapoint.envs import PointCloud
+        >>> cloud = PointCloud([(0.4, 0.0, 0.2), (0.4, 0.02, 0.2), (0.42, 0.0, 0.21)], radius=0.01)
+        >>> cloud.distance([0.4, 0.0, 0.3]).round(4).item()
+        0.0822
+    """
+
+    kind: ClassVar[str] = "point_cloud"
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
+
+    points: Array
+    """Shape (K, 3), [m]."""
+    radius: Array = 0.01
+    """Radius of the spheres, [m]."""
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Centre and radius, [m]."""
+        centre, size = bounds_of_points(self.points)
+        return self._placed(centre, size + self.radius)
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo sphere for each point."""
+        (geom,) = self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, self.radius)
+        places = self.points @ self.rotation.T + to_numpy(self.position)
+        return [geom._replace(position=place) for place in places]
+
+    def footprint(self, extent: float = 2.0) -> list[Float]:
+        """Return a circle for each point; see :meth:`Shape.footprint`."""
+        del extent
+        turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS // 8, endpoint=False)
+        circle = float(self.radius) * np.stack((np.cos(turn), np.sin(turn)), axis=-1)
+        return [geom.position[:2] + circle for geom in self.geoms()]
+
+    def _check(self) -> None:
+        array = as_real_array(self.points)
+        if array is None or array.ndim != 2 or array.shape[-1] != 3 or not len(array):
+            got = "no real numbers" if array is None else f"shape {array.shape}"
+            raise self._error(f"points must have shape (K, 3) with K at least 1, got {got}")
+        if not (finite := np.isfinite(array).all(axis=1)).all():
+            wrong = int(finite.argmin())
+            raise self._error(
+                f"points must be finite, got {array[wrong].tolist()} at index {wrong} ({(~finite).sum()} of "
+                f"{len(array)} points); remove them: points[np.isfinite(points).all(axis=1)]"
+            )
+        object.__setattr__(self, "points", array.astype(np.float64))
+
+    def _signed(self, points: Components) -> Array:
+        xp = namespace_of(points[0])
+        *parts, _ = spread(*points, points[0])
+        flat = [p.reshape(-1) for p in parts]
+        nearest = self._nearest_points(np.stack([to_numpy(p) for p in flat]).astype(np.float64, copy=False))
+        offset = [p - like(xp, c, flat[0]) for p, c in zip(flat, nearest, strict=True)]
+        return length(offset).reshape(parts[0].shape) - self.radius
+
+    def _nearest_points(self, points: Float) -> Float:
+        """Return the points of the cloud that are nearest to other points, shape (3, M) both."""
+        nearest = np.empty_like(points)
+        square = (self.points * self.points).sum(axis=1)[:, None]
+        for some in blocks(points.shape[1], len(self.points)):
+            # |p - q|^2 without |p|^2, which is common to all points of the cloud
+            index = (square - 2.0 * (self.points @ points[:, some])).argmin(axis=0)
+            nearest[:, some] = self.points[index].T
+        return nearest
+
+    def _nearest(self, start: Components, along: Components) -> Array:
+        """Return t in [0, 1] for which the segment is nearest to a point of the cloud, exactly."""
+        xp = namespace_of(start[0])
+        *vectors, first = spread(*start, *along, start[0] + along[0])
+        flat = np.stack([to_numpy(v).astype(np.float64).reshape(-1) for v in vectors])
+        found = np.zeros(flat.shape[1])
+        for some in blocks(len(found), 8 * len(self.points)):
+            gap = [q[:, None] - p for q, p in zip(self.points.T, flat[:3, some], strict=True)]
+            link = flat[3:, some]
+            square = np.maximum((link * link).sum(axis=0), TINY)
+            t = (sum(g * u for g, u in zip(gap, link, strict=True)) / square).clip(0.0, 1.0)
+            squared = sum(np.square(g - t * u) for g, u in zip(gap, link, strict=True))
+            found[some] = t[squared.argmin(axis=0), np.arange(t.shape[1])]
+        return like(xp, found.reshape(first.shape), first)
+
+    def _support(self, directions: Float) -> Float:
+        farthest = self.points[(directions @ self.points.T).argmax(axis=1)]
+        return np.asarray(farthest + float(self.radius) * directions)

@@ -1,0 +1,137 @@
+"""Spheres and capsules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.arrays import in_space, norm
+from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.distance import point_axis_squared, segment_axis_squared
+from viapoint.envs.geometry.shape import (
+    GUARD,
+    Components,
+    Geom,
+    Shape,
+    length,
+    nearest_to_origin,
+    quaternion_to,
+)
+from viapoint.primitives.array_api import Array, namespace_of
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Shape):
+    """Sphere around its position.
+
+    Example:
+        >>> from viapoint.envs import Sphere
+        >>> ball = Sphere(0.05, position=(0.4, 0.0, 0.3))
+        >>> ball.distance([0.4, 0.0, 0.5], radius=0.03).round(3).item()  # of a sphere of 3 cm, [m]
+        0.12
+    """
+
+    kind: ClassVar[str] = "sphere"
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
+
+    radius: Array
+    """Shape (...,), [m]."""
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Centre and radius, [m]."""
+        return self.position, self.radius
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo sphere."""
+        return self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, self.radius)
+
+    def _relative(self, points: Array) -> Components:
+        return self._offset(points)
+
+    def _signed(self, points: Components) -> Array:
+        return length(points) - self.radius
+
+    def _nearest(self, start: Components, along: Components) -> Array:
+        return nearest_to_origin(start, along)
+
+    def _support(self, directions: Float) -> Float:
+        return np.asarray(self.radius * directions)
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule(Shape):
+    """Capsule around a part of its z axis: all points within a radius of the segment.
+
+    Example:
+        >>> from viapoint.envs import Capsule
+        >>> bar = Capsule.between((0.2, -0.1, 0.3), (0.2, 0.1, 0.3), radius=0.02)
+        >>> bar.distance([0.5, 0.0, 0.3]).round(3).item()
+        0.28
+        >>> bar.segment_distance([0.5, 0.0, 0.3], [0.3, 0.0, 0.3], radius=0.05).round(3).item()
+        0.03
+    """
+
+    kind: ClassVar[str] = "capsule"
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
+
+    radius: Array
+    """Shape (...,), [m]."""
+    half_length: Array
+    """Half length of the segment, shape (...,), [m]."""
+
+    @classmethod
+    def between(cls, first: Any, second: Any, radius: Any, name: str = "") -> Self:
+        """Return the capsule around the segment between two points.
+
+        Args:
+            first: One end, shape (3,), or (2,) for an obstacle in the plane, [m].
+            second: The other end, [m].
+            radius: [m].
+            name: Name for error messages.
+        """
+        first, second = (in_space(np.asarray(end, dtype=np.float64)) for end in (first, second))
+        half = 0.5 * (second - first)
+        turn, size = quaternion_to(half), norm(half)
+        return cls(radius, size, position=0.5 * (first + second), quaternion=turn, name=name)
+
+    @property
+    def half_axis(self) -> Array:
+        """Vector from the centre to one end of the segment, shape (..., 3), [m]."""
+        return namespace_of(self.position).stack(self._half_axis, -1)
+
+    @property
+    def bounding_sphere(self) -> tuple[Array, Array]:
+        """Centre and radius, [m]."""
+        return self.position, self.radius + self.half_length
+
+    def segment_distance(self, first: Array, second: Array, radius: Array = 0.0) -> Array:
+        """Return the distance from segments; see :meth:`Shape.segment_distance`."""
+        own, (first, second) = self._matched(first, second)
+        start, half = own._offset(first), own._half_axis
+        gap = [p + h for p, h in zip(start, half, strict=True)]
+        link = [second[..., i] - first[..., i] for i in range(3)]
+        squared = segment_axis_squared(gap, link, [2.0 * h for h in half])
+        return namespace_of(squared).sqrt(squared + GUARD) - own.radius - radius
+
+    def geoms(self) -> list[Geom]:
+        """Return one MuJoCo capsule."""
+        return self._geom(mujoco.mjtGeom.mjGEOM_CAPSULE, self.radius, self.half_length)
+
+    @property
+    def _half_axis(self) -> Components:
+        return [self.half_length * c for c in self._axes[2]]
+
+    def _relative(self, points: Array) -> Components:
+        return self._offset(points)
+
+    def _signed(self, points: Components) -> Array:
+        squared = point_axis_squared(points, self._half_axis)
+        return namespace_of(squared).sqrt(squared + GUARD) - self.radius
+
+    def _support(self, directions: Float) -> Float:
+        ends = np.sign(directions[:, 2:]) * np.array([0.0, 0.0, float(self.half_length)])
+        return np.asarray(self.radius * directions + ends)

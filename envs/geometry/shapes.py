@@ -1,0 +1,272 @@
+"""Table of all obstacle shapes, lists of obstacles as dictionaries and JSON, and distances from lists of obstacles."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float, Single
+from viapoint.envs.geometry.box import Box
+from viapoint.envs.geometry.convex_mesh import ConvexMesh
+from viapoint.envs.geometry.cylinder import Cylinder
+from viapoint.envs.geometry.half_space import HalfSpace
+from viapoint.envs.geometry.point_cloud import PointCloud
+from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+from viapoint.envs.geometry.shape import Shape
+from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+
+SHAPES: dict[str, type[Shape]] = {
+    shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
+}
+"""Shapes by their names in dictionaries."""
+ROW_SIZE = len(SHAPES) + 13
+"""Number of values of one obstacle in :func:`observation_rows`."""
+
+
+def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
+    """Return a shape from its dictionary; a shape is returned as it is.
+
+    Args:
+        value: Shape, or a mapping with its kind as `shape`, its parameters, and optionally `position`, `quaternion` and
+            `name`.
+
+    Raises:
+        ValueError: The shape or a parameter is unknown or missing, or a value is not allowed.
+
+    Example:
+        >>> from viapoint.envs import as_obstacle
+        >>> box = as_obstacle({"shape": "box", "size": (0.1, 0.2, 0.02), "position": (0.5, 0.0, 0.3)})
+        >>> box.distance([0.5, 0.0, 0.5]).round(3).item()
+        0.18
+        >>> as_obstacle({"shape": "box", "sizes": (0.1, 0.2, 0.02)})
+        Traceback (most recent call last):
+        ValueError: box: unknown parameter 'sizes', did you mean 'size'? Parameters are size, position, quaternion, name
+    """
+    if isinstance(value, Shape):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError(f"an obstacle must be a shape of viapoint.envs or a dictionary, got {value!r:.80}")
+    values = dict(value)
+    kind = values.pop("shape", None)
+    shape = SHAPES.get(kind) if isinstance(kind, str) else None
+    if shape is None:
+        known = f"Shapes are {', '.join(SHAPES)}"
+        if kind is None:
+            raise ValueError(f"the key 'shape' is missing. {known}")
+        raise ValueError(f"unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
+    allowed = shape.parameters()
+    named = f"{kind} {values['name']!r}" if values.get("name") else str(kind)
+    for name in values:
+        if name not in allowed:
+            known = f"Parameters are {', '.join(allowed)}"
+            raise ValueError(f"{named}: unknown parameter {name!r}{_meant(name, allowed)} {known}")
+    try:
+        return shape(**values)
+    except TypeError:
+        missing = [f.name for f in fields(shape) if f.name not in values and f.default is f.default_factory]
+        raise ValueError(f"{named}: missing {', '.join(missing)}") from None
+
+
+def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
+    """Return shapes from a list of shapes and dictionaries; an error names the index of the obstacle.
+
+    Example:
+        >>> from viapoint.envs import as_obstacles
+        >>> as_obstacles([{"shape": "sphere", "radius": 0.1}, {"shape": "sphere", "radius": -1.0}])
+        Traceback (most recent call last):
+        ValueError: obstacle 1: sphere: radius must be greater than 0, got -1.0
+    """
+    found = []
+    for i, value in enumerate(values):
+        try:
+            found.append(as_obstacle(value))
+        except ValueError as error:
+            raise ValueError(f"obstacle {i}: {error}") from None
+    return found
+
+
+def obstacles_to_json(obstacles: Iterable[Shape | Mapping[str, Any]]) -> str:
+    """Return obstacles as JSON.
+
+    Example:
+        >>> from viapoint.envs import Sphere, obstacles_from_json, obstacles_to_json
+        >>> text = obstacles_to_json([Sphere(0.1, position=(0.5, 0.0, 0.3))])
+        >>> text
+        '[{"shape": "sphere", "radius": 0.1, "position": [0.5, 0.0, 0.3], "quaternion": [1.0, 0.0, 0.0, 0.0]}]'
+        >>> obstacles_from_json(text) == [Sphere(0.1, position=(0.5, 0.0, 0.3))]
+        True
+    """
+    return json.dumps([each.to_dict() for each in as_obstacles(obstacles)])
+
+
+def obstacles_from_json(text: str) -> list[Shape]:
+    """Return the obstacles of :func:`obstacles_to_json`.
+
+    Raises:
+        ValueError: The text is not JSON, not a list, or an obstacle is not allowed.
+
+    Example:
+        >>> from viapoint.envs import obstacles_from_json
+        >>> [table] = obstacles_from_json('[{"shape": "box", "size": [0.4, 0.6, 0.02], "name": "table"}]')
+        >>> table.name, table.size.tolist()
+        ('table', [0.4, 0.6, 0.02])
+    """
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"obstacles must be JSON ({error})") from None
+    if not isinstance(values, list):
+        raise ValueError(f"obstacles must be a JSON list of dictionaries, got {type(values).__name__}")
+    return as_obstacles(values)
+
+
+def signed_distances(
+    obstacles: Sequence[Shape], first: Array, second: Array | None = None, radius: Array = 0.0
+) -> Array:
+    """Return the signed distance of spheres or capsules from each of n obstacles, shape (..., n), [m].
+
+    Args:
+        obstacles: n shapes.
+        first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
+        second: The other end; None for spheres.
+        radius: Radius, [m].
+
+    Example:
+        >>> from viapoint.envs import Box, Sphere, signed_distances
+        >>> scene = [Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2)), Sphere(0.05, position=(0.5, 0.2, 0.27))]
+        >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
+        [0.02, 0.12]
+    """
+    first = first if hasattr(first, "dtype") else np.asarray(first, dtype=np.float64)
+    if not obstacles:
+        return namespace_of(first).zeros_like(first[..., :0])
+    each = [
+        o.distance(first, radius) if second is None else o.segment_distance(first, second, radius)
+        for o in obstacles
+    ]
+    return namespace_of(each[0]).stack(each, -1)
+
+
+def nearest_distance(
+    obstacles: Sequence[Shape],
+    first: Float,
+    second: Float | None = None,
+    radius: Any = 0.0,
+    most: float = np.inf,
+) -> Float:
+    """Return the least signed distance of spheres or capsules from all obstacles, shape (...,), at most `most`, [m].
+
+    Broad phase: bounding spheres bound every distance from below. Narrow phase: obstacles in the order of their bounds;
+    distances are only computed where the bound is below the least distance so far.
+
+    Args:
+        obstacles: Shapes.
+        first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
+        second: The other end; None for spheres.
+        radius: Radius, which broadcasts with the leading axes, [m].
+        most: Greatest distance of interest, [m].
+
+    Example:
+        >>> from viapoint.envs import HalfSpace, Sphere, nearest_distance
+        >>> nearest_distance([HalfSpace(), Sphere(0.1, position=(0.5, 0.0, 0.3))], [0.5, 0.0, 0.6], most=1.0).round(3)
+        np.float64(0.2)
+    """
+    first = np.asarray(first, dtype=np.float64)
+    ends = [first] if second is None else [first, np.asarray(second, dtype=np.float64)]
+    shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
+    flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
+    size = np.broadcast_to(radius, shape).reshape(-1)
+    middle = flat[0] if second is None else 0.5 * (flat[0] + flat[1])
+    reach = size + (0.0 if second is None else _length(flat[1] - middle))
+    least = np.full(len(middle), float(most))
+    if not obstacles:
+        return least.reshape(shape)
+    spheres = [(to_numpy(c), float(to_numpy(r))) for c, r in (o.bounding_sphere for o in obstacles)]
+    bounds = np.stack([_length(middle - centre) - wide - reach for centre, wide in spheres])
+    for which in np.argsort(bounds.min(axis=1), kind="stable"):
+        some = np.flatnonzero(bounds[which] < least)
+        if some.size:
+            found = signed_distances(
+                [obstacles[which]], flat[0][some], None if second is None else flat[1][some], size[some]
+            )[:, 0]
+            least[some] = np.minimum(least[some], found)
+    return least.reshape(shape)
+
+
+def observation_rows(obstacles: Sequence[Shape], n_rows: int) -> Single:
+    """Return obstacles as rows of numbers for networks, shape (n_rows, ROW_SIZE); absent rows are zero.
+
+    A row is (shape one-hot, centre 3, rotation 6, half lengths 3, present): the centre and half lengths are those of
+    the bounding box along the axes of the shape's frame, [m], and the rotation is the first two axes of the frame (Zhou
+    et al., On the continuity of rotation representations in neural networks, 2019).
+
+    Example:
+        >>> from viapoint.envs import Box, observation_rows
+        >>> rows = observation_rows([Box((0.1, 0.2, 0.25), position=(0.5, 0.0, 0.25))], n_rows=2)
+        >>> rows[0, 7:].astype(float).round(3).tolist()  # behind the one-hot
+        [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.2, 0.25, 1.0]
+    """
+    if len(obstacles) > n_rows:
+        raise ValueError(f"there may be at most {n_rows} obstacles, got {len(obstacles)}")
+    rows, kinds = np.zeros((n_rows, ROW_SIZE), np.float32), list(SHAPES)
+    for row, each in zip(rows, obstacles, strict=False):
+        row[kinds.index(each.kind)] = 1.0
+        centre, half = each.box()
+        row[len(SHAPES) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
+    return rows
+
+
+def add_to_model(
+    spec: mujoco.MjSpec, obstacles: Sequence[Shape], body: Any = None, **attributes: Any
+) -> list[list[str]]:
+    """Add the geoms of obstacles to a MuJoCo model, and return their names, one list for each obstacle.
+
+    Args:
+        spec: Model.
+        obstacles: Shapes.
+        body: Body of the geoms; the world by default.
+        **attributes: Attributes of all geoms, such as `contype` or `rgba`.
+
+    Example:
+        >>> import mujoco
+        >>> from viapoint.envs import Box, Capsule, add_to_model
+        >>> spec = mujoco.MjSpec()
+        >>> add_to_model(spec, [Box((0.1, 0.1, 0.1)), Capsule(0.02, 0.1, position=(0.0, 0.0, 0.2), name="post")])
+        [['obstacle_0_0'], ['post_0']]
+        >>> spec.compile().ngeom
+        2
+    """
+    body = spec.worldbody if body is None else body
+    names: list[list[str]] = []
+    for i, each in enumerate(obstacles):
+        names.append([])
+        for j, geom in enumerate(each.geoms()):
+            name = f"{each.name or f'obstacle_{i}'}_{j}"
+            mesh = {}
+            if geom.vertices is not None:
+                mesh = {"meshname": name}
+                spec.add_mesh(
+                    name=name, uservert=geom.vertices.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+                )  # fmt: skip
+            body.add_geom(
+                name=name, type=geom.type, size=geom.size, pos=geom.position, quat=geom.quaternion,
+                **mesh, **attributes,
+            )  # fmt: skip
+            names[-1].append(name)
+    return names
+
+
+def _length(vectors: Float) -> Any:
+    return np.sqrt((vectors * vectors) @ np.ones(3))
+
+
+def _meant(name: Any, known: Iterable[str]) -> str:
+    """Return a suggestion for a misspelled name."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    return f", did you mean {close[0]!r}?" if close else "."

@@ -1,0 +1,422 @@
+"""Signed distances of all shapes are those of independent libraries, and records say what is not allowed."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from viapoint.envs import (
+    SHAPES,
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    HalfSpace,
+    PointCloud,
+    Shape,
+    Sphere,
+    as_obstacle,
+    as_obstacles,
+    nearest_distance,
+    observation_rows,
+    obstacles_from_json,
+    obstacles_to_json,
+    signed_distances,
+)
+from viapoint.envs.geometry import shapes
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from geometry import Probes, agreement, random_shape
+
+ALL = pytest.mark.parametrize("kind", SHAPES)
+CLOSED = ("sphere", "capsule", "cylinder", "box")
+"""Shapes whose parameters may be a batch of sizes."""
+CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
+POSE = {"position": (0.1, -0.2, 0.3), "quaternion": (0.5, -0.5, 0.1, 0.7)}
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(8)
+
+
+@pytest.fixture
+def segments(generator):
+    """Ends of segments that pass by shapes, touch them, and lie inside, shape (200, 3)."""
+    return generator.uniform(-0.5, 0.5, (2, 200, 3)) * np.where(np.arange(200) % 2, 1.0, 0.3)[:, None]
+
+
+@ALL
+@pytest.mark.parametrize("long", [False, True])
+def test_distances_and_contacts_agree_with_coal_and_mujoco(kind, long):
+    found = agreement(kind, 500, 1, long=long)
+    assert max(found.coal, found.mujoco, found.depth) < 1e-6
+    assert 100 < found.contacts < 400
+    assert found.wrong == 0
+
+
+@ALL
+def test_a_segment_is_as_near_as_its_nearest_point(kind, generator, segments):
+    shape, (first, second) = random_shape(kind, generator), segments
+    share = np.linspace(0.0, 1.0, 1001)[:, None, None]
+    brute = shape.distance(first + share * (second - first)).min(axis=0)
+    found = shape.segment_distance(first, second)
+    assert (found <= brute + 1e-9).all()
+    np.testing.assert_allclose(found, brute, atol=1e-3)
+    assert (found < -0.01).any()
+    assert (found > 0.1).any()
+    np.testing.assert_allclose(shape.segment_distance(first, first), shape.distance(first), atol=1e-9)
+    np.testing.assert_allclose(shape.segment_distance(second, first), found, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHAPES if kind != "point_cloud"])
+def test_the_search_that_a_new_shape_inherits_finds_the_same(kind, generator, segments):
+    shape, (first, second) = random_shape(kind, generator), segments
+    start, end = shape._relative(first), shape._relative(second)
+    t = Shape._nearest(shape, start, [b - a for a, b in zip(start, end, strict=True)])
+    searched = shape.distance(first + t[:, None] * (second - first))
+    np.testing.assert_allclose(searched, shape.segment_distance(first, second), atol=1e-8)
+
+
+@ALL
+def test_capsules_along_faces_edges_and_axes(kind):
+    """Where formulas divide by zero: segments that are parallel to, perpendicular to, or on something."""
+    shape = as_obstacle(
+        {
+            "shape": kind,
+            **{
+                "sphere": {"radius": 0.1},
+                "capsule": {"radius": 0.1, "half_length": 0.1},
+                "half_space": {},
+            }.get(kind, {}),
+            **({"radius": 0.1, "half_length": 0.1} if kind == "cylinder" else {}),
+            **({"size": (0.1, 0.1, 0.1)} if kind == "box" else {}),
+            **({"vertices": 2.0 * CUBE - 0.1} if kind == "convex_mesh" else {}),
+            **({"points": 2.0 * CUBE - 0.1, "radius": 0.05} if kind == "point_cloud" else {}),
+        }
+    )
+    places = 0.1 * np.array(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij")).reshape(3, -1).T
+    first, second = np.repeat(places, len(places), axis=0), np.tile(places, (len(places), 1))
+    found = shape.segment_distance(first, second)
+    share = np.linspace(0.0, 1.0, 61)[:, None, None]
+    brute = shape.distance(first + share * (second - first)).min(axis=0)
+    assert np.isfinite(found).all()
+    assert (found <= brute + 1e-9).all()
+    assert (found >= brute - 0.006).all()
+
+
+@ALL
+def test_distances_move_with_the_shape(kind, generator, segments):
+    shape, (first, second) = random_shape(kind, generator), segments
+    turn, shift = HalfSpace(**POSE).rotation, np.array([0.3, -0.1, 0.2])
+    matrix = turn @ shape.rotation
+    w = 0.5 * np.sqrt(max(1.0 + np.trace(matrix), 1e-9))
+    x, y, z = (
+        np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+        / 4
+        / w
+    )
+    values = {**shape.to_dict(), "position": turn @ shape.position + shift, "quaternion": (w, x, y, z)}
+    moved = as_obstacle(values)
+    for distance, ends in (("distance", [first]), ("segment_distance", [first, second])):
+        there = [end @ turn.T + shift for end in ends]
+        np.testing.assert_allclose(
+            getattr(moved, distance)(*there), getattr(shape, distance)(*ends), atol=1e-7
+        )
+
+
+@ALL
+def test_radii_shrink_distances_and_leading_axes_broadcast(kind, generator, segments):
+    shape, (first, second) = random_shape(kind, generator), segments
+    radius = generator.uniform(0.0, 0.1, (5, 1))
+    np.testing.assert_allclose(shape.distance(first, radius), shape.distance(first) - radius, atol=1e-15)
+    found = shape.segment_distance(first.reshape(4, 50, 3), second[:50], 0.02)
+    for i in range(4):
+        alone = shape.segment_distance(first[50 * i : 50 * (i + 1)], second[:50]) - 0.02
+        np.testing.assert_allclose(found[i], alone, atol=1e-12)
+    assert np.shape(shape.segment_distance(first[0], second[0])) == ()
+    assert shape.distance(first[:0]).shape == shape.segment_distance(first[:0], second[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("kind", CLOSED)
+def test_a_batch_of_shapes_is_those_shapes(kind, generator, segments):
+    each = [random_shape(kind, generator) for _ in range(6)]
+    batch = SHAPES[kind](
+        **{
+            name: np.stack([getattr(s, name) for s in each])
+            for name in each[0].parameters()
+            if name != "name"
+        }
+    )
+    first, second = (end[:30, None] for end in segments)
+    np.testing.assert_allclose(batch.distance(first), signed_distances(each, first[:, 0]), atol=1e-14)
+    np.testing.assert_allclose(
+        batch.segment_distance(first, second), signed_distances(each, first[:, 0], second[:, 0]), atol=1e-12
+    )
+    centre, radius = batch.bounding_sphere
+    assert centre.shape == (6, 3)
+    assert radius.shape == (6,)
+
+
+@ALL
+def test_torch_and_single_precision_give_the_same(kind, generator, segments):
+    shape, (first, second) = random_shape(kind, generator), segments
+    exact = shape.distance(first), shape.segment_distance(first, second)
+    tensors = [torch.as_tensor(end) for end in segments]
+    for mine, theirs in zip(
+        exact, (shape.distance(tensors[0]), shape.segment_distance(*tensors)), strict=True
+    ):
+        assert theirs.dtype == torch.float64
+        np.testing.assert_allclose(theirs.numpy(), mine, atol=1e-12)
+    single = [end.astype(np.float32) for end in segments]
+    for mine, theirs in zip(exact, (shape.distance(single[0]), shape.segment_distance(*single)), strict=True):
+        assert theirs.dtype == np.float32
+        np.testing.assert_allclose(theirs, mine, atol=2e-6)
+    assert shape.distance(tensors[0].float()).dtype == torch.float32
+
+
+@ALL
+def test_gradients_are_those_of_finite_differences(kind, generator, segments):
+    shape, step = random_shape(kind, generator), 1e-6
+    points, ends = segments[0][:60], np.concatenate(segments[:, :60])
+    for distance, places in (
+        (shape.distance, points),
+        (lambda ends: shape.segment_distance(ends[:60], ends[60:]), ends),
+    ):
+        tensor = torch.as_tensor(places).requires_grad_()
+        distance(tensor).sum().backward()
+        shifted = [step * np.eye(3)[i] for i in range(3)]
+        for i, shift in enumerate(shifted):
+            each = np.zeros_like(places)
+            for half in np.split(np.arange(len(places)), len(places) // 60):
+                there = np.zeros_like(places)
+                there[half] = shift
+                each[half, i] = (distance(places + there) - distance(places - there)) / (2.0 * step)
+            error = np.abs(each[:, i] - tensor.grad.numpy()[:, i])
+            assert (error < 1e-5).mean() > 0.97  # not at kinks
+    wall = torch.as_tensor(np.asarray(shape.position) + 0.0 * points).requires_grad_()
+    shape.distance(wall).sum().backward()
+    assert torch.isfinite(wall.grad).all()
+
+
+@pytest.mark.parametrize("kind", CLOSED)
+def test_gradients_reach_sizes_and_poses(kind, generator, segments):
+    shape, step = random_shape(kind, generator), 1e-6
+    values = {n: getattr(shape, n) for n in shape.parameters() if n not in ("name", "quaternion")}
+    tensors = {n: torch.tensor(v, dtype=torch.float64, requires_grad=True) for n, v in values.items()}
+    pose = {"quaternion": shape.quaternion}
+    ends = [torch.as_tensor(end) for end in segments]
+    SHAPES[kind](**tensors, **pose).segment_distance(*ends).sum().backward()
+    for name, tensor in tensors.items():
+        for index in np.ndindex(tensor.shape):
+            changed = []
+            for sign in (1.0, -1.0):
+                other = np.array(values[name], dtype=float)
+                other[index] += sign * step
+                changed.append(
+                    SHAPES[kind](**{**values, name: other}, **pose).segment_distance(*segments).sum()
+                )
+            slope = (changed[0] - changed[1]) / (2.0 * step)
+            assert tensor.grad.numpy()[index] == pytest.approx(slope, abs=1e-3)
+
+
+@ALL
+def test_descriptions_contain_the_shape(kind, generator):
+    shape = random_shape(kind, generator)
+    centre, radius = shape.bounding_sphere
+    places = centre + min(radius, 0.5) * generator.uniform(-1.0, 1.0, (4000, 3))
+    inside = places[shape.distance(places) < 0.0]
+    assert len(inside) > 40
+    assert (np.linalg.norm(inside - centre, axis=-1) <= radius).all()
+    outlines = shape.footprint()
+    covered = np.zeros(len(inside), dtype=bool)
+    for outline in outlines:
+        following = np.roll(outline, -1, axis=0)
+        side = np.cross(
+            np.append(following - outline, np.zeros((len(outline), 1)), axis=1)[:, None],
+            np.append(inside[:, :2] - outline[:, None], np.zeros((len(outline), len(inside), 1)), axis=-1),
+        )[..., 2]
+        covered |= (side >= -2e-4).all(axis=0)
+    assert kind == "half_space" or covered.all()
+    middle, half = shape.box()
+    if kind != "half_space":
+        assert (np.abs((inside - middle) @ shape.rotation) <= half + 1e-9).all()
+    (row, absent) = observation_rows([shape], 2)
+    assert list(SHAPES)[row[: len(SHAPES)].argmax()] == kind
+    assert row[: len(SHAPES)].sum() == row[-1] == 1.0
+    np.testing.assert_allclose(row[-4:-1], half, rtol=1e-6)
+    np.testing.assert_allclose(row[-13:-10], middle, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(row[-10:-4].reshape(2, 3), shape.rotation[:, :2].T, atol=1e-6)
+    assert not absent.any()
+
+
+def test_a_wall_seen_from_above_covers_its_side():
+    (outline,) = HalfSpace.facing((1.0, 0.0, 0.0), position=(0.5, 0.0, 0.0)).footprint(extent=1.0)
+    assert sorted(map(tuple, outline)) == [(-1.0, -1.0), (-1.0, 1.0), (0.5, -1.0), (0.5, 1.0)]
+    assert HalfSpace(position=(0.0, 0.0, -1.0)).footprint() == []
+
+
+@ALL
+def test_json_keeps_obstacles_as_they_are(kind, generator):
+    shape = random_shape(kind, generator)
+    named = as_obstacle({**shape.to_dict(), "name": "it"})
+    assert named.name == "it"
+    assert named != shape
+    assert obstacles_from_json(obstacles_to_json([shape, named])) == [shape, named]
+    assert obstacles_from_json(obstacles_to_json([shape.to_dict()])) == [shape]
+    assert json.loads(obstacles_to_json([shape]))[0]["shape"] == kind
+
+
+def test_the_nearest_of_many_obstacles_is_the_least_of_all_distances(generator, segments, monkeypatch):
+    obstacles = [random_shape(kind, generator) for kind in SHAPES for _ in range(4) if kind != "half_space"]
+    obstacles.append(HalfSpace(position=(0.0, 0.0, -0.4)))
+    first, second = segments
+    radius = generator.uniform(0.0, 0.05, len(first))
+    asked = []
+    original = shapes.signed_distances
+
+    def counted(which, points, *others):
+        asked.append(len(points))
+        return original(which, points, *others)
+
+    monkeypatch.setattr(shapes, "signed_distances", counted)
+    for ends in ((first,), (first, second)):
+        least = original(obstacles, *ends, radius=radius[:, None][:, 0]).min(axis=-1)
+        for most in (np.inf, 0.05):
+            found = nearest_distance(obstacles, *ends, radius=radius, most=most)
+            np.testing.assert_allclose(found, np.minimum(least, most), atol=1e-12)
+    assert sum(asked) < 0.6 * 4 * len(first) * len(obstacles)
+    np.testing.assert_array_equal(nearest_distance([], first, most=1.0), 1.0)
+    assert signed_distances([], first).shape == (200, 0)
+
+
+def test_a_mesh_of_a_box_is_the_box(generator, segments):
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (0.1, 0.2, 0.05)
+    box, mesh = Box((0.1, 0.2, 0.05), **POSE_UNIT), ConvexMesh(corners, **POSE_UNIT)
+    assert len(mesh.polytope.offsets) == 6
+    assert len(mesh.polytope.edges) == 12
+    np.testing.assert_allclose(mesh.distance(segments[0]), box.distance(segments[0]), atol=1e-9)
+    np.testing.assert_allclose(mesh.segment_distance(*segments), box.segment_distance(*segments), atol=1e-9)
+
+
+POSE_UNIT = {**POSE, "quaternion": np.array(POSE["quaternion"]) / np.linalg.norm(POSE["quaternion"])}
+
+
+def test_a_capsule_between_two_points_has_them_as_ends():
+    bar = Capsule.between((0.1, 0.2, 0.3), (0.4, 0.1, 0.2), 0.02)
+    np.testing.assert_allclose(bar.position + bar.half_axis, (0.4, 0.1, 0.2), atol=1e-12)
+    np.testing.assert_allclose(bar.position - bar.half_axis, (0.1, 0.2, 0.3), atol=1e-12)
+    assert Capsule.between((0.1, 0.2), (0.3, 0.2), 0.02).position.tolist() == pytest.approx([0.2, 0.2, 0.0])
+
+
+def test_a_quaternion_is_normalised_if_it_is_nearly_a_unit():
+    turned = Sphere(0.1, quaternion=(0.9995, 0.0, 0.0, 0.0))
+    assert turned.quaternion.tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+DENTED = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0.1, 0.1, 0.1)])
+STAR = ((0, 1, 2), (0, 1, 4), (1, 2, 4), (0, 2, 4))
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        (
+            {"shape": "boks", "size": (1, 1, 1)},
+            "unknown shape 'boks', did you mean 'box'? Shapes are sphere,",
+        ),
+        ({"shape": "torus"}, "unknown shape 'torus'. Shapes are sphere, capsule, cylinder, box"),
+        ({"shape": 3}, "unknown shape 3. Shapes are"),
+        ({"size": (1, 1, 1)}, "the key 'shape' is missing. Shapes are"),
+        ("box", "must be a shape of viapoint.envs or a dictionary, got 'box'"),
+        ({"shape": "box"}, "box: missing size"),
+        ({"shape": "cylinder", "radius": 0.1}, "cylinder: missing half_length"),
+        (
+            {"shape": "box", "size": (1, 1, 1), "centre": 0},
+            "box: unknown parameter 'centre'. Parameters are size,",
+        ),
+        ({"shape": "sphere", "radius": 0.0}, "sphere: radius must be greater than 0, got 0.0"),
+        ({"shape": "sphere", "radius": -0.1, "name": "ball"}, "sphere 'ball': radius must be greater than 0"),
+        (
+            {"shape": "box", "size": (0.1, -0.1, 0.1)},
+            "box: size must be greater than 0, got (0.1, -0.1, 0.1)",
+        ),
+        ({"shape": "box", "size": (0.1, 0.1)}, "box: size must have shape (..., 3), got shape (2,)"),
+        (
+            {"shape": "capsule", "radius": "a", "half_length": 1},
+            "capsule: radius must be an array of real numbers",
+        ),
+        ({"shape": "sphere", "radius": np.nan}, "sphere: radius must be finite, got nan"),
+        ({"shape": "half_space", "position": (0, 0)}, "half_space: position must have shape (..., 3)"),
+        ({"shape": "half_space", "position": (0, 0, np.inf)}, "half_space: position must be finite, got inf"),
+        (
+            {"shape": "half_space", "quaternion": (1, 1, 0, 0)},
+            "quaternion must have length 1 (within 0.001), got",
+        ),
+        ({"shape": "half_space", "quaternion": (0, 0, 0, 0)}, "got length 0"),
+        (
+            {"shape": "convex_mesh", "vertices": CUBE[:3]},
+            "vertices must have shape (V, 3) with V at least 4, got",
+        ),
+        ({"shape": "convex_mesh", "vertices": CUBE[:4]}, "vertices must span a volume, they lie in a plane"),
+        ({"shape": "convex_mesh", "vertices": np.zeros((5, 3))}, "vertices must span a volume"),
+        ({"shape": "convex_mesh", "vertices": CUBE * np.nan}, "vertices must be finite"),
+        (
+            {"shape": "convex_mesh", "vertices": DENTED},
+            "not those of a convex mesh: vertex 4 lies 0.1 m inside their hull; ConvexMesh.hull(vertices) is",
+        ),
+        (
+            {
+                "shape": "convex_mesh",
+                "vertices": DENTED[:4],
+                "faces": ((0, 1, 2), (0, 1, 3), (1, 2, 9), (0, 2, 3)),
+            },
+            "faces must be indices of the 4 vertices, got 9",
+        ),
+        (
+            {
+                "shape": "convex_mesh",
+                "vertices": DENTED[:4],
+                "faces": ((0, 1, 2), (0, 1, 3), (1, 2, 0), (0, 2, 3)),
+            },
+            "faces are not those of a convex mesh",
+        ),
+        (
+            {"shape": "point_cloud", "points": [(0, 0, 0), (0, np.nan, 0)]},
+            "points must be finite, got [0.0, nan,",
+        ),
+        (
+            {"shape": "point_cloud", "points": np.zeros((0, 3))},
+            "points must have shape (K, 3) with K at least 1",
+        ),
+        ({"shape": "point_cloud", "points": CUBE, "radius": 0}, "point_cloud: radius must be greater than 0"),
+    ],
+)
+def test_what_is_no_obstacle_is_refused_with_its_index_and_what_is_allowed(value, reason):
+    with pytest.raises(ValueError, match=r"^obstacle 1: ") as caught:
+        as_obstacles([Sphere(0.1), value])
+    assert reason in str(caught.value)
+
+
+def test_text_that_is_no_list_of_obstacles_is_refused():
+    for text, reason in (("[", "must be JSON"), ("{}", "must be a JSON list of dictionaries, got dict")):
+        with pytest.raises(ValueError, match=reason):
+            obstacles_from_json(text)
+    with pytest.raises(ValueError, match="at most 1 obstacles, got 2"):
+        observation_rows([Sphere(0.1), Sphere(0.1)], 1)
+
+
+def test_a_mesh_with_the_faces_of_its_hull_is_convex():
+    faces = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+    assert ConvexMesh(DENTED[:4], faces) == ConvexMesh(DENTED[:4])
+    assert len(ConvexMesh.hull(DENTED).vertices) == 4
+
+
+def test_probes_are_near_contact(generator):
+    shape = Cylinder(0.1, 0.1)
+    probes = Probes.around(shape, 100, generator, long=True)
+    assert (np.abs(probes.clearance(shape)) < 0.006).mean() > 0.3
+    assert PointCloud([(0.0, 0.0, 0.0)]).radius == 0.01
