@@ -268,12 +268,12 @@ def ablations(study: dict[str, Any]) -> str:
 
 
 ROWS = {
-    "viaq-0": "agent, learned alone",
-    "viaq-4": "agent, 4 checks",
-    "viaq-16": "agent, 16 checks",
-    "viaq-64": "agent, 64 checks",
-    "untrained-0": "untrained network",
-    "untrained-64": "untrained network, 64 checks",
+    "viaq-0": "viaq, learned alone",
+    "viaq-4": "viaq, 4 checks",
+    "viaq-16": "viaq, 16 checks",
+    "viaq-64": "viaq, 64 checks",
+    "untrained-0": "viaq untrained",
+    "untrained-64": "viaq untrained, 64 checks",
     "search16": "search, 16 checks",
     "search64": "search, 64 checks",
     "search512": "search, 512 checks",

@@ -10,9 +10,9 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 STUDY = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
 ROWS = {
-    "agent, learned alone": ("viaq", "alone"),
-    "agent, 64 checks": ("viaq", "checked"),
-    "untrained network, 64 checks": ("viaq", "untrained"),
+    "viaq, learned alone": ("viaq", "alone"),
+    "viaq, 64 checks": ("viaq", "checked"),
+    "viaq untrained, 64 checks": ("viaq", "untrained"),
     "search without learning, 16 checks": ("search16", None),
     "search without learning, 512 checks": ("search512", None),
     "SAC": ("sac", "alone"),

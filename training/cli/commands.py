@@ -8,10 +8,10 @@ import gymnasium as gym
 
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.agent import Agent, load_agent
-from viapoint.training.cli.progress import evenly_spread, progress_bar
+from viapoint.training.cli.progress import progress_bar
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import check_baselines, task_of
+from viapoint.training.evaluation.evaluator import check_baselines, evenly_spread, task_of
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import write_json
 from viapoint.training.planners.baselines import agent_method
@@ -50,7 +50,7 @@ def evaluate(config: EvaluateConfig) -> None:
     env_id, env_kwargs = task_of(agent, config.env, None)
     check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
-    scenes = whole.take(slice(0, config.n_scenes))
+    scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
     with progress_bar() as progress:
         result = measure(
             agent,

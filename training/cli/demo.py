@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
 from viapoint.training.algorithms.model_io import untrained
-from viapoint.training.cli.progress import evenly_spread, progress_bar
+from viapoint.training.cli.progress import progress_bar
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
 from viapoint.training.io.files import BadFileError, read_json
 from viapoint.training.planners.baselines import Method, agent_method, make_method
 from viapoint.training.plotting import plots
@@ -64,7 +64,8 @@ def run(config: DemoConfig) -> None:
     trained = _trained(config)
     model_folder = find_model(folder)
     agent = load_agent(model_folder)
-    frozen = load("test", config.env).take(slice(0, config.n_scenes))
+    frozen = load("test", config.env)
+    frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
     record = _measured(config, agent, frozen)
     pictures: dict[str, Callable[[Path], Any]] = {
         "learning_curve.png": lambda path: plots.learning_curve(path, {"agent": trained.curve}),

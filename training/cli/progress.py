@@ -1,19 +1,12 @@
-"""Progress bar of commands, and the scenes that they show."""
+"""Progress bar of commands."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import numpy as np
 from tqdm.auto import tqdm
-
-
-def evenly_spread(number: int, count: int) -> Any:
-    """Return at most `count` indices, evenly spread over `number`."""
-    return np.unique(np.linspace(0, number - 1, min(count, number)).round().astype(int))
 
 
 @contextmanager

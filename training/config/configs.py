@@ -236,7 +236,7 @@ class EvaluateConfig(Config):
     scenes: str = "test"
     """Scene set: validation, test, hard, or a scene file."""
     n_scenes: int | None = None
-    """Number of scenes, from the first on; all if not given."""
+    """Number of scenes, evenly spread over the set; all if not given."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
     failures: Path | None = None
@@ -352,7 +352,7 @@ class DemoConfig(Config):
     n_timesteps: int | None = None
     """Decisions in total; default: a quarter of those of the preset."""
     n_scenes: int | None = None
-    """Number of test scenes; all if not given."""
+    """Number of test scenes, evenly spread over the set; all if not given."""
     checks: int = 16
     """Number of proposals that the agent checks with exact geometry in its second row of the table."""
 

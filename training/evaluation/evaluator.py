@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
@@ -194,7 +194,7 @@ def evaluate(
         env: Id of the environment; that of the agent if not given.
         env_kwargs: Keyword arguments of the environment; those of the agent if not given.
         scenes: `validation`, `test`, `hard`, the path of a scene file, or a scene set.
-        n_scenes: Number of scenes, from the first on; all if not given.
+        n_scenes: Number of scenes, evenly spread over the set; all if not given.
         checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
             agent's own setting if not given.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
@@ -223,12 +223,18 @@ def evaluate(
     methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
     return evaluate_methods(
         methods,
-        chosen.take(slice(0, n_scenes)),
+        chosen.take(evenly_spread(len(chosen.share), n_scenes)),
         env_id,
         env_kwargs=kwargs,
         time_decisions=time_decisions,
         progress=progress,
     )
+
+
+def evenly_spread(number: int, count: int | None) -> Int:
+    """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
+    kept = number if count is None else min(number, count)
+    return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
 def task_of(
