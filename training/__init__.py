@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from viapoint.training.algorithms.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
+    from viapoint.training.rollouts.ray_vec_env import LostEpisodesCallback, RayVecEnv
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
@@ -23,6 +24,8 @@ else:
         "ElapsedTimeCallback": "viapoint.training.algorithms.smdp_buffers",
         "EvaluationResult": "viapoint.training.evaluation.evaluator",
         "GeometrySearch": "viapoint.training.search.geometry_search",
+        "LostEpisodesCallback": "viapoint.training.rollouts.ray_vec_env",
+        "RayVecEnv": "viapoint.training.rollouts.ray_vec_env",
         "Run": "viapoint.training.runs.run_dir",
         "SceneExtractor": "viapoint.training.algorithms.extractors",
         "TrainConfig": "viapoint.training.config.configs",
@@ -48,6 +51,8 @@ __all__ = [
     "ElapsedTimeCallback",
     "EvaluationResult",
     "GeometrySearch",
+    "LostEpisodesCallback",
+    "RayVecEnv",
     "Run",
     "SceneExtractor",
     "TrainConfig",

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import runner_jobs
 
-from viapoint.training.io.ray_cluster import LOOPBACK, import_ray
-from viapoint.training.study.ray_runner import check_versions
+from viapoint.training.io.ray_cluster import LOOPBACK, check_versions, import_ray
 from viapoint.training.study.runner import Job, make_runner
 
 

@@ -32,6 +32,8 @@ ELSEWHERE = {
     "vectorization_mode": "the environments are native vector environments",
     "vector_kwargs": "the environments are native vector environments",
     "wrappers": "the environments are trained on as they are",
+    "workers": "--rollout-workers shares the environments among processes",
+    "on": "--on names the place of rollout workers",
 }
 """Arguments that a training's environment does not take, and what to use instead."""
 GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
@@ -53,6 +55,16 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
     for name in kwargs:
         if name in ELSEWHERE:
             raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
+
+
+def check_rollout_workers(workers: int, on: str, n_envs: int | None) -> None:
+    """Check the number of rollout workers and their place."""
+    if on not in ("local", "ray") and not on.startswith("ray://"):
+        raise ValueError(f"on must be local, ray or ray://HOST:PORT, got {on!r}")
+    if on != "local" and not workers:
+        raise ValueError(f"on={on} needs rollout workers; give their number, such as rollout_workers=2")
+    if n_envs is not None and workers > n_envs:
+        raise ValueError(f"rollout_workers must be at most n_envs, which is {n_envs}, got {workers}")
 
 
 def check_whole_movements(env: str) -> None:

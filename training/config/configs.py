@@ -21,6 +21,7 @@ from viapoint.training.config.checks import (
     check_folder,
     check_has_scenes,
     check_hyperparameters,
+    check_rollout_workers,
     check_whole,
     check_whole_movements,
 )
@@ -115,6 +116,7 @@ class TrainConfig(Config):
         "n_envs": 1,
         "eval_every": 0,
         "checkpoint_every": 1,
+        "rollout_workers": 0,
     }
 
     env: EnvId = DEFAULT_ENV
@@ -146,6 +148,11 @@ class TrainConfig(Config):
     """Time that gamma discounts once, [s], if decisions report their duration; default: that of the preset."""
     progress: bool = True
     """Show a progress bar."""
+    rollout_workers: int = 0
+    """Processes or actors that share the environments, 0 for none; the agent does not depend on it."""
+    on: str = "local"
+    """Place of the rollout workers: local for processes of this machine, ray for the cluster of RAY_ADDRESS, or without
+    that variable for a Ray on this machine, or ray://HOST:PORT."""
 
     def _check(self) -> None:
         check_env(self.env)
@@ -157,6 +164,7 @@ class TrainConfig(Config):
                 f"{', '.join(STEP_PRESETS)}"
             )
         check_env_kwargs(self.env_kwargs)
+        check_rollout_workers(self.rollout_workers, self.on, None if self.resume else self.copies)
         check_hyperparameters(self.algo, self.hyperparameters)
         if self.discount_unit is not None:
             check_discount_unit(self.algo, self.discount_unit, self.env)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Mapping
 from typing import Any
+
+from viapoint.training.io.installed import installed
 
 SILENCE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_TQDM_PATCH_PRINT": "0"}
 """Environment variables of Ray: it sends nothing to its authors."""
@@ -76,3 +79,44 @@ def _check_listens(address: str) -> None:
     if not colon or not port.isdigit():
         raise ValueError("it must be HOST:PORT")
     socket.create_connection((host, int(port)), timeout=10.0).close()
+
+
+def check_nodes(options: Mapping[str, Any] | None = None) -> None:
+    """Check that every node has the packages of this machine.
+
+    Args:
+        options: Options of the function that runs on the nodes.
+
+    Raises:
+        ValueError: One has other versions, or lacks a package; the message names it.
+    """
+    ray = import_ray()
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    there = ray.remote(num_cpus=0, max_retries=0, **(options or {}))(installed)
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    asked = [
+        there.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote()
+        for node in nodes
+    ]
+    for node, reference in zip(nodes, asked, strict=True):
+        name = f"{node['NodeManagerHostname']}/{node['NodeID'][:6]}"
+        try:
+            found = ray.get(reference)
+        except Exception as error:  # such as of a node that lacks a package
+            reason = " ".join(str(error).split())[-300:]
+            raise ValueError(f"node {name} cannot run viapoint: {reason}") from error
+        check_versions(found, installed(), name)
+
+
+def check_versions(found: dict[str, str], wanted: dict[str, str], node: str) -> None:
+    """Check that the packages of a node are those of the driver.
+
+    Raises:
+        ValueError: They are not; the message names them.
+    """
+    others = [
+        f"{name} {found.get(name)}, not {wanted[name]}" for name in wanted if found.get(name) != wanted[name]
+    ]
+    if others:
+        raise ValueError(f"node {node} has {'; '.join(others)}: install the same versions on all nodes")

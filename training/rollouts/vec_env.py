@@ -98,7 +98,8 @@ class ViaVecEnv(VecEnv):
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
             )
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
-        super().__init__(num_envs, self.venv.single_observation_space, self.venv.single_action_space)
+        spaces = self.venv.single_observation_space, self.venv.single_action_space
+        VecEnv.__init__(self, num_envs, *spaces)
         self.last_outcome: dict[str, NDArray[Any]] = {}
         """Outcomes of the episodes that ended in the last step, one entry of each array per episode."""
         self._batched_options: Mapping[str, Any] | None = None

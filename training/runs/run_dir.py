@@ -39,7 +39,7 @@ from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
 
-MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress", "rollout_workers", "on"}
 """Fields that may differ when a run is resumed."""
 
 

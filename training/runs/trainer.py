@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.envs.registration import REPLANNING_TASKS
+from viapoint.envs.worker_process import WorkerDiedError
 from viapoint.training.algorithms.model_io import build
 from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
@@ -38,7 +39,7 @@ UNFIT = (
 
 
 class TrainingFailedError(Exception):
-    """Training could not continue, for example because the disk is full; files saved before are intact."""
+    """Training could not continue, as a disk is full or a worker died, for example; files saved before are intact."""
 
 
 def train(config: TrainConfig, callback: Callbacks = None) -> Run:
@@ -118,6 +119,23 @@ def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     )
 
 
+def training_env(config: TrainConfig) -> ViaVecEnv:
+    """Return the environments of a training, in this process or shared by rollout workers.
+
+    Raises:
+        ImportError: Ray is asked for and not installed.
+        ValueError: There is no such environment or cluster.
+    """
+    workers = config.rollout_workers
+    if config.on == "local":
+        return ViaVecEnv(config.env, config.copies, workers=workers, **config.env_kwargs)
+    from viapoint.training.rollouts.ray_vec_env import RayVecEnv
+
+    env = RayVecEnv(config.env, config.copies, workers=workers, on=config.on, **config.env_kwargs)
+    assert isinstance(env, ViaVecEnv)
+    return env
+
+
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end.
@@ -126,7 +144,7 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         ValueError: There is no such environment or model.
     """
     try:
-        env = ViaVecEnv(config.env, config.copies, **config.env_kwargs)
+        env = training_env(config)
     except TypeError as error:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     try:
@@ -172,7 +190,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
     try:
         with _logging(model, run), RunCallback(run) as monitor:
             _learn(model, run, monitor, callback)
-    except OSError as error:
+    except (OSError, WorkerDiedError) as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
             f"{run.decisions}, and viapoint train --resume goes on from there"
@@ -195,7 +213,9 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         run.write_config()
-    run.config = dataclasses.replace(run.config, progress=config.progress)
+    run.config = dataclasses.replace(
+        run.config, progress=config.progress, rollout_workers=config.rollout_workers, on=config.on
+    )
     began, now = run.versions, versions()
     others = [
         f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]

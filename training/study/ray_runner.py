@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 from filelock import FileLock, Timeout
 
 from viapoint.training.io.installed import installed
-from viapoint.training.io.ray_cluster import connect, import_ray
+from viapoint.training.io.ray_cluster import check_nodes, check_versions, connect, import_ray
 from viapoint.training.study.folder_sync import Changes, Sender, pack, unpack
 from viapoint.training.study.job import LINEAR_ALGEBRA, Answer, Job, answer
 
@@ -75,7 +75,7 @@ class RayRunner:
         self._connected = connect(address, workers)
         self._full: set[str] = set()
         try:
-            check_nodes()
+            check_nodes(ONE_THREAD)
             from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
             here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
@@ -228,41 +228,3 @@ def _own_cores(number: int) -> Iterator[None]:
             yield
         finally:
             os.sched_setaffinity(0, before)
-
-
-def check_nodes() -> None:
-    """Check that every node has the packages of this machine.
-
-    Raises:
-        ValueError: One has other versions, or lacks a package; the message names it.
-    """
-    ray = import_ray()
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    there = ray.remote(num_cpus=0, max_retries=0, **ONE_THREAD)(installed)
-    nodes = [node for node in ray.nodes() if node["Alive"]]
-    asked = [
-        there.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote()
-        for node in nodes
-    ]
-    for node, reference in zip(nodes, asked, strict=True):
-        name = f"{node['NodeManagerHostname']}/{node['NodeID'][:6]}"
-        try:
-            found = ray.get(reference)
-        except Exception as error:  # such as of a node that lacks a package
-            reason = " ".join(str(error).split())[-300:]
-            raise ValueError(f"node {name} cannot run viapoint: {reason}") from error
-        check_versions(found, installed(), name)
-
-
-def check_versions(found: dict[str, str], wanted: dict[str, str], node: str) -> None:
-    """Check that the packages of a node are those of the driver.
-
-    Raises:
-        ValueError: They are not; the message names them.
-    """
-    others = [
-        f"{name} {found.get(name)}, not {wanted[name]}" for name in wanted if found.get(name) != wanted[name]
-    ]
-    if others:
-        raise ValueError(f"node {node} has {'; '.join(others)}: install the same versions on all nodes")
