@@ -13,6 +13,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC, TD3
 
 from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.algorithms.sb3_archive import algorithm_of
 from viapoint.training.cli import import_sb3
 from viapoint.training.cli import main as cli
 from viapoint.training.io.files import BadFileError
@@ -115,7 +116,7 @@ def test_what_is_no_such_archive_is_refused_unopened(tmp_path, capsys):
         if bytes_ is not None:
             (tmp_path / name).write_bytes(bytes_)
         with pytest.raises(BadFileError, match=reason):
-            import_sb3.algorithm_of(tmp_path / name)
+            algorithm_of(tmp_path / name)
         with pytest.raises(SystemExit):
             cli.main(words(tmp_path / name, tmp_path / "out", "--trust"))
     assert not (tmp_path / "out").exists()
@@ -123,9 +124,9 @@ def test_what_is_no_such_archive_is_refused_unopened(tmp_path, capsys):
 
 def test_what_does_not_fit_is_refused(tmp_path):
     archive(PPO, tmp_path / "other.zip", "viapoint/PlanarReach-v0")
-    with pytest.raises(BadFileError, match="holds no plain ppo model for viapoint/PlanarObstacles-v0"):
+    with pytest.raises(BadFileError, match="cannot be opened as PPO for viapoint/PlanarObstacles-v0"):
         import_sb3.convert(tmp_path / "other.zip", "ppo", ENV, tmp_path / "out")
-    with pytest.raises(BadFileError, match="cannot be opened as sac"):
+    with pytest.raises(BadFileError, match="cannot be opened as SAC"):
         import_sb3.convert(tmp_path / "other.zip", "sac", ENV, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "full").mkdir()

@@ -108,7 +108,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             warnings.simplefilter(
                 "ignore", UserWarning
             )  # PPO finds that its batches do not fill one environment
-            chosen = env or _own_environment(record["env"])
+            chosen = env or own_environment(record["env"])
             unit = record.get("discount_unit")
             model = build(record["algorithm"], record["policy"], chosen, hyperparameters, discount_unit=unit)
         model.num_timesteps = int(record["num_timesteps"])
@@ -256,7 +256,12 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
+def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
+    """Return one copy of the environment that a file names by `id` and `kwargs`.
+
+    Raises:
+        ValueError: The id is not registered, or an argument is not one that files may give.
+    """
     if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
         raise ValueError(f"environment {record['id']!r} is not known")
     check_env_arguments(record["kwargs"])

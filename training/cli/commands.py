@@ -13,7 +13,7 @@ from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainCo
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, evenly_spread, task_of
 from viapoint.training.evaluation.evaluator import evaluate as measure
-from viapoint.training.io.files import write_json
+from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.plotting.failure_report import classify_failures, write_failures
 from viapoint.training.rollouts.step_rollout import whole_task
@@ -63,6 +63,7 @@ def evaluate(config: EvaluateConfig) -> None:
     record = result.to_dict()
     report.show(record)
     if run is not None:
+        record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         name = _evaluation_name(config.scenes, whole, len(scenes.share), partial=result.partial)
         print(f"kept as {run.write_evaluation(name, record)}")
     if config.json is not None:

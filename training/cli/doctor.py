@@ -28,6 +28,10 @@ SPACE = 1 << 30
 REINSTALL = "pip install --force-reinstall 'mujoco>=4'"
 OPTIONAL = {"moviepy": "gymnasium's RecordVideo", "ompl": "the baseline by a motion planner (RRT-Connect)"}
 """Packages that only some features need, and these features."""
+MODULES = {"pyyaml": "yaml"}
+"""Modules of packages with other names."""
+EXTRAS = {"optuna": "tuning", "ray": "cluster"}
+"""Extras of packages that a command imports when it needs them."""
 INSTALL_TRAINING = "pip install 'viapoint[training]'"
 REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
 
@@ -106,7 +110,10 @@ def run_without_command(words: Sequence[str]) -> NoReturn:
 
 
 def explain_import_error(error: ImportError) -> str:
-    """Return one line on a failed import: what to install if packages of the extra `training` are missing."""
+    """Return one line on a failed import: what to install if packages of an extra are missing."""
+    extra = EXTRAS.get(error.name or "")
+    if extra is not None:
+        return f"the command needs the extra `{extra}` (not installed: {error.name}): pip install 'viapoint[{extra}]'"
     missing = missing_packages()
     if missing:
         names = ", ".join(missing)
@@ -179,7 +186,8 @@ def installed(name: str) -> str:
     """Return the version of a package that can be found by an import as well, '' if there is none."""
     try:
         version = importlib.metadata.version(name)
-        return version if importlib.util.find_spec(name.replace("-", "_")) else ""
+        module = MODULES.get(name.lower(), name.replace("-", "_"))
+        return version if importlib.util.find_spec(module) else ""
     except (importlib.metadata.PackageNotFoundError, ImportError):
         return ""
 

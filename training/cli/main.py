@@ -20,10 +20,12 @@ from viapoint.training.config.configs import (
     DemoConfig,
     DoctorConfig,
     EvaluateConfig,
+    ExportConfig,
     ImportConfig,
     PaperConfig,
     PlayConfig,
     TrainConfig,
+    TuneConfig,
 )
 
 
@@ -51,6 +53,8 @@ COMMANDS: dict[str, Command] = {
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
+    "tune": Command(TuneConfig, "viapoint.training.study.tuning", "run"),
+    "export": Command(ExportConfig, "viapoint.training.cli.export", "run"),
     "import-sb3": Command(ImportConfig, "viapoint.training.cli.import_sb3", "run"),
 }
 """Subcommands by name."""

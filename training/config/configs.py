@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
 import tyro
 
@@ -26,7 +27,7 @@ from viapoint.training.config.checks import (
     check_whole_movements,
 )
 from viapoint.training.config.discount import check_discount_unit
-from viapoint.training.config.key_values import NamedValues
+from viapoint.training.config.key_values import NamedValues, to_words
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
 _ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
@@ -198,6 +199,20 @@ class TrainConfig(Config):
     def time_unit(self) -> float | None:
         """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
         return self.preset.discount_unit if self.discount_unit is None else self.discount_unit
+
+    @property
+    def command(self) -> str:
+        """Command that trains with this configuration, apart from where it is written and what is shown."""
+        words = ["viapoint", "train"]
+        for name in ("env", "algo", "seed", "n_timesteps", "n_envs", "discount_unit"):
+            value = getattr(self, name)
+            if value is not None:
+                words += [f"--{name.replace('_', '-')}", f"{value}"]
+        for name in ("env_kwargs", "hyperparameters"):
+            values = getattr(self, name)
+            if values:
+                words += [f"--{name.replace('_', '-')}", *to_words(values)]
+        return shlex.join(words)
 
     @property
     def folder(self) -> Path:
@@ -400,15 +415,67 @@ class ImportConfig(Config):
 
     file: tyro.conf.Positional[Path]
     """Archive that `model.save` of Stable-Baselines3 wrote."""
-    env: EnvId = DEFAULT_ENV
-    """Id of the environment that the model was trained on, with default arguments."""
+    env: Annotated[str | None, _ENV] = None
+    """Id of the environment that the model was trained on, with default arguments; default: the one that an archive by
+    `viapoint export` names, otherwise viapoint/PlanarObstacles-v0."""
     out: Path
     """Folder for the model, which must be new."""
-    algo: Literal["sac", "td3", "ppo", "tqc"] | None = None
+    algo: Algorithm | None = None
     """Algorithm; recognised from the archive if not given."""
     trust: bool = False
     """Open the archive without asking, because you trust its source."""
 
     def _check(self) -> None:
-        check_env(self.env)
+        if self.env is not None:
+            check_env(self.env)
         check_folder("out", self.out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuneConfig(Config):
+    """Search for hyperparameters with Optuna. The same command continues a search; several may work on one folder.
+
+    Example: viapoint tune benchmarks/tuning/sac_obstacles.yaml --workers 2 --out runs/tune
+    """
+
+    file: tyro.conf.Positional[Path]
+    """YAML file that describes the search: environment, algorithm, budget, parameters with ranges (docs/tuning.md)."""
+    out: Path | None = None
+    """Folder of the search; default: runs/tune-<name of the file>."""
+    trials: int | None = None
+    """Number of trials in total, over all calls and processes; default: that of the file."""
+    workers: int | None = None
+    """Number of trainings at the same time; default: 1, or on Ray as many as fit."""
+    on: str = "local"
+    """Place of the trainings: local, ray, or ray://HOST:PORT."""
+
+    least: ClassVar = {"trials": 1, "workers": 1}
+
+    def _check(self) -> None:
+        check_folder("out", self.out)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the search."""
+        return self.out or Path("runs") / f"tune-{self.file.stem}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(Config):
+    """Write an agent as an archive of Stable-Baselines3 with a model card, for example to share it on Hugging Face.
+
+    Example: viapoint export viapoint/PlanarObstacles-v0 --out shared/planar-obstacles --scenes test
+    """
+
+    agent: Annotated[tyro.conf.Positional[str], _AGENT]
+    """Run folder, model folder, or id of an environment with a shipped agent."""
+    out: Path
+    """Folder for the archive and its card README.md, or a file that ends in .zip, with the card beside it."""
+    scenes: tuple[str, ...] = ()
+    """Scene sets in which the agent is measured for the card, such as test hard; measurements that a run folder holds
+    are there already."""
+    license: str | None = None
+    """Licence of the model in its card, such as mit; default: mit for shipped agents, none for others."""
+
+    def _check(self) -> None:
+        check_folder("out", self.out.parent if self.out.suffix == ".zip" else self.out)

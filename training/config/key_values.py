@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import tyro
@@ -24,6 +25,20 @@ def from_words(words: list[str]) -> dict[str, Any]:
             raise ValueError(f"{name} is there twice, as {json.dumps(result[name])} and as {value}")
         result[name] = _value(name, value)
     return result
+
+
+def to_words(values: Mapping[str, Any]) -> list[str]:
+    """Return a dictionary as NAME=VALUE words; :func:`from_words` is the inverse."""
+    return [f"{name}={_text(value)}" for name, value in values.items()]
+
+
+def _text(value: Any) -> str:
+    text = json.dumps(value, separators=(",", ":"))
+    try:
+        plain = isinstance(value, str) and _value("", value) == value
+    except ValueError:
+        plain = False
+    return value if plain else text
 
 
 def _value(name: str, text: str) -> Any:
@@ -63,7 +78,7 @@ _NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(
     metavar="NAME=VALUE",
     instance_from_str=from_words,
     is_instance=lambda value: isinstance(value, dict),
-    str_from_instance=lambda value: [f"{name}={json.dumps(each)}" for name, each in value.items()],
+    str_from_instance=to_words,
 )
 NamedValues = Annotated[dict[str, Any], _NAMED_VALUES]
 """Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""

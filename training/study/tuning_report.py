@@ -1,0 +1,186 @@
+"""Report on a hyperparameter search: trials, importance of parameters, pruned trials, and the best settings."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any, Protocol
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from viapoint.training.config.configs import TrainConfig
+from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.io.installed import versions
+from viapoint.training.runs.callback import validation_scenes
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace, plain
+
+SHOWN = 10
+"""Greatest number of trials in the table."""
+FEWEST = 4
+"""Least number of finished trials for which the importance of parameters is estimated."""
+
+
+class Results(Protocol):
+    """Trials of a search, as :class:`~viapoint.training.study.tuning.Tuning` has them."""
+
+    folder: Path
+    search: SearchSpace
+    study: optuna.Study
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """Trials that count."""
+
+    @property
+    def best(self) -> FrozenTrial | None:
+        """Finished trial with the highest score."""
+
+    def folder_of(self, trial: FrozenTrial) -> str:
+        """Return the folder of a trial below that of the search."""
+
+
+def write_report(tuning: Results) -> Path:
+    """Write `report.md`, `curves.png` and, if a trial is finished, `best.json`; return the path of the report."""
+    best = tuning.best
+    if best is not None:
+        write_json(tuning.folder / "best.json", best_training(tuning, best).as_json())
+    draw_curves(tuning, tuning.folder / "curves.png")
+    path = tuning.folder / "report.md"
+    write_bytes(path, report(tuning).encode())
+    return path
+
+
+def best_training(tuning: Results, best: FrozenTrial) -> TrainConfig:
+    """Return the configuration of the best trial, as `viapoint train` uses it."""
+    return tuning.search.training(best.params, tuning.search.seeds[0], progress=True)
+
+
+def report(tuning: Results) -> str:
+    """Return the report as Markdown."""
+    search, trials = tuning.search, tuning.trials
+    states = Counter(each.state for each in trials)
+    folders = [tuning.folder / tuning.folder_of(each) / f"seed-{search.seeds[0]}" for each in trials]
+    first = next((each for each in folders if (each / "config.json").is_file()), None)
+    lines = [
+        f"# Hyperparameters of {search.algo} on {search.env}",
+        "",
+        f"{states[TrialState.COMPLETE]} trials of {search.n_timesteps} decisions finished, "
+        f"{states[TrialState.PRUNED]} were pruned, {states[TrialState.FAIL]} could not be trained. A trial trains "
+        f"{len(search.seeds)} seed{'s' if len(search.seeds) > 1 else ''} "
+        f"({', '.join(map(str, search.seeds))}); its score is the {search.objective} success rate"
+        f"{_scenes(first)}. The score of the best trial is the greatest of several noisy numbers: train its settings "
+        "with other seeds before you compare them.",
+        "",
+        *_table(tuning),
+        *_importance(tuning),
+        *_pruned(tuning),
+        *_failed(trials),
+    ]
+    if tuning.best is not None:
+        command = best_training(tuning, tuning.best).command
+        lines += ["## Best settings", "", "```sh", command, "```", "", "`best.json` holds them as JSON.", ""]
+    using = ", ".join(f"{name} {version}" for name, version in versions().items())
+    return "\n".join([*lines, f"Versions: {using}, optuna {optuna.__version__}.", ""])
+
+
+def _scenes(folder: Path | None) -> str:
+    """Return the validation scenes in words."""
+    if folder is None:
+        return ""
+    scenes = validation_scenes(Run(folder))
+    kind = "drawn" if scenes.name == "drawn" else "shipped"
+    return f" in the same {len(scenes.share)} {kind} validation scenes (sha256 {scenes.sha256[:12]})"
+
+
+def ranked(tuning: Results) -> list[FrozenTrial]:
+    """Return the finished trials, best first."""
+    complete = [each for each in tuning.trials if each.state == TrialState.COMPLETE]
+    return sorted(complete, key=lambda each: (-(each.value or 0.0), each.number))
+
+
+def _table(tuning: Results) -> list[str]:
+    names = list(tuning.search.parameters)
+    rows = [
+        f"| {each.number}{' (given)' if 'fixed_params' in each.system_attrs else ''} "
+        f"| {100.0 * (each.value or 0.0):.1f} % | {_minutes(each)} "
+        f"| {' | '.join(_shown(each.params[name]) for name in names)} |"
+        for each in ranked(tuning)[:SHOWN]
+    ]
+    head = f"| trial | score | minutes | {' | '.join(f'`{name}`' for name in names)} |"
+    return ["## Best trials", "", head, "|" + "---|" * (3 + len(names)), *rows, ""] if rows else []
+
+
+def _minutes(trial: FrozenTrial) -> str:
+    return f"{trial.duration.total_seconds() / 60.0:.1f}" if trial.duration else "-"
+
+
+def importance(tuning: Results) -> dict[str, float]:
+    """Return the importance of each parameter by PED-ANOVA, with sum 1; empty where there are too few trials."""
+    if len(ranked(tuning)) < FEWEST or len({each.value for each in ranked(tuning)}) < 2:
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return optuna.importance.get_param_importances(tuning.study)
+
+
+def _importance(tuning: Results) -> list[str]:
+    values = importance(tuning)
+    if not values:
+        return []
+    rows = [f"| `{name}` | {value:.2f} |" for name, value in values.items()]
+    return [
+        "## Importance of parameters", "",
+        "Estimated by PED-ANOVA from the finished trials; the sum is 1. With few trials it is a rough guess.", "",
+        "| parameter | importance |", "|---|---|", *rows, "",
+    ]  # fmt: skip
+
+
+def _pruned(tuning: Results) -> list[str]:
+    pruned = Counter(each.last_step or 0 for each in tuning.trials if each.state == TrialState.PRUNED)
+    rows = [f"| {step} | {number} |" for step, number in sorted(pruned.items())]
+    return ["## Pruned trials", "", "| decisions | trials |", "|---|---|", *rows, ""] if rows else []
+
+
+def _failed(trials: list[FrozenTrial]) -> list[str]:
+    rows = [f"* trial {each.number}: {each.user_attrs[ERROR]}" for each in trials if ERROR in each.user_attrs]
+    repeats = [
+        f"* trial {each.number} repeats trial {each.user_attrs[ATTEMPTS][-1]}, whose process ended"
+        for each in trials
+        if ATTEMPTS in each.user_attrs
+    ]
+    return ["## Failures", "", *rows, *repeats, ""] if rows or repeats else []
+
+
+def _shown(value: Any) -> str:
+    value = plain(value)
+    return f"{value:.3g}" if isinstance(value, float) else f"{value}"
+
+
+def draw_curves(tuning: Results, path: Path) -> None:
+    """Draw the success rate of every trial in validation against decisions."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 3.4), layout="constrained")
+    axes = FigureCanvasAgg(figure).figure.subplots()
+    best = tuning.best
+    styles = {
+        TrialState.COMPLETE: ("#9aa5b1", "-", "finished"), TrialState.PRUNED: ("#d9822b", "--", "pruned"),
+    }  # fmt: skip
+    for each in sorted(tuning.trials, key=lambda trial: trial == best):
+        if each.state not in styles or not each.intermediate_values:
+            continue
+        color, line, label = styles[each.state]
+        if best is not None and each.number == best.number:
+            color, label = "#1f5fa8", f"best (trial {each.number})"
+        steps, rates = zip(*sorted(each.intermediate_values.items()), strict=True)
+        axes.plot(steps, [100.0 * rate for rate in rates], line, color=color, label=label, marker=".")
+    axes.set(xlabel="decisions", ylabel="success in validation [%]")
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    if handles:
+        axes.legend(handles.values(), handles.keys(), frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
