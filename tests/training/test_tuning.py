@@ -1,8 +1,10 @@
 """Hyperparameter search: what a file may say, which trials there are, and that none is lost or done twice."""
 
 import json
+import re
 import shlex
 import sys
+from pathlib import Path
 
 import optuna
 import pytest
@@ -20,6 +22,7 @@ from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace
 from viapoint.training.study.tuning import MOST_REPEATS, Tuning, TuningStoppedError
 from viapoint.training.study.tuning_report import importance, write_report
 
+ROOT = Path(__file__).parents[2]
 RATE = {"type": "float", "low": 1e-4, "high": 1e-2, "log": True}
 BASE = {
     "env": "viapoint/PlanarReach-v0", "algo": "sac", "n_timesteps": 256, "n_envs": 32, "eval_every": 64,
@@ -341,3 +344,10 @@ def test_journals_are_those_of_optuna(tmp_path, trainings):
     backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / "a" / "journal.log"))
     study = optuna.load_study(study_name=None, storage=optuna.storages.JournalStorage(backend))
     assert len(study.trials) == 2
+
+
+def test_the_shipped_files_and_the_one_on_the_page_are_searches(tmp_path):
+    (example,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "tuning.md").read_text(), re.DOTALL)
+    (tmp_path / "page.yaml").write_text(example)
+    for path in (tmp_path / "page.yaml", *sorted((ROOT / "benchmarks" / "tuning").glob("*.yaml"))):
+        assert SearchSpace.read(path).distributions()
