@@ -133,12 +133,11 @@ class TrainConfig(Config):
     out: AnyPath | None = None
     """Run folder; default: runs/<environment>-<algorithm>-<seed>."""
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint; --n-timesteps may extend it, other flags must be as they
-    were."""
+    """Continue the run from its last checkpoint; --n-timesteps may extend it, others must be as they were."""
     eval_every: int | None = None
-    """Decisions between two evaluations on the validation scenes, 0 for none; default: that of the preset."""
+    """Decisions between two evaluations, 0 for none; default: that of the preset."""
     eval_scenes: int = 500
-    """Greatest number of validation scenes in each evaluation."""
+    """Validation scenes in each evaluation."""
     checkpoint_every: int | None = None
     """Decisions between two checkpoints; default: that of the preset."""
     env_kwargs: NamedValues = field(default_factory=dict)
@@ -146,14 +145,13 @@ class TrainConfig(Config):
     hyperparameters: NamedValues = field(default_factory=dict)
     """Hyperparameters that replace those of the preset, in the same form: batch_size=256."""
     discount_unit: float | None = None
-    """Time that gamma discounts once, [s], if decisions report their duration; default: that of the preset."""
+    """Time that gamma discounts once, [s]; default: that of the preset."""
     progress: bool = True
     """Show a progress bar."""
     rollout_workers: int = 0
-    """Processes or actors that share the environments, 0 for none; the agent does not depend on it."""
+    """Processes that share the environments, 0 for none."""
     on: str = "local"
-    """Place of the rollout workers: local for processes of this machine, ray for the cluster of RAY_ADDRESS, or without
-    that variable for a Ray on this machine, or ray://HOST:PORT."""
+    """Place of rollout workers: local, ray or ray://HOST:PORT."""
 
     def _check(self) -> None:
         check_env(self.env)
