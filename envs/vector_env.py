@@ -370,11 +370,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._last = execution = join_groups(movements, groups)
         self.scenes = None
         terms = reward_terms(execution.outcome, self.action_layout.centre_duration, self.task.weights)
+        reward, info = terms.total(), {**execution.outcome._asdict(), **terms.as_info()}
         observation = self._observe_end(execution)
         if self.render_mode == "human":
             self.render()
-        info = {**execution.outcome._asdict(), **terms.as_info()}
-        return Decision(observation, terms.total(), info), following
+        return Decision(observation, reward, info), following
 
     def _observe_end(self, execution: Execution) -> Observation:
         """Stage 7: return the observations after a movement."""

@@ -238,7 +238,7 @@ class Trajectory:
 
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
-        return 0.5 * self.energy(self.order)
+        return 0.5 * self._energy(self.order)
 
     def energy(self, nu: int) -> Array:
         """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
@@ -246,9 +246,12 @@ class Trajectory:
         Raises:
             ValueError: nu is not a whole number from 0 to 2 order - 1.
         """
-        xp = self.namespace
         if whole_order(nu) >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
+        return self._energy(nu)
+
+    def _energy(self, nu: int) -> Array:
+        xp = self.namespace
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
         modes = xp.reshape(

@@ -119,7 +119,8 @@ class PlanarArm:
 
     def hand_position(self, joints: Array) -> Array:
         """Return hand positions; see :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
-        xp = namespace_of(joints)
+        # Every step asks for this: NumPy arrays save the call.
+        xp = np if isinstance(joints, np.ndarray) else namespace_of(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
         return xp.stack(
@@ -163,7 +164,7 @@ class PlanarArm:
 
         It is the least of the distances to the inner and the outer circle and, along arcs, to the shoulder's limits.
         """
-        xp = namespace_of(hand)
+        xp = np if isinstance(hand, np.ndarray) else namespace_of(hand)
         distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
         near, far = self.reach
         low, high = self.joint_range[0]
@@ -186,7 +187,7 @@ class PlanarArm:
         The actuator's torque is control - stiffness * angle - damping * velocity, limited to `torque_limit`. So the
         control is the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
         """
-        xp = namespace_of(position)
+        xp = np if isinstance(position, np.ndarray) else namespace_of(position)
         joints, upper_arm, forearm, sine = self._configurations(position, xp)
         rates = self._rates(position, upper_arm, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)

@@ -18,7 +18,7 @@ import functools
 from collections.abc import Sequence
 
 from viapoint.envs.common.arrays import clamp, dot
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 MAX_CLEARANCE = 1.0
 """Greatest clearance that is reported, also without obstacles, [m]."""
@@ -35,8 +35,9 @@ def hand_clearance(points: Array, radius: float, obstacles: Array, present: Arra
         obstacles: See the module.
         present: See the module.
     """
-    nearest = namespace_of(points).min(point_distance_squared(points, obstacles), axis=-1)
-    return _clearance(nearest, obstacles[..., -1] + radius, present)
+    xp = namespace_of(points)
+    nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
+    return _clearance(xp, nearest, obstacles[..., -1] + radius, present)
 
 
 def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, present: Array) -> Array:
@@ -52,7 +53,7 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
     for i, radius in enumerate(radii):
         # Only the least squared distance needs its root: 6 to 10 % faster than all clearances first.
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
-        each.append(_clearance(xp.min(squared, axis=-1), obstacles[..., -1] + radius, present))
+        each.append(_clearance(xp, xp.min(squared, axis=-1), obstacles[..., -1] + radius, present))
     return functools.reduce(xp.minimum, each)
 
 
@@ -100,7 +101,7 @@ def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
         axis: Components of a, [m].
     """
     square = dot(axis, axis)
-    along = clamp(dot(offset, axis) / namespace_of(square).where(square > TINY, square, 1.0), -1.0, 1.0)
+    along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)
     rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
     return dot(rest, rest)
 
@@ -138,8 +139,7 @@ def nearest_on_segments(
     return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis
 
 
-def _clearance(squared: Array, radii: Array, present: Array) -> Array:
+def _clearance(xp: Namespace, squared: Array, radii: Array, present: Array) -> Array:
     """Return clearance from squared distances of axes; the small summand keeps gradients at distance 0 finite."""
-    xp = namespace_of(squared)
     distance = xp.sqrt(squared + 1e-24) - radii
     return xp.where(present, xp.minimum(distance, MAX_CLEARANCE), xp.full_like(distance, MAX_CLEARANCE))
