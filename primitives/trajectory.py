@@ -174,8 +174,8 @@ class Trajectory:
             ValueError: bad time or nu, or buffers of a wrong number, kind, shape or dtype.
         """
         xp = self.namespace
-        orders = whole_orders(nu)
         time, inside = self._times(time, xp)
+        orders = whole_orders(nu)
         batch = self.batch_shape
         if time.ndim > 1:
             batch = broadcast_batch(trajectory=batch, time=tuple(time.shape[:-1]))

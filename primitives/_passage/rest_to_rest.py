@@ -81,8 +81,9 @@ def fractions_at_rest(points: Any) -> Any:
     arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
     t = nearer_fraction(*arguments)
     t = np.maximum(t, SHORTEST * near.any(axis=0))
-    fractions = np.stack([t, 1.0 - t], axis=-1)
-    return np.where(is_late[:, None], fractions[:, ::-1], fractions)
+    fractions = np.empty((len(points), 2))
+    fractions[:, 0], fractions[:, 1] = np.where(is_late, (1.0 - t, t), (t, 1.0 - t))
+    return fractions
 
 
 def _dot(x: Array, y: Array) -> Array:
