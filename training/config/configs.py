@@ -125,9 +125,9 @@ class TrainConfig(Config):
     algo: Algorithm = "viaq"
     """Learning algorithm."""
     seed: int = 0
-    """Seed of all random numbers; equal seeds give equal agents on one machine."""
+    """Seed of all random numbers."""
     n_timesteps: int | None = None
-    """Decisions in total; default: that of the preset."""
+    """Decisions; default: the preset's."""
     n_envs: int | None = None
     """Environments that are stepped together; default: that of the preset."""
     out: AnyPath | None = None
@@ -135,11 +135,11 @@ class TrainConfig(Config):
     resume: bool = False
     """Continue the run from its last checkpoint; --n-timesteps may extend it, others must be as they were."""
     eval_every: int | None = None
-    """Decisions between two evaluations, 0 for none; default: that of the preset."""
+    """Decisions between evaluations, 0 for none; default: the preset's."""
     eval_scenes: int = 500
     """Validation scenes in each evaluation."""
     checkpoint_every: int | None = None
-    """Decisions between two checkpoints; default: that of the preset."""
+    """Decisions between checkpoints; default: the preset's."""
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
