@@ -7,12 +7,13 @@ point of all, so the result is exact over all given times.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Int, Single
+from viapoint.envs.common.types import Bool, Float, Index, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, segment_distance_squared
 
@@ -73,28 +74,61 @@ def nearest_approach(
     bounds = ball_bounds(lift_quadratic(centres), around.reshape(len(least), -1), shown)
     size = np.array(radii)
 
-    def clearance(each: Int, row: Int, link: Int, times: Int) -> Float:
+    def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:
         """Return the clearance of M links, each from one obstacle at some times, shape (M, .), [m]."""
         first, second = (_take(places, each[:, None], times, links[link, end, None]) for end in (0, 1))
         squared = segment_distance_squared(first, second, obstacles[each, row][:, None])[:, 0]
         return np.asarray(np.sqrt(squared) - (obstacles[each, row, -1] + size[link])[:, None])
 
-    # The ball with the least bound of each movement, looked at first, gives an upper bound for the others.
-    flat, each = bounds.reshape(len(least), -1), np.arange(len(least))
-    row, ball = np.divmod(flat.argmin(axis=-1), bounds.shape[-1])
+    def at_middle(each: Index, ball: Index) -> Float:
+        """Return the clearance of balls from obstacles in the middle of their stretches, shape (M,), [m]."""
+        row, ball = np.divmod(ball, bounds.shape[-1])
+        stretch, link = np.divmod(ball, len(size))
+        return clearance(each, row, link, middles[each, stretch, None])[:, 0]
+
+    # All times of the stretches that are still near enough after their middles.
+    each, ball, nearest = branch_and_bound(bounds.reshape(len(least), -1), least, at_middle)
+    row, ball = np.divmod(ball, bounds.shape[-1])
     stretch, link = np.divmod(ball, len(size))
-    nearest = clearance(each, row, link, middles[each, stretch, None])[:, 0]
-    np.minimum(least, np.where(present[each, row], nearest, MAX_CLEARANCE), out=least)
-    # In the middle of their stretches, all balls whose bounds are below that; then all times of those still near.
-    each, row, ball = np.nonzero(bounds < least[:, None, None])
-    stretch, link = np.divmod(ball, len(size))
-    nearest = clearance(each, row, link, middles[each, stretch, None])[:, 0]
-    np.minimum.at(least, each, nearest)
     nearer = nearest - excursion[each, stretch, link] < least[each]
     each, row, stretch, link = each[nearer], row[nearer], stretch[nearer], link[nearer]
     times = np.minimum(starts[stretch, None] + np.arange(STRETCH), last[each, None])
     np.minimum.at(least, each, clearance(each, row, link, times).min(axis=-1))
     return least
+
+
+def branch_and_bound(
+    bounds: Single, least: Float, exact: Callable[[Index, Index], Float], floor: float = -np.inf
+) -> tuple[Index, Index, Float]:
+    """Lower the least values of M groups, in place, to those of the candidates whose bounds are below them.
+
+    The candidate with the least bound of each group comes first; its value excludes most of the others.
+
+    Args:
+        bounds: Lower bounds of the values of K candidates in each group, shape (M, K).
+        least: Values above which candidates do not matter, shape (M,).
+        exact: Function that returns the values of candidates from the indices of groups and candidates.
+        floor: Value below which the result need not be exact.
+
+    Returns:
+        Groups, candidates and values that were computed, shape (L,) each.
+    """
+    nearest = bounds.argmin(axis=-1)
+    some = np.flatnonzero(bounds[np.arange(len(least)), nearest] < least)
+    first = some, nearest[some], exact(some, nearest[some])
+    np.minimum.at(least, some, first[2])
+    some = some[least[some] >= floor]
+    below = bounds.take(some, axis=0) < least[some, None].astype(np.float32)
+    below[np.arange(len(some)), nearest[some]] = False
+    which, candidate = np.nonzero(below)
+    if not len(which):
+        return first
+    values = exact(some[which], candidate)
+    np.minimum.at(least, some[which], values)
+    group, which, found = (
+        np.concatenate(each) for each in zip(first, (some[which], candidate, values), strict=True)
+    )
+    return group, which, found
 
 
 def _take(positions: Float, each: Int, times: Int, point: Int) -> Float:

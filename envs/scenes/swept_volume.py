@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.common.types import Float, Int, Single
+from viapoint.envs.common.types import Float, Index, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
+from viapoint.envs.geometry.narrow_phase import branch_and_bound
 
 OUTER = 5
 """Links next to the hand, which obstacles near its path touch first; only chosen obstacles are compared with others."""
@@ -53,8 +54,8 @@ class LinkBodies(NamedTuple):
     ) -> Float:
         """Return the least clearance over time from each obstacle, or group of obstacles, less a margin.
 
-        Broad phase: the ball around a link bounds its clearance from below. Narrow phase: exact distances are computed
-        for the nearest ball, then for all balls whose bound is below that result.
+        Broad phase: the ball around a link bounds its clearance from below. Narrow phase: exact distances by
+        :func:`~viapoint.envs.geometry.narrow_phase.branch_and_bound`.
 
         Args:
             rows: Obstacles, shape (N, n, 7), [m]; absent ones, without a radius, are as far away as `most`.
@@ -73,21 +74,12 @@ class LinkBodies(NamedTuple):
         margins = np.zeros(self.balls.shape[2:]) + margin
         around = (self.around[:, None] + margins).astype(np.float32).reshape(-1)
         bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows).reshape(len(least), -1)
-        nearest = bound.argmin(axis=-1)
 
-        def look(one: Int, ball: Int) -> None:
+        def exact(one: Index, ball: Index) -> Float:
             row, ball = np.divmod(one * bound.shape[-1] + ball, places)
-            clearance = self._between(rows, row, ball) - margins.reshape(-1)[ball]
-            np.minimum.at(least, one, clearance)
+            return np.asarray(self._between(rows, row, ball) - margins.reshape(-1)[ball])
 
-        one = np.flatnonzero(bound[np.arange(len(least)), nearest] < most)
-        look(one, nearest[one])
-        one = one[least[one] >= floor]
-        nearer = bound.take(one, axis=0) < least[one, None].astype(np.float32)
-        nearer[np.arange(len(one)), nearest[one]] = False
-        which, ball = np.nonzero(nearer)
-        if len(which):
-            look(one[which], ball)
+        branch_and_bound(bound, least, exact, floor)
         return least.reshape(shape)
 
     def every_other(self) -> LinkBodies:
@@ -98,7 +90,7 @@ class LinkBodies(NamedTuple):
         """Return some of the movements."""
         return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
 
-    def _between(self, rows: Float, row: Int, ball: Int) -> Float:
+    def _between(self, rows: Float, row: Index, ball: Index) -> Float:
         """Return clearances, shape (M,), [m], of pairs of an obstacle and a link at one time."""
         links, times = self.balls.shape[2:]
         ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
