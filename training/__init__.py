@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
     from viapoint.training.search.geometry_search import GeometrySearch
+    from viapoint.training.study.config import Study
+    from viapoint.training.study.run import run_study
 else:
     _MODULES = {
         "Agent": "viapoint.training.algorithms.agent",
@@ -28,11 +30,13 @@ else:
         "RayVecEnv": "viapoint.training.rollouts.ray_vec_env",
         "Run": "viapoint.training.runs.run_dir",
         "SceneExtractor": "viapoint.training.algorithms.extractors",
+        "Study": "viapoint.training.study.config",
         "TrainConfig": "viapoint.training.config.configs",
         "ViaQ": "viapoint.training.algorithms.viaq",
         "ViaVecEnv": "viapoint.training.rollouts.vec_env",
         "evaluate": "viapoint.training.evaluation.evaluator",
         "load_agent": "viapoint.training.algorithms.agent",
+        "run_study": "viapoint.training.study.run",
         "time_discount": "viapoint.training.algorithms.smdp_buffers",
         "train": "viapoint.training.runs.trainer",
     }
@@ -55,11 +59,13 @@ __all__ = [
     "RayVecEnv",
     "Run",
     "SceneExtractor",
+    "Study",
     "TrainConfig",
     "ViaQ",
     "ViaVecEnv",
     "evaluate",
     "load_agent",
+    "run_study",
     "time_discount",
     "train",
 ]

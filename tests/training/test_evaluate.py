@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
-from viapoint.training.planners.baselines import make_method
+from viapoint.training.planners.baselines import StoredSolutions, make_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import BANDS
 

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from viapoint.training.cli.demo import StoredSolutions
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.planners.baselines import StoredSolutions
 from viapoint.training.plotting import plots
 
 ENV = "viapoint/PlanarObstacles-v0"

@@ -17,7 +17,7 @@ from viapoint.training.io.yaml_file import read_yaml
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import resolved
 from viapoint.training.study import tuning as module
-from viapoint.training.study.local_runner import LocalRunner
+from viapoint.training.study.runner import LocalRunner
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace
 from viapoint.training.study.tuning import MOST_REPEATS, Tuning, TuningStoppedError
 from viapoint.training.study.tuning_report import importance, write_report

@@ -151,7 +151,7 @@ def build(
     kind, policies = ALGORITHMS[algorithm], _policies(algorithm)
     if policy not in policies:
         raise ValueError(f"policy of {algorithm} must be one of {', '.join(policies)}, got {policy!r}")
-    allowed = _argument_names(kind)
+    allowed = argument_names(kind)
     unknown = sorted(set(hyperparameters) - allowed)
     if unknown:
         raise ValueError(
@@ -188,8 +188,8 @@ def _policy_with(critic: Any, algorithm: str) -> str:
     return MINIMUM_CRITIC
 
 
-def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
-    """Return a model like this one before its training, with weights of seed 0."""
+def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
+    """Return a model like this one before its training, with the weights of a seed."""
     record, env = describe(model), model.get_env()
     assert env is not None
     hyperparameters = dict(record["hyperparameters"])
@@ -200,7 +200,7 @@ def untrained(model: BaseAlgorithm) -> BaseAlgorithm:
         env,
         hyperparameters,
         discount_unit=record["discount_unit"],
-        seed=0,
+        seed=seed,
     )
 
 
@@ -212,7 +212,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
     policies = {kind: each for each, kind in _policies(name).items()}
-    stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
+    stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
     return {
         "format": FORMAT,
         "viapoint": importlib.metadata.version("viapoint"),
@@ -279,7 +279,7 @@ def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: fl
     return time_discount(kind, env.observation_space, gamma=gamma, unit=unit)
 
 
-def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
+def argument_names(kind: type[BaseAlgorithm]) -> set[str]:
     """Return the names of an algorithm's arguments, including those that `**kwargs` passes to base classes."""
     names: set[str] = set()
     for each in kind.__mro__:

@@ -10,9 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.cli.progress import progress_bar
@@ -20,7 +18,7 @@ from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
 from viapoint.training.io.files import BadFileError, read_json
-from viapoint.training.planners.baselines import Method, agent_method, make_method
+from viapoint.training.planners.baselines import Method, StoredSolutions, agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.plotting.video import record_video
@@ -33,25 +31,6 @@ PICTURES = 12
 """Number of movements in the gallery."""
 MOVEMENTS = 4
 """Number of movements in the video."""
-
-
-class StoredSolutions:
-    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew."""
-
-    name = "planner (stored)"
-    timed = False
-
-    def __init__(self, frozen: FrozenScenes) -> None:
-        keys = map(self._key, *frozen.scenes)
-        self._solutions = dict(zip(keys, frozen.solution, strict=True))
-
-    def decide(self, observation: Any, scenes: Scenes) -> NDArray[np.float64]:
-        """See :class:`viapoint.training.planners.baselines.Method`; the scenes must be of the set."""
-        return np.array([self._solutions[key] for key in map(self._key, *scenes)])
-
-    @staticmethod
-    def _key(*fields: NDArray[np.float64]) -> bytes:
-        return b"".join(field.tobytes() for field in fields)
 
 
 def run(config: DemoConfig) -> None:
@@ -161,7 +140,10 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         agent_method(f"agent, {config.checks} checks", agent, config.checks),
         agent_method("untrained", untrained(agent), 0),
     ]
-    methods += [*(make_method(name, config.env) for name in BASELINES), StoredSolutions(frozen)]
+    methods += [
+        *(make_method(name, config.env) for name in BASELINES),
+        StoredSolutions(frozen),
+    ]
     with progress_bar() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
     record = {**result.to_dict(), **identity}

@@ -24,6 +24,7 @@ from viapoint.training.config.configs import (
     ImportConfig,
     PaperConfig,
     PlayConfig,
+    StudyConfig,
     TrainConfig,
     TuneConfig,
 )
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Command] = {
     "bench": Command(BenchConfig, "viapoint.training.cli.bench", "run"),
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
+    "study": Command(StudyConfig, "viapoint.training.study.run", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
     "tune": Command(TuneConfig, "viapoint.training.study.tuning", "run"),
     "export": Command(ExportConfig, "viapoint.training.cli.export", "run"),

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import tyro
 
@@ -477,3 +477,24 @@ class ExportConfig(Config):
 
     def _check(self) -> None:
         check_folder("out", self.out.parent if self.out.suffix == ".zip" else self.out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig(Config):
+    """Run a study: trainings, evaluations, baselines and pages that a YAML file describes. A second call continues.
+
+    Example: viapoint study benchmarks/results.yaml --workers 2
+    """
+
+    file: tyro.conf.Positional[Path]
+    """YAML file that describes the study (docs/studies.md)."""
+    on: str = "local"
+    """Place of the jobs: local, ray, or ray://HOST:PORT."""
+    workers: int | None = None
+    """Number of jobs at the same time; default: 1, or on Ray as many as fit."""
+    only: tuple[Literal["train", "evaluate", "baselines", "time", "page"], ...] = (
+        "train", "evaluate", "baselines", "time", "page",
+    )  # fmt: skip
+    """Steps to run."""
+
+    least: ClassVar = {"workers": 0}

@@ -88,6 +88,28 @@ class RandomVias:
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
+class StoredSolutions:
+    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew.
+
+    Args:
+        frozen: :class:`~viapoint.training.scene_sets.scene_set.FrozenScenes`.
+    """
+
+    name = "planner (stored)"
+    timed = False
+
+    def __init__(self, frozen: Any) -> None:
+        self._solutions = dict(zip(map(self._key, *frozen.scenes), frozen.solution, strict=True))
+
+    def decide(self, observation: Any, scenes: Scenes) -> Float:
+        """See :class:`Method`; the scenes must be of the set."""
+        return np.array([self._solutions[key] for key in map(self._key, *scenes)])
+
+    @staticmethod
+    def _key(*fields: Float) -> bytes:
+        return b"".join(field.tobytes() for field in fields)
+
+
 class AgentMethod:
     """Trained agent.
 
@@ -129,7 +151,7 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     return AgentMethod(name, model, checks)
 
 
-def _search(total: int) -> Callable[[SceneSimulation], Method]:
+def refined_search(total: int) -> Callable[[SceneSimulation], Method]:
     """Return a factory of searches; half of the checks on refinement solve more scenes (docs/geometry-search.md)."""
     rounds = 2 if total < 256 else 4
     return lambda simulation: GeometrySearch(
@@ -137,7 +159,7 @@ def _search(total: int) -> Callable[[SceneSimulation], Method]:
     )
 
 
-SEARCHES = {f"search{number}": _search(number) for number in (16, 64, 512, 4096)}
+SEARCHES = {f"search{number}": refined_search(number) for number in (16, 64, 512, 4096)}
 """Factories of searches by name; the number is that of the plans checked in a decision."""
 
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {

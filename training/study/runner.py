@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from viapoint.training.study.job import Answer, Job, Runner
-from viapoint.training.study.local_runner import LocalRunner
-from viapoint.training.study.ray_runner import RayRunner
+from viapoint.training.study.runners.job import Answer, Job, Runner
+from viapoint.training.study.runners.local import LocalRunner
+from viapoint.training.study.runners.on_ray import RayRunner
 
 __all__ = ["Answer", "Job", "LocalRunner", "RayRunner", "Runner", "make_runner"]
 

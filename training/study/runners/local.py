@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from viapoint.training.study.job import LINEAR_ALGEBRA, Answer, Job, answer
+from viapoint.training.study.runners.job import LINEAR_ALGEBRA, Answer, Job, answer
 
 
 class LocalRunner:

@@ -22,8 +22,8 @@ from filelock import FileLock, Timeout
 
 from viapoint.training.io.installed import installed
 from viapoint.training.io.ray_cluster import check_nodes, check_versions, connect, import_ray
-from viapoint.training.study.folder_sync import Changes, Sender, pack, unpack
-from viapoint.training.study.job import LINEAR_ALGEBRA, Answer, Job, answer
+from viapoint.training.study.runners.folder_sync import Changes, Sender, pack, unpack
+from viapoint.training.study.runners.job import LINEAR_ALGEBRA, Answer, Job, answer
 
 POLL = 0.5
 """Time between two looks for files of running jobs, [s]."""
@@ -96,7 +96,7 @@ class RayRunner:
             self._ray.shutdown()
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Answer]]:
-        """Run jobs, see :class:`viapoint.training.study.job.Runner`."""
+        """Run jobs, see :class:`viapoint.training.study.runners.job.Runner`."""
         queue, again, running = iter(jobs), list[_Task](), dict[Any, _Task]()
         try:
             while True:

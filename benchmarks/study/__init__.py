@@ -1,1 +1,0 @@
-"""Study behind docs/results.md: plan, jobs, aggregation, page and figures."""

@@ -1,0 +1,266 @@
+"""Studies: what a YAML file may say, that nothing is done twice, and that pages hold what was measured."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from viapoint.training import Study, run_study
+from viapoint.training.io.files import read_json
+from viapoint.training.study import jobs, run
+from viapoint.training.study.config import rows_of
+from viapoint.training.study.page import fill_tables, render_page, row, table
+from viapoint.training.study.results import gather
+
+ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
+SMALL = {
+    "seeds": [0, 1],
+    "environments": {ENV: {"n_scenes": 8}},
+    "agents": {
+        "viaq": {
+            "n_timesteps": 64,
+            "eval_scenes": 8,
+            "checks": [0, 4],
+            "untrained": True,
+            "hyperparameters": {"policy_kwargs": {"candidates": 16}},
+        }
+    },
+    "baselines": {
+        "stored": None,
+        "search{checks}": {"method": "search", "grid": {"checks": [16, 32]}},
+        "in-time": {"method": "search", "time_of": "viaq/4"},
+        "search-k{n_via}": {
+            "method": "search",
+            "checks": 16,
+            "scenes": ["test"],
+            "n_scenes": 4,
+            "grid": {"env_kwargs.n_via": [2]},
+        },
+    },
+    "compare": [["viaq", "viaq/untrained"], ["viaq/4", "search16"]],
+}
+
+
+def study_of(folder, **changes):
+    return Study.from_dict({**SMALL, "out": str(folder), **changes}, name="small")
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    return folder, run_study(study_of(folder), workers=0)
+
+
+def rows(record, env=ENV):
+    return {each["row"]: each for each in record["environments"][env]["rows"]}
+
+
+def test_every_row_is_that_of_its_files(done):
+    folder, record = done
+    found = rows(record)
+    modes = ["viaq", "viaq/4", "viaq/untrained", "viaq/untrained/4"]
+    assert list(found) == [*modes, "stored", "search16", "search32", "in-time", "search-k2"]
+    for name in modes:
+        for scenes in ("test", "hard"):
+            mode = name.removeprefix("viaq").strip("/").replace("/", "-") or "alone"
+            runs = [folder / "PlanarObstacles-v0" / "viaq" / f"seed-{seed}" for seed in (0, 1)]
+            files = [read_json(each / "evaluations" / f"{scenes}.{mode}.json") for each in runs]
+            each = [np.mean(file["outcomes"]["is_success"]) for file in files]
+            assert found[name]["sets"][scenes]["each"] == pytest.approx(each)
+        assert found[name]["seeds"] == [0, 1]
+    assert found["stored"]["sets"]["test"]["success"][0] == 1.0
+    assert found["stored"]["sets"]["test"]["jerk"] == [1.0, 1.0, 1.0]
+    assert found["search-k2"]["sets"]["test"]["scenes"] == 4
+    assert found["in-time"]["checks"] >= 4
+    assert all(0.0 < found[name]["decision_time"] < 10.0 for name in (*modes, "search16", "in-time"))
+    assert found["viaq"]["training"]["decisions"] == 64
+    compared = record["environments"][ENV]["compared"]
+    assert "probability" in compared[0]["sets"]["test"]
+    assert set(compared[1]["sets"]["hard"]) == {"difference", "p_value"}
+
+
+def test_the_page_and_the_figures_are_made_of_the_record(done):
+    folder, record = done
+    study = study_of(folder)
+    text = (folder / "results.md").read_text()
+    assert render_page(json.loads((folder / "results.json").read_text()), study.page) == text
+    assert f"{100 * rows(record)['viaq']['sets']['test']['success'][0]:.1f} %" in text
+    pictures = re.findall(r"\((figures/\S+\.png)\)", text)
+    assert pictures == ["figures/results_planar_obstacles.png"]
+    assert (folder / pictures[0]).stat().st_size < 80_000
+    assert np.asarray(Image.open(folder / pictures[0]).convert("L")).std() > 5.0
+
+
+def test_a_second_call_does_nothing_again(done, monkeypatch):
+    folder, record = done
+
+    def never(*args, **kwargs):
+        pytest.fail("did again what was done")
+
+    for module, name in ((jobs, "train"), (jobs, "evaluate_methods"), (run, "make_runner")):
+        monkeypatch.setattr(module, name, never)
+    before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
+    assert run_study(study_of(folder), workers=0) == record
+    assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
+
+
+def test_what_is_lost_or_of_something_else_is_measured_again(done):
+    folder, record = done
+    lost = folder / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "test.4.json"
+    before = lost.read_bytes()
+    for content in (None, {**json.loads(before), "weights": "of another agent"}):
+        lost.unlink() if content is None else lost.write_text(json.dumps(content))
+        assert rows(gather(study_of(folder)))["viaq/4"]["seeds"] == [0]
+        assert run_study(study_of(folder), workers=0, only=["evaluate"]) == record
+        assert lost.read_bytes() == before
+
+
+def test_rows_outlive_their_files_until_as_much_is_measured(done, tmp_path):
+    _, record = done
+    empty = study_of(tmp_path)
+    assert rows(gather(empty)) == {}
+    assert gather(empty, record) == record
+    fewer = json.loads(json.dumps(record))
+    for each in fewer["environments"][ENV]["rows"]:
+        each["seeds"] = each.get("seeds", [])[:1]
+    folder, _ = done
+    assert rows(gather(study_of(folder), fewer))["viaq"]["seeds"] == [0, 1]
+    more = json.loads(json.dumps(record))
+    more["environments"][ENV]["rows"][0]["seeds"] = [0, 1, 2]
+    assert rows(gather(study_of(folder), more))["viaq"]["seeds"] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("what", ["scenes", "settings"])
+def test_rows_of_other_scenes_or_settings_do_not_stay(done, tmp_path, what):
+    _, record = done
+    changed = json.loads(json.dumps(record))
+    if what == "scenes":
+        changed["environments"][ENV]["sets"]["test"]["sha256"] = "of other scenes"
+    study = study_of(
+        tmp_path, **({"agents": {}, "compare": [], "baselines": ["search16"]} if what == "settings" else {})
+    )
+    found = rows(gather(study, changed))
+    if what == "scenes":
+        assert {name for each in found.values() for name in each["sets"]} == {"hard"}
+    else:
+        assert found == {}  # its search of another kind has the same name
+
+
+def test_a_run_with_other_settings_is_refused_and_others_go_on(done):
+    folder, _ = done
+    other, lines = {"viaq": {**SMALL["agents"]["viaq"], "n_timesteps": 128}}, []
+    study = study_of(folder, agents=other, seeds=[0], baselines=["straight"], compare=[])
+    with pytest.raises(run.StudyFailedError, match="1 jobs failed: PlanarObstacles-v0 viaq seed 0"):
+        run_study(study, workers=0, only=["train", "baselines"], report=lines.append)
+    assert "was trained with other settings (n_timesteps)" in lines[1]
+    assert "PlanarObstacles-v0 straight: test" in lines[2]
+
+
+def test_what_is_interrupted_is_not_kept(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("viapoint.training.planners.baselines.StoredSolutions.decide", interrupted)
+    study = study_of(tmp_path, agents={}, compare=[], baselines=["stored"])
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study, workers=0, only=["baselines"])
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_grid_has_an_entry_for_each_point():
+    agents = {
+        "k{n_via}-{timing}": {
+            "grid": {"env_kwargs.n_via": [1, 2], "env_kwargs.timing": ["optimal", "learned"]}
+        },
+        "sac": {"algo": "sac", "grid": {"hyperparameters.batch_size": [64]}, "label": "SAC of {batch_size}"},
+        "ppo-step": {"algo": "ppo", "step_wise": True},
+    }
+    study = Study.from_dict({"environments": [ENV, MOVING], "agents": agents})
+    found = {each.name: each for each in study.agents}
+    assert list(found) == [
+        "k1-optimal", "k1-learned", "k2-optimal", "k2-learned", "sac-batch_size=64", "ppo-step",
+    ]  # fmt: skip
+    assert found["k2-learned"].training["env_kwargs"] == {"n_via": 2, "timing": "learned"}
+    assert found["sac-batch_size=64"].label == "SAC of 64"
+    assert found["ppo-step"].environments == (ENV,)
+    assert found["ppo-step"].config(study.environments[0], 0, Path("x")).env.endswith("ObstaclesStep-v0")
+    assert rows_of(found["sac-batch_size=64"]) == ["sac-batch_size=64"]
+
+
+def test_settings_of_the_policy_are_merged_with_those_of_the_preset(tmp_path):
+    agents = {"sac": {"algo": "sac", "hyperparameters": {"policy_kwargs": {"critic": "minimum"}}}}
+    study = Study.from_dict({"environments": [ENV], "agents": agents})
+    policy = study.agents[0].config(study.environments[0], 0, tmp_path).hyperparameters["policy_kwargs"]
+    assert policy["critic"] == "minimum"
+    assert policy["net_arch"] == [256, 256]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"enviroments": [ENV]}, "the study: fields must be one of .*, got 'enviroments'; did you mean 'environments'"),
+        ({"environments": ["viapoint/PlanarObstacle-v0"]}, f"id must be one of .*did you mean '{ENV}'"),
+        ({"environments": []}, "environments must be a list of names"),
+        ({"seeds": [0, 0]}, "seeds must hold at least one number and none twice"),
+        ({"agents": {"a": {"algo": "sacc"}}}, "agents.a: algo must be one of .*did you mean 'sac'"),
+        ({"agents": {"a": {"n_timestep": 5}}}, "agents.a: fields must be one of .*did you mean 'n_timesteps'"),
+        ({"agents": {"a": {"n_timesteps": 0}}}, "agents.a in viapoint/PlanarObstacles-v0: n_timesteps must be"),
+        ({"agents": {"a": {"seed": 3}}}, "got 'seed'; did you mean 'seeds'"),
+        ({"agents": {"a": {"hyperparameters": {"batchsize": 3}}}}, "a.hyperparameters: .*you mean 'batch_size'"),
+        ({"agents": {"a": {"algo": "sac", "checks": [4]}}}, "sac has no proposals to check"),
+        ({"agents": {"a": {"environments": ["b"]}}}, "agents.a.environments must be one of"),
+        ({"agents": {"a": {"grid": {"n_step.x": [1]}}}}, "agents.a.grid must be one of .*, got 'n_step'"),
+        ({"agents": {"a-{x}": {"grid": {"n_timesteps": [64]}}}}, "got 'x'"),
+        ({"baselines": ["magic"]}, "baselines.magic: method must be one of .*search"),
+        ({"baselines": {"s": {"method": "search"}}}, "search needs checks, a number"),
+        ({"baselines": {"s": {"method": "search", "time_of": "viaq"}}, "agents": {}}, "time_of must be one of"),
+        ({"baselines": {"straight": {"checks": 4}}}, "checks and time_of are for search"),
+        ({"baselines": {"unrevised": {"environments": [ENV]}}}, f"does not exist in {ENV}"),
+        ({"agents": {"straight": {}}, "baselines": ["straight"]}, "straight is there twice"),
+        ({"compare": [["viaq", "magic"]]}, "compare must be one of"),
+        ({"page": {"template": "nowhere.j2"}}, "nowhere.j2 is missing"),
+        ({"scenes": ["tests"]}, "must be one of .*did you mean 'test'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_is_refused_with_what_is_allowed(changes, reason):
+    given = {"environments": [ENV], "agents": {"viaq": {}}, "baselines": [], **changes}
+    with pytest.raises(ValueError, match=reason):
+        Study.from_dict(given)
+
+
+def test_a_file_is_named_in_its_errors(tmp_path):
+    path = tmp_path / "bad.yaml"
+    for content, reason in (
+        ("agents: {}\n", "bad.yaml: environments must be"),
+        ("a: [", "bad.yaml: cannot be read"),
+    ):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=reason):
+            Study.from_yaml(path)
+    with pytest.raises(ValueError, match=r"only must be some of train, .* got 'trian'"):
+        run_study(Study.from_dict({"environments": [ENV]}), only=["trian"])
+
+
+def test_tables_of_other_pages_are_filled_in(done, tmp_path):
+    _, record = done
+    (tmp_path / "tables.j2").write_text(
+        "{% macro rates() %}{% for each in chosen(record.environments['" + ENV + "'], ['viaq', 'magic']) %}"
+        "{{ each.label }}: {{ each.sets.test.success | interval }}{% endfor %}{% endmacro %}"
+    )
+    page = Study.from_dict({"environments": [ENV], "page": {"tables": "tables.j2"}}, folder=tmp_path).page
+    text = fill_tables(record, page, "a\n<!-- table:rates -->\nold\n<!-- end -->\nb", Path("x.md"))
+    rate = 100 * row(record["environments"][ENV], "viaq")["sets"]["test"]["success"][0]
+    assert text.startswith(f"a\n<!-- table:rates -->\n\nviaq: {rate:.1f} % (")
+    assert text.endswith(")\n\n<!-- end -->\nb")
+    with pytest.raises(ValueError, match=r"has a table other, and .*tables.j2 has no macro"):
+        fill_tables(record, page, "<!-- table:other -->\n<!-- end -->", Path("x.md"))
+
+
+def test_tables_leave_out_columns_of_zeros():
+    text = table(
+        [["method", "success", "collision", "jerk"], ["a", "1", "0.0 %", "-"], ["b", "2", "0.0 %", "-"]]
+    )
+    assert text.splitlines() == ["| method | success |", "| --- | ---: |", "| a | 1 |", "| b | 2 |"]

@@ -1,0 +1,174 @@
+"""Decision times of all methods of a study, one after the other on an idle machine, and searches of equal time."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.io.files import read_json, write_json
+from viapoint.training.planners.baselines import Method
+from viapoint.training.rollouts.rollout import new_simulation
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import one_thread
+from viapoint.training.study.config import Agent, Baseline, Environment, Study
+from viapoint.training.study.jobs import Cell, Record, identity, identity_of, sets_of, state
+from viapoint.training.study.methods import method_of, method_of_mode, modes
+
+N_TIMED = 100
+"""Greatest number of scenes in which decisions are timed."""
+BUDGET = 5.0
+"""Wall time after which no further decision of a method is timed, [s]."""
+MOST_CHECKS = 1 << 16
+"""Greatest number of checks of a search of equal time."""
+FEWEST_CHECKS = 4
+
+
+class Timed(NamedTuple):
+    """Method to be timed."""
+
+    row: str
+    """Id of its row."""
+    source: Any
+    """Plain values; a time is obsolete if they have changed."""
+    method: Any
+    """Function without arguments that returns the method."""
+
+
+def path_of_times(env: Environment) -> str:
+    """Return the file of the decision times in an environment, below the folder of the study."""
+    return f"{env.folder}/timings.json"
+
+
+def times_of(study: Study, env: Environment) -> Record:
+    """Return the stored times by row."""
+    path = study.out / path_of_times(env)
+    return read_json(path) if path.is_file() else {}
+
+
+def time_decisions(study: Study) -> Iterator[str]:
+    """Time what has no time yet, and yield a line about each; trained agents are those of the first seed."""
+    for env in study.environments:
+        times = times_of(study, env)
+        for row, source, make in _to_time(study, env):
+            if times.get(row, {}).get("source") == source:
+                continue
+            times[row] = {"source": source, "median": median_time(study, env, make())}
+            _write(study, env, times)
+            yield f"{env.folder} {row}: {1e3 * times[row]['median']:.2f} ms"
+        for baseline in _of_equal_time(study, env):
+            if baseline.time_of not in times:
+                continue
+            source = {"time_of": times[baseline.time_of], **_made(baseline, env)}
+            if times.get(baseline.name, {}).get("source") == source:
+                continue
+            checks, seconds = checks_within(study, env, baseline, times[baseline.time_of]["median"])
+            times[baseline.name] = {"source": source, "median": seconds, "checks": checks}
+            _write(study, env, times)
+            yield f"{env.folder} {baseline.name}: {checks} checks in {1e3 * seconds:.2f} ms"
+
+
+def equal_time_pairs(study: Study) -> list[tuple[Baseline, Environment]]:
+    """Return the searches of equal time with the numbers of checks that were timed, and their environments."""
+    found = []
+    for env in study.environments:
+        times = times_of(study, env)
+        for baseline in _of_equal_time(study, env):
+            if "checks" in times.get(baseline.name, {}):
+                found.append((dataclasses.replace(baseline, checks=times[baseline.name]["checks"]), env))
+    return found
+
+
+def median_time(study: Study, env: Environment, method: Method) -> float:
+    """Return the median wall time of single decisions on one thread, without the first one, [s]."""
+    frozen = next(iter(sets_of(env).values()))
+    simulation = new_simulation(env.id, 2, **{**env.env_kwargs, "threads": 1})
+    times: list[float] = []
+    began = time.perf_counter()
+    try:
+        with one_thread():
+            for row in range(min(N_TIMED, len(frozen.share))):
+                scene = frozen.scenes.take(slice(row, row + 1))
+                observation = simulation.observe(scene)
+                before = time.perf_counter()
+                method.decide(observation, scene)
+                times.append(time.perf_counter() - before)
+                if time.perf_counter() - began > BUDGET:
+                    break
+    finally:
+        simulation.close()
+    return float(np.median(times[1:] or times))
+
+
+def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: float) -> tuple[int, float]:
+    """Return the number of checks of a search that takes at most a time, and its own time, [s].
+
+    The number is doubled until it takes longer, then interpolated once; a search that takes longer even with the fewest
+    checks has these.
+    """
+    frozen = next(iter(sets_of(env).values()))
+
+    def timed(checks: int) -> float:
+        search = dataclasses.replace(baseline, checks=checks)
+        return median_time(study, env, method_of(search, env, frozen, threads=1))
+
+    checks, took = FEWEST_CHECKS, timed(FEWEST_CHECKS)
+    while took < seconds and checks < MOST_CHECKS:
+        longer = timed(2 * checks)
+        if longer > seconds:
+            between = int(checks * (1.0 + (seconds - took) / (longer - took)))
+            tried = timed(between)
+            return (between, tried) if tried <= seconds else (checks, took)
+        checks, took = 2 * checks, longer
+    return checks, took
+
+
+def _of_equal_time(study: Study, env: Environment) -> list[Baseline]:
+    return [each for each in study.baselines if each.time_of is not None and env.name in each.environments]
+
+
+def _to_time(study: Study, env: Environment) -> Iterator[Timed]:
+    """Yield the methods of an environment: agents of the first trained seed, then baselines."""
+    frozen = next(iter(sets_of(env).values()))
+    for agent in (each for each in study.agents if each.timed and env.name in each.environments):
+        yield from _agent_to_time(study, env, agent)
+    for baseline in study.baselines:
+        if baseline.timed and baseline.time_of is None and env.name in baseline.environments:
+            yield Timed(
+                baseline.name,
+                _made(baseline, env),
+                lambda baseline=baseline: method_of(baseline, env, frozen, threads=1),
+            )
+
+
+def _agent_to_time(study: Study, env: Environment, agent: Agent) -> Iterator[Timed]:
+    runs = [Cell(env=env, agent=agent, seed=seed) for seed in agent.seeds]
+    first = next((cell for cell in runs if state(cell, study.out) == "trained"), None)
+    if first is None:
+        return
+    folder = Run(study.out / first.folder).best
+    frozen = next(iter(sets_of(env).values()))
+    kwargs = {**first.training(study.out).env_kwargs, "threads": 1}
+    model: Any = None
+
+    def make(mode: Any) -> Method:
+        nonlocal model
+        model = load_model(folder) if model is None else model
+        return method_of_mode(mode, model, env, kwargs)
+
+    for mode in modes(agent):
+        yield Timed(mode.row(agent), identity_of(frozen, folder, mode), lambda mode=mode: make(mode))
+
+
+def _made(baseline: Baseline, env: Environment) -> Record:
+    return identity(baseline, env, next(iter(sets_of(env).values())))
+
+
+def _write(study: Study, env: Environment, times: Record) -> None:
+    path = study.out / path_of_times(env)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, times)
