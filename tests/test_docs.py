@@ -36,6 +36,18 @@ def test_links_lead_somewhere(path):
         assert not anchor or anchor in anchors(target), link
 
 
+def test_files_named_to_contributors_hold_what_they_are_named_for():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("## Where things are")[1].split("##")[0]
+    for files in re.findall(r"`(\w+/[\w/]+\.py)`", text):
+        assert (ROOT / files).is_file() or "NAME" in files, files
+    for row in table.splitlines()[4:]:
+        for names, file in re.findall(r"((?:`\w+`(?: and )?)+) in `([\w/]+\.py)`", row):
+            source = (ROOT / file).read_text(encoding="utf-8")
+            for name in re.findall(r"\w+", names.replace(" and ", " ")):
+                assert re.search(rf"(?:class|def) {name}\b", source), (name, file)
+
+
 @pytest.mark.parametrize("path", PAGES, ids=NAMES)
 def test_examples_import_public_packages_only(path):
     for example in examples(path):

@@ -12,12 +12,14 @@ import numpy as np
 from dataflow import draw_flow
 from PIL import Image
 
+from viapoint.envs import load_arm
 from viapoint.envs.common.types import Float, Frame
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training import load_agent
+from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.scene_sets.scene_set import load
 
+ROOT = Path(__file__).parents[2]
 SEEDS = {"PlanarReach": 4, "PlanarObstacles": 15, "PlanarWholeArm": 1}
 """Seeds of scenes that are typical of a task."""
 FILES = {
@@ -140,17 +142,24 @@ def passage(env: gym.Env[Any, Any], env_id: str, row: int, *, straight: bool = F
         RuntimeError: The agent's movement fails, or the straight one succeeds.
     """
     scene, agent = load("test", env_id).scenes.take([row]), load_agent(env_id)
-    observation, _ = env.reset(options=scene.as_options())
+    return film(env, scene.as_options(), None if straight else agent_method("agent", agent, 16))
+
+
+def film(env: gym.Env[Any, Any], scene: dict[str, Any], method: Any) -> list[Frame]:
+    """Return the frames of a method's movement in a scene, or without a method of the straight one until its contact.
+
+    Raises:
+        RuntimeError: The method's movement fails, or the straight one succeeds.
+    """
+    observation, _ = env.reset(options=scene)
     task: Any = env.unwrapped.task  # type: ignore[attr-defined]
     batch = {name: part[None] for name, part in observation.items()}
-    action = (
-        np.zeros(task.action.size) if straight else agent_method("agent", agent, 16).decide(batch, scene)[0]
-    )
+    action = np.zeros(task.action.size) if method is None else method.decide(batch, None)[0]
     info = env.step(action.astype(np.float32))[-1]
-    if info["is_success"] is straight:
-        raise RuntimeError(f"scene {row} shows nothing: is_success is {info['is_success']}")
+    if info["is_success"] is (method is None):
+        raise RuntimeError(f"the scene shows nothing: is_success is {info['is_success']}")
     frames: list[Frame] = env.render()  # type: ignore[assignment]
-    if straight:
+    if method is None:
         frames = frames[: 1 + round(info["first_contact_time"] / info["duration"] * (len(frames) - 1))]
     return frames
 
@@ -179,6 +188,24 @@ def passages(strip: Path, pair: Path, film: Path) -> None:
         env.close()
 
 
+def own_arm(path: Path, seed: int = 7, side: int = 480) -> None:
+    """Render the arm of the page on arms of one's own: the plan of a search beside the straight movement."""
+    ur5e = load_arm(
+        ROOT / "docs" / "ur5e.xml",
+        hand_site="hand",
+        joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
+        home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
+        velocity_limit=np.pi,
+    )
+    env = gym.make("viapoint/Obstacles-v0", arm=ur5e, render_mode="rgb_array_list", width=side, height=side)
+    env.reset(seed=seed)
+    scene = env.unwrapped.batch.scenes.as_options()  # type: ignore[attr-defined]
+    frames = film(env, scene, GeometrySearch(env.unwrapped.task))  # type: ignore[attr-defined]
+    moment = frames[round(MOMENTS[1] * (len(frames) - 1))]
+    Image.fromarray(side_by_side((moment, film(env, scene, None)[-1]))).save(path, optimize=True)
+    env.close()
+
+
 def flow(path: Path) -> None:
     """Draw the flow from action to observation with the data of one movement."""
     env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0", render_mode="rgb_array")
@@ -200,6 +227,7 @@ def main() -> None:
     animation(out / "reaching.webp")
     replanning(out / "revising.webp")
     passages(out / "panda_agent.png", out / "panda_obstacles.png", out / "panda.webp")
+    own_arm(out / "own_arm.png")
     flow(out / "flow.png")
     for path in sorted(out.iterdir()):
         print(f"{path}  {path.stat().st_size / 1000:.0f} kB")

@@ -48,11 +48,17 @@ class Arm(Protocol):
 
     @property
     def joint_range(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest angle of each of the J joints, [rad]."""
+        """Lowest and highest angle of each of the J joints, [rad].
+
+        :func:`~viapoint.envs.sim.outcome.within_joint_range` checks executed movements.
+        """
 
     @property
     def velocity_limit(self) -> tuple[float, ...]:
-        """Velocity limits of the joints, [rad/s]; empty if there are none."""
+        """Velocity limits of the joints, [rad/s]; empty if there are none.
+
+        Time scaling keeps them: :mod:`viapoint.envs.sim.time_scaling`.
+        """
 
     @property
     def workspace(self) -> Box:
