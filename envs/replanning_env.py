@@ -177,6 +177,19 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         moving = MovingPlan(waypoints, plan.durations.copy(), state.velocity, state.acceleration)
         return self._execute_decision(moving, np.ones(self.num_envs, dtype=bool))
 
+    def move_goals(self, goals: Float) -> Observation:
+        """Move the targets of the running episodes, which jump no more, and return the new observations.
+
+        The next decision revises the plans without a jump of position, velocity or acceleration.
+
+        Args:
+            goals: New targets, shape (num_envs, D), [m], within the arm's reach.
+        """
+        self._check_running()
+        assert self.scenes is not None
+        self.scenes = self.scenes._replace(goal=goals.copy(), jumps=np.zeros_like(self.scenes.jumps))
+        return self.observe()
+
     def episodes_state(self) -> dict[str, Any]:
         """See :meth:`MultiStepVectorEnv.episodes_state`."""
         every = [each for history in self._history for each in history]

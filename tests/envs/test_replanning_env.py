@@ -222,3 +222,24 @@ def test_a_plan_in_metres_and_seconds_can_be_performed_on_the_way():
         batch.execute_plan(Plan(waypoints, np.array([0.3, 0.4])))
     with pytest.raises(ValueError, match="must begin where the hand is"):
         batch.execute_plan(Plan(waypoints + 0.1, np.array([[0.3, 0.4]])))
+
+
+def test_a_moved_goal_is_reached_without_a_jump():
+    env = gym.make_vec("viapoint/PlanarTargetJump-v0", num_envs=3, horizon=0.1, threads=1).unwrapped
+    env.reset(seed=0)
+    zero = np.zeros((3, 3))
+    env.execute_actions(zero)
+    env.execute_actions(zero)
+    goals = env.scenes.goal + np.array([0.0, 0.03])
+    before = env.default.state
+    observation = env.move_goals(goals)
+    np.testing.assert_allclose(observation["goal"], goals, atol=1e-6)
+    env.execute_actions(zero)
+    for row, history in enumerate(env.last_plans):
+        after = history[-1][1].states(np.zeros(1))
+        for was, now in zip(before, after, strict=True):
+            np.testing.assert_allclose(now[0], was[row], rtol=0.0, atol=1e-9)
+    while not env.terminated.any():
+        info = env.execute_actions(zero).info
+    np.testing.assert_allclose(env.last_plan.waypoints[:, -1], goals)
+    assert info["is_success"][env.terminated].all()

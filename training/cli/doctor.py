@@ -5,6 +5,7 @@ Nothing but the standard library is imported before a check asks for it, so that
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
 import json
@@ -15,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import webbrowser
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,12 +28,18 @@ PATIENCE = 120.0
 SPACE = 1 << 30
 """Free disk space for a few trainings, [bytes]."""
 REINSTALL = "pip install --force-reinstall 'mujoco>=4'"
-OPTIONAL = {"moviepy": "gymnasium's RecordVideo", "ompl": "the baseline by a motion planner (RRT-Connect)"}
+OPTIONAL = {
+    "moviepy": "gymnasium's RecordVideo",
+    "ompl": "the baseline by a motion planner (RRT-Connect)",
+    "viser": "the live page",
+}
 """Packages that only some features need, and these features."""
 MODULES = {"pyyaml": "yaml"}
 """Modules of packages with other names."""
-EXTRAS = {"optuna": "tuning", "ray": "cluster"}
+EXTRAS = {"mjviser": "live", "optuna": "tuning", "ray": "cluster", "viser": "live"}
 """Extras of packages that a command imports when it needs them."""
+BROWSERS = ("chromium", "google-chrome", "chromium-browser", "microsoft-edge", "firefox")
+"""Programs that show the live page."""
 INSTALL_TRAINING = "pip install 'viapoint[training]'"
 REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
 
@@ -157,6 +165,7 @@ def examine(folder: Path) -> Iterator[Finding]:
         yield attempt("torch", torch_threads, INSTALL_TRAINING)
         yield in_a_process("train and render", RENDER_THEN_TRAIN, UPDATE_TRITON)
         yield in_a_process("shipped agent", AGENT, "pip install --force-reinstall viapoint")
+    yield browser()
     yield attempt("processors", processors, "")
     yield attempt(
         "disk", lambda: disk(folder), f"choose another folder than {folder}, or make room on its disk"
@@ -293,6 +302,17 @@ def torch_threads() -> str:
     assert float(torch.ones(3) @ torch.ones(3)) == 3.0
     others = f", {torch.cuda.get_device_name(0)} is there, too" if torch.cuda.is_available() else ""
     return f"training on the CPU, on one thread of {torch.get_num_threads()}{others}"
+
+
+def browser() -> Finding:
+    """Look for a browser, which the live page needs."""
+    places = [path for path in map(shutil.which, BROWSERS) if path]
+    with contextlib.suppress(webbrowser.Error):
+        places.append(getattr(webbrowser.get(), "name", "the default browser"))
+    return Finding(
+        name="browser", works=bool(places), needed=False, found=places[0] if places else "none for `viapoint live`",
+        remedy="on Debian and Ubuntu: apt-get install chromium; or look at the page from elsewhere by an SSH tunnel",
+    )  # fmt: skip
 
 
 def processors() -> str:

@@ -28,6 +28,7 @@ from viapoint.training.config.configs import (
     TrainConfig,
     TuneConfig,
 )
+from viapoint.training.config.live_config import LiveConfig
 
 
 class UsageError(ValueError):
@@ -54,6 +55,7 @@ COMMANDS: dict[str, Command] = {
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
     "study": Command(StudyConfig, "viapoint.training.study.run", "run"),
+    "live": Command(LiveConfig, "viapoint.training.live.page", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
     "tune": Command(TuneConfig, "viapoint.training.study.tuning", "run"),
     "export": Command(ExportConfig, "viapoint.training.cli.export", "run"),

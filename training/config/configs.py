@@ -30,13 +30,13 @@ from viapoint.training.config.discount import check_discount_unit
 from viapoint.training.config.key_values import NamedValues, to_words
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 
-_ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
-_AGENT = tyro.conf.arg(
+ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
+AGENT = tyro.conf.arg(
     metavar="AGENT",
     help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
 )
-_PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent, one of {', '.join(SHIPPED_IDS)}.")
-EnvId = Annotated[str, _ENV]
+PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent, one of {', '.join(SHIPPED_IDS)}.")
+EnvId = Annotated[str, ENV]
 """Id of an environment; the help of a command lists them."""
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ class TrainConfig(Config):
         )
 
 
-def _take_pretrained(config: EvaluateConfig | PlayConfig) -> None:
+def take_pretrained(config: Any) -> None:
     """Set the agent of a configuration from `pretrained`.
 
     Raises:
@@ -244,9 +244,9 @@ class EvaluateConfig(Config):
     Example: viapoint evaluate runs/first --baselines straight planner --scenes test
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], _AGENT] = None
+    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent; None for baselines alone."""
-    pretrained: Annotated[str | None, _PRETRAINED] = None
+    pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     baselines: tuple[str, ...] = ("straight", "random", "planner")
     """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
@@ -262,13 +262,13 @@ class EvaluateConfig(Config):
     """JSON file for all results, scene by scene."""
     failures: Path | None = None
     """Folder for counts and pictures of the agent's failures by kind, those of its last row in the table."""
-    env: Annotated[str | None, _ENV] = None
+    env: Annotated[str | None, ENV] = None
     """Id of the environment; default: that of the agent."""
 
     least: ClassVar = {"n_scenes": 1}
 
     def _check(self) -> None:
-        _take_pretrained(self)
+        take_pretrained(self)
         check_baselines(self.baselines)
         if self.env is not None:
             check_env(self.env)
@@ -292,9 +292,9 @@ class PlayConfig(Config):
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], _AGENT] = None
+    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent."""
-    pretrained: Annotated[str | None, _PRETRAINED] = None
+    pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
@@ -308,7 +308,7 @@ class PlayConfig(Config):
     least: ClassVar = {"n_scenes": 1, "checks": 0}
 
     def _check(self) -> None:
-        _take_pretrained(self)
+        take_pretrained(self)
         if self.agent is None:
             raise ValueError("name an agent: run folder, model folder or id")
         check_file("video", self.video, ".mp4")
@@ -413,7 +413,7 @@ class ImportConfig(Config):
 
     file: tyro.conf.Positional[Path]
     """Archive that `model.save` of Stable-Baselines3 wrote."""
-    env: Annotated[str | None, _ENV] = None
+    env: Annotated[str | None, ENV] = None
     """Id of the environment that the model was trained on, with default arguments; default: the one that an archive by
     `viapoint export` names, otherwise viapoint/PlanarObstacles-v0."""
     out: Path
@@ -465,7 +465,7 @@ class ExportConfig(Config):
     Example: viapoint export viapoint/PlanarObstacles-v0 --out shared/planar-obstacles --scenes test
     """
 
-    agent: Annotated[tyro.conf.Positional[str], _AGENT]
+    agent: Annotated[tyro.conf.Positional[str], AGENT]
     """Run folder, model folder, or id of an environment with a shipped agent."""
     out: Path
     """Folder for the archive and its card README.md, or a file that ends in .zip, with the card beside it."""

@@ -1,0 +1,253 @@
+"""The live page without a browser: files, drawn shapes, decisions and movements."""
+
+import json
+import socket
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("viser", reason="the extra `live` is not installed")
+pytest.importorskip("mjviser", reason="the extra `live` is not installed")
+
+import trimesh
+
+from viapoint.envs.registration import ENV_IDS
+from viapoint.training import load_agent
+from viapoint.training.cli import main as cli
+from viapoint.training.config.checks import SHIPPED_IDS
+from viapoint.training.live import drawing, movements, obstacle_editing
+from viapoint.training.live.decisions import APART, plan_by_hand
+from viapoint.training.live.page import LivePage, is_loopback
+from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
+from viapoint.training.live.shared import Shared
+
+PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
+MOVING = "viapoint/PlanarMovingObstacles-v0"
+
+
+@pytest.fixture(scope="module")
+def shared():
+    made = {}
+
+    def of(env_id, agent=None):
+        if env_id not in made:
+            made[env_id] = Shared(env_id, agent, model_file=None, seed=0, env_kwargs={})
+        return made[env_id]
+
+    yield of
+    for each in made.values():
+        each.comparison.close()
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, shared):
+    """Without an agent the geometry search decides; environments of an own arm have the Panda by default."""
+    some = shared(env_id)
+    env, task = some.make_env(), some.task
+    for draw in some.scene_kinds().values():
+        scene = draw()
+        again = from_json(to_json(scene, env_id), task.arm.dimension)
+        for mine, theirs in zip(scene, again, strict=True):
+            np.testing.assert_allclose(mine, theirs, atol=1e-6)
+    observation, _ = env.reset(options=scene.options(changing=task.replanning))
+    decision = some.decisions.choose(observation)
+    proposals = some.decisions.proposals(observation, decision)
+    np.testing.assert_allclose(decision.chosen.plan.waypoints[[0, -1]], (scene.start, scene.goal), atol=1e-6)
+    assert decision.chosen.clear
+    profile = movements.plan_profile(task, scene, decision.chosen.plan)
+    assert profile.speed[0] < 1e-6 < profile.speed.max()
+    if task.replanning:
+        segments = movements.execute_replanning(
+            env, some.decisions, scene, decision.chosen.plan, lambda: scene.goal
+        )
+    else:
+        segments = movements.execute_whole(env, scene, decision.chosen.plan)
+    (*_, last) = segments
+    assert last.info["is_success"][0]
+    assert "Success" in movements.describe_outcome({name: v[0] for name, v in last.info.items()})
+    paths = np.array([each.path() for each in proposals])
+    for i, j in np.argwhere(~np.eye(len(paths), dtype=bool)):
+        assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * APART
+    parts = some.drawing(env.model)
+    assert len(parts.poses(task.arm.inverse_kinematics(scene.start))) == len(parts.parts) > 0
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", [PLANAR, MOVING])
+@pytest.mark.parametrize("checks", [0, 16])
+def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
+    agent = load_agent(env_id)
+    some = Shared(env_id, agent, model_file=None, seed=0, env_kwargs={})
+    observation, _ = some.make_env().reset(seed=4)
+    decision = some.decisions.choose(observation, checks=checks)
+    agent.policy.checks = checks
+    expected, _ = agent.predict(observation, deterministic=True)
+    np.testing.assert_array_equal(decision.action, expected[0])
+    first, *_ = some.decisions.proposals(observation, decision)
+    assert first.predicted is not None
+    if not checks:
+        assert first.rank == 1
+
+
+def test_other_numbers_of_via_points_are_searched(shared):
+    some = shared(PLANAR)
+    observation, _ = some.make_env().reset(seed=4)
+    for number in (0, 2, 3):
+        decision = some.decisions.choose(observation, n_via=number)
+        assert decision.maker.startswith("search")
+        assert len(decision.chosen.plan.durations) == number + 1
+
+
+def test_a_plan_by_hand_is_valued_as_the_same_decision(shared):
+    some = shared(PLANAR)
+    env = some.make_env()
+    observation, _ = env.reset(seed=4)
+    chosen = some.decisions.choose(observation).chosen
+    plan = plan_by_hand(LiveScene.of(env.scenes), chosen.plan.waypoints[1:-1], chosen.duration)
+    mine = some.decisions.evaluate(observation, plan)
+    assert mine.rank == 0
+    assert mine.clearance == pytest.approx(chosen.clearance, abs=1e-4)
+    assert mine.reward == pytest.approx(chosen.reward, abs=1e-3)
+
+
+def test_a_dragged_goal_is_reached_without_a_jump():
+    agent = load_agent(MOVING)
+    some = Shared(MOVING, agent, model_file=None, seed=0, env_kwargs={})
+    env, scene = some.make_env(), some.scene_kinds()["Random"]()
+    observation, _ = env.reset(options=scene.options(changing=True))
+    plan = some.decisions.choose(observation).chosen.plan
+    asked, aside = [], scene.goal + (0.02, 0.04) * np.sign(0.3 - scene.goal)
+
+    def goal():
+        asked.append(None)
+        return aside if len(asked) > 2 else scene.goal
+
+    segments = list(movements.execute_replanning(env, some.decisions, scene, plan, goal))
+    hand = np.concatenate([each.hand for each in segments])
+    time = np.concatenate([each.time for each in segments])
+    assert np.linalg.norm(hand[-1] - aside) < 0.01
+    assert sum(each.path is not None for each in segments) >= 1
+    velocity = np.diff(hand, axis=0) / np.diff(time)[:, None]
+    assert np.abs(np.diff(velocity, axis=0)).max() < 0.1
+
+
+def test_methods_are_compared_in_a_scene(shared):
+    some = shared(PLANAR)
+    scene = some.scene_kinds()["Hard"]()
+    results = {name: result() for name, result in some.comparison(scene)}
+    assert list(results) == ["straight", "geometry search", "planner"]
+    assert not results["straight"].success
+    assert results["planner"].success
+    assert results["straight"].jerk_ratio == pytest.approx(1.0)
+
+
+@settings(max_examples=30)
+@given(
+    st.integers(2, 3), st.floats(0.01, 0.1), st.floats(0.01, 0.3), st.floats(-89.0, 89.0), st.floats(-80, 80)
+)
+def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevation):
+    row = np.zeros(2 * d + 1)
+    row[-1] = 0.02
+    values = {"radius": radius, "half-length": length, "heading": heading}
+    values |= {"elevation": elevation} if d == 3 else {}
+    for name in ("half-length", *values):
+        row = obstacle_editing.resized(row, name, values[name])
+    assert obstacle_editing.sizes_of(row) == pytest.approx(values, abs=1e-6)
+
+
+@settings(max_examples=20)
+@given(st.integers(2, 3), st.floats(0.01, 0.1), st.floats(0.0, 0.2), st.floats(-3.0, 3.0))
+def test_obstacles_are_drawn_where_they_are(d, radius, length, angle):
+    """All corners lie on the surface: their distance from the axis is the radius."""
+    half = length * np.array([np.cos(angle), np.sin(angle), 0.0])[:d]
+    mesh = drawing.obstacle_mesh(np.array([*np.zeros(d), *half, radius]), -0.02, 0.03)
+    points = np.asarray(mesh.vertices)[:, :d]
+    square = float(half @ half)
+    along = np.clip(points @ half / square, -1.0, 1.0) if square > 1e-12 else np.zeros(len(points))
+    np.testing.assert_allclose(np.linalg.norm(points - along[:, None] * half, axis=-1), radius, rtol=1e-6)
+
+
+def test_tubes_are_closed_and_have_their_radius():
+    angle = np.linspace(0.0, 2.0, 40)
+    points = np.stack((np.cos(angle), np.sin(angle), 0.2 * angle), axis=-1)
+    mesh = drawing.tube(points, 0.01)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert solid.is_watertight
+    length = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum()
+    octagon = 2.0 * np.sqrt(2.0) * 0.01**2
+    assert solid.volume == pytest.approx(length * octagon, rel=0.02)
+
+
+@pytest.mark.parametrize("env_id", [PLANAR, PANDA, MOVING])
+def test_python_code_sets_the_scene_up(env_id, shared):
+    some = shared(env_id)
+    scene = some.scene_kinds()["Random"]()
+    names = {}
+    exec(to_python(scene, env_id, {}, changing=some.task.replanning), names)
+    env = names["env"].unwrapped
+    np.testing.assert_allclose(LiveScene.of(env.batch.scenes).obstacles, scene.obstacles, atol=1e-6)
+    np.testing.assert_allclose(env.batch.scenes.goal[0], scene.goal, atol=1e-6)
+    assert isinstance(names["observation"], dict)
+    assert isinstance(names["gym"].spec(env_id), gym.envs.registration.EnvSpec)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format": "other"}, "viapoint-scene"),
+        ({"start": [0.1]}, "start of the scene file"),
+        ({"goal": [0.1, float("nan")]}, "goal of the scene file"),
+        ({"goal": None}, "goal of the scene file"),
+        ({"obstacles": 3}, "must be a list"),
+        ({"obstacles": [3]}, "obstacle 0 of the scene file must be an object"),
+        ({"obstacles": [{"shape": "cube"}]}, "shape capsule"),
+        ({"obstacles": [{"shape": "capsule", "position": [0, 0], "radius": "x"}]}, "obstacle 0: radius"),
+        ({"jumps": [[1.0]]}, "jumps"),
+    ],
+)
+def test_bad_scene_files_are_named(change, reason):
+    record = {"format": "viapoint-scene", "start": [0.1, 0.2], "goal": [0.2, 0.3], "obstacles": []}
+    with pytest.raises(ValueError, match=reason):
+        from_json(json.dumps({**record, **change}), dimension=2)
+
+
+def test_text_that_is_no_json_is_named():
+    for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20)):
+        with pytest.raises(ValueError, match="scene file"):
+            from_json(text, dimension=2)
+
+
+def failure(capsys, *words):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["live", *words])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_bad_input_is_said_in_one_line(capsys, tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        assert f"127.0.0.1:{port}" in failure(capsys, "--port", port)
+    assert "no such folder" in failure(capsys, str(tmp_path / "none"))
+    assert "0 to 65535" in failure(capsys, "--port", "70000")
+    assert "cannot listen on 203.0.113.7" in failure(capsys, "--host", "203.0.113.7", "--port", "0")
+    with pytest.raises(ValueError, match="decides in"):
+        LivePage(PLANAR, env=PANDA, port=0)
+
+
+def test_only_loopback_addresses_are_private():
+    assert all(map(is_loopback, ("127.0.0.1", "127.8.8.8", "::1", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.0.1", "example.org")))
+
+
+def test_the_page_never_asks_for_a_public_address():
+    with LivePage(env=PLANAR, port=0) as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        assert page._server.request_share_url() is None
+    assert PLANAR in SHIPPED_IDS

@@ -1,0 +1,204 @@
+"""The live page in a real browser: decisions follow what a user does, and errors are said on the page."""
+
+import gc
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra `live` is not installed")
+pytest.importorskip("mjviser", reason="the extra `live` is not installed")
+
+from browser import Browser, chromium, wait_for
+from viser import transforms
+
+from viapoint.training.live.page import LivePage
+from viapoint.training.live.scene_file import LiveScene, to_json
+
+pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
+
+PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v0"
+MESSAGE = "#viapoint-message"
+SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
+"""Displacements, [m]."""
+READY = 10.0
+"""Time in which a page must be ready, [s]."""
+UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
+"""Message of the library's client at every press on something that can be dragged; it changes nothing."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    browser = Browser()
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """Open pages and tabs; all are closed in the end."""
+    pages, tabs = [], []
+
+    def page(env, **kwargs):
+        pages.append(LivePage(env=env, port=0, seed=3, **kwargs))
+        return pages[-1]
+
+    def tab(page):
+        before = set(page.sessions)
+        tabs.append(browser.tab(page.url))
+        (session,) = wait_for(lambda: set(page.sessions) - before, READY)
+        wait_for(lambda: session.idle and session.proposal is not None, READY)
+        wait_for(lambda: "plan" in tabs[-1].text(MESSAGE), READY)
+        wait_for(lambda: steady(tabs[-1]), READY)
+        return tabs[-1], session
+
+    yield page, tab
+    for each in pages:
+        each.close()
+    for each in tabs:
+        assert [error for error in each.errors if error != UPSTREAM] == []
+        each.close()
+
+
+def steady(tab):
+    """Return True when the panels have found their places."""
+    before = tab.canvas()
+    time.sleep(0.3)
+    return before == tab.canvas()
+
+
+def settled(session):
+    """Wait until the session has seen what the browser sent, and has done it."""
+    time.sleep(0.25)
+    wait_for(lambda: session.idle)
+
+
+def on_screen(tab, session, point):
+    """Return the pixel at which a point of the world is seen."""
+    camera = session.camera
+    x, y, depth = transforms.SO3(camera.wxyz).as_matrix().T @ (np.resize([*point, 0.0], 3) - camera.position)
+    left, top, width, height = tab.canvas()
+    scale = 0.5 * height / np.tan(0.5 * camera.fov) / depth
+    return float(left + 0.5 * width + scale * x), float(top + 0.5 * height + scale * y)
+
+
+def drag(tab, session, first, last, **kwargs):
+    tab.drag(on_screen(tab, session, first), on_screen(tab, session, last), **kwargs)
+
+
+def test_what_a_user_does_changes_the_plan(opened):
+    open_page, open_tab = opened
+    page = open_page(PLANAR)
+    tab, session = open_tab(page)
+    assert {each.split("/")[2] for each in tab.requests if each.startswith("http")} == {
+        page.url.split("/")[2]
+    }
+
+    before = session.proposal.duration
+    tab.run("document.querySelector('[role=slider]').focus()")
+    for _ in range(4):
+        tab.key("ArrowRight")
+    settled(session)
+    assert session.proposal.duration == pytest.approx(before + 0.04, abs=0.02)
+    assert session.proposal.rank == 0  # made by hand
+    tab.press("button", "Decide anew")
+    wait_for(lambda: session.proposal and session.proposal.rank == 1)
+
+    goal, number = session.scene.goal, session.decisions
+    drag(tab, session, goal, goal + SHIFT)
+    settled(session)
+    assert np.linalg.norm(session.scene.goal - goal - SHIFT) < 0.01
+    assert session.decisions > number
+    np.testing.assert_allclose(session.proposal.plan.waypoints[-1], session.scene.goal, atol=1e-6)
+    assert session.proposal.rank > 0
+
+    tab.press("button", "Execute")
+    text = wait_for(lambda: "Success" in tab.text(MESSAGE) and tab.text(MESSAGE))
+    assert "from the goal after" in text
+
+    tab.press("[role=tab]", "Methods")
+    tab.press("button", "Compare in this scene")
+    wait_for(lambda: "planner" in tab.text("body") and "Each row is simulated" in tab.text("body"))
+    settled(session)
+
+    via = np.array(session.proposal.plan.waypoints[1])
+    drag(tab, session, via, via + UP)
+    settled(session)
+    np.testing.assert_allclose(session.proposal.plan.waypoints[1], via + UP, atol=0.01)
+
+    start = session.scene.start
+    obstacle = session.scene.obstacles[0, :2]
+    drag(tab, session, obstacle, start)
+    settled(session)
+    assert "touches the arm at the start" in tab.text(MESSAGE)
+    assert session.proposal is None
+    tab.press("button", "Test")
+    wait_for(lambda: "plan" in tab.text(MESSAGE))
+    assert session.proposal is not None
+
+
+def test_tabs_are_independent_and_leave_nothing_behind(opened):
+    open_page, open_tab = opened
+    page = open_page(PLANAR)
+    first, one = open_tab(page)
+    second, two = open_tab(page)
+    goal = two.scene.goal
+    second.press("button", "Random")
+    settled(two)
+    assert not np.array_equal(two.scene.goal, goal)
+    assert np.array_equal(one.scene.goal, goal)
+
+    first.call("Page.bringToFront")  # a page in the background is not drawn
+    first.press("button", "Random")
+    settled(one)
+    first.call("Page.reload")
+    wait_for(lambda: one not in page.sessions)
+    wait_for(lambda: len(page.sessions) == 2 and all(each.idle and each.proposal for each in page.sessions))
+    assert not one.alive
+    second.close()
+    wait_for(lambda: two not in page.sessions and not two.alive)
+    gc.collect()
+    assert len(page.sessions) == 1
+
+
+def test_a_goal_is_dragged_while_the_arm_moves(opened):
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page(REPLANNING))
+    goal = session.scene.goal
+    aside = goal + ASIDE
+    tab.press("button", "Execute")
+    wait_for(lambda: not session.idle)
+    drag(tab, session, goal, aside)
+    wait_for(lambda: "Success" in tab.text(MESSAGE))
+    assert np.linalg.norm(session.scene.goal - aside) < 0.01
+    hand = np.concatenate([each.hand for each in session.movement])
+    assert np.linalg.norm(hand[-1] - session.scene.goal) < 0.01
+    time_ = np.concatenate([each.time for each in session.movement])
+    speed = np.diff(hand, axis=0) / np.diff(time_)[:, None]
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.1  # no jump of the velocity, [m/s]
+
+
+def test_files_are_saved_and_impossible_ones_are_refused(opened):
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page(PLANAR))
+    tab.press("div", "Files")
+    time.sleep(0.6)  # it unfolds
+    tab.press("button", "Save scene (JSON)")
+    wait_for(lambda: list(tab.downloads.glob("*.json")))
+    tab.press("button", "Save picture (PNG)")
+    (picture,) = wait_for(lambda: list(tab.downloads.glob("*.png")))
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    tab.press("button", "Copy as Python")
+    assert "gym.make(" in wait_for(lambda: tab.text("#viapoint-code"))
+
+    scene = session.scene
+    blocked = LiveScene(*scene)._replace(obstacles=scene.obstacles.copy())
+    blocked.obstacles[0, :2] = scene.goal
+    session.load(to_json(blocked, PLANAR).encode())
+    wait_for(lambda: "impossible" in tab.text(MESSAGE))
+    assert np.array_equal(session.scene.obstacles, scene.obstacles)
+    session.load(b"{}")
+    wait_for(lambda: "viapoint-scene" in tab.text(MESSAGE))
+    session.load(to_json(scene._replace(goal=scene.goal + 0.01), PLANAR).encode())
+    wait_for(lambda: "plan" in tab.text(MESSAGE))
+    np.testing.assert_allclose(session.scene.goal, scene.goal + 0.01, atol=1e-6)

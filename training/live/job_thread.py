@@ -1,0 +1,99 @@
+"""Thread of one tab of the live page, in which all its work is done."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+
+Job = Callable[[], None]
+
+TICK = 0.03
+"""Time between two pictures of an animation, [s]."""
+
+
+class JobThread(threading.Thread):
+    """Thread that does jobs one after the other and animates in between.
+
+    Jobs of the same key replace each other while they wait, so that a fast drag skips positions instead of lagging
+    behind. Jobs whose key begins with `later` wait until there are no others.
+
+    Args:
+        name: Name of the thread.
+        begin: First job.
+        animate: Function that shows the next picture if it is due, and returns True as long as there is more to show.
+        end: Last job, also after an error.
+        tell: Function that shows an error to the user, in one sentence.
+    """
+
+    def __init__(
+        self, name: str, *, begin: Job, animate: Callable[[], bool], end: Job, tell: Callable[[str], None]
+    ) -> None:
+        super().__init__(name=name, daemon=True)
+        self._begin, self._animate, self._end, self._tell = begin, animate, end, tell
+        self._jobs: dict[str, Job] = {}
+        self._wake, self._busy = threading.Condition(), True
+        self.closed = False
+        """True after :meth:`close`."""
+
+    @property
+    def idle(self) -> bool:
+        """True if no job waits or is being done."""
+        with self._wake:
+            return not self._jobs and not self._busy
+
+    def post(self, key: str, job: Job) -> None:
+        """Let the thread do a job; a waiting one of the same key is replaced."""
+        with self._wake:
+            self._jobs.pop(key, None)
+            self._jobs[key] = job
+            self._wake.notify()
+
+    def close(self) -> None:
+        """End the thread after the job that is being done."""
+        with self._wake:
+            self.closed = True
+            self._wake.notify()
+
+    def run(self) -> None:
+        """Do jobs until the thread is closed."""
+        try:
+            self._begin()
+            more = True
+            while not self.closed:
+                job = self._next(more)
+                if job is not None:
+                    self.guard(job)
+                more = self._animate()
+        except Exception:
+            if not self.closed:
+                traceback.print_exc(file=sys.stderr)
+        finally:
+            self._end()
+
+    def guard(self, job: Job) -> None:
+        """Do a job; an error is told in one sentence."""
+        try:
+            job()
+        except Exception as error:
+            if self.closed:
+                return
+            sentence = " ".join(str(error).split()).removeprefix("scene 0: ")
+            known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith("viapoint")
+            if not known:
+                traceback.print_exc(file=sys.stderr)
+                sentence = f"{type(error).__name__}: {sentence}"
+            self._tell(f"{sentence[:1].upper()}{sentence[1:].rstrip('.')}.")
+
+    def _next(self, animated: bool) -> Job | None:
+        """Return the next job; wait for one, but only for a moment while something is animated."""
+        with self._wake:
+            self._busy = False
+            if not self._jobs and not self.closed:
+                self._wake.wait(TICK if animated else None)
+            if self.closed or not self._jobs:
+                return None
+            self._busy = True
+            urgent = [key for key in self._jobs if not key.startswith("later")]
+            return self._jobs.pop(urgent[0] if urgent else next(iter(self._jobs)))

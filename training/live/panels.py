@@ -1,0 +1,351 @@
+"""Panels of the live page in one tab: what is decided on the left, what can be changed on the right."""
+
+from __future__ import annotations
+
+import functools
+import html
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.palette import PALETTE, Colour
+
+if TYPE_CHECKING:
+    import viser
+
+    from viapoint.training.live.comparison import MethodResult
+    from viapoint.training.live.decisions import Proposal
+    from viapoint.training.live.movements import Profile
+
+WIDTH = 330
+"""Width of a panel, [pixels]."""
+PLOT_HEIGHT = 126
+"""Height of a plot, [pixels]."""
+SHOWN_CLEARANCE = 0.25
+"""Greatest clearance in the plot, [m]."""
+SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
+"""Speeds of the playback."""
+CHECKS = {"none": 0, "16": 16, "64": 64}
+"""Numbers of proposals that the agent checks with computed geometry."""
+GOOD, BAD, PLAIN = "#1b7f4b", "#c4202b", "#4a4f58"
+"""Colours of messages."""
+
+
+class Actions(NamedTuple):
+    """Functions that the panels call."""
+
+    scene: Callable[[str], None]
+    """Called with the name of the wanted kind of scene."""
+    duration: Callable[[float], None]
+    vias: Callable[[int], None]
+    checks: Callable[[int], None]
+    pick: Callable[[int], None]
+    add: Callable[[str], None]
+    remove: Callable[[], None]
+    resize: Callable[[str, float], None]
+    decide: Callable[[], None]
+    execute: Callable[[], None]
+    compare: Callable[[], None]
+    save: Callable[[], None]
+    load: Callable[[bytes], None]
+    code: Callable[[], None]
+    picture: Callable[[], None]
+    film: Callable[[], None]
+    view: Callable[[], None]
+
+
+class Facts(NamedTuple):
+    """Facts about the page that do not change."""
+
+    title: str
+    subtitle: str
+    scene_kinds: Sequence[str]
+    shapes: Sequence[str]
+    n_via: int
+    most_vias: int
+    duration_range: tuple[float, float]
+    ranks: bool
+    """True if the agent can check its proposals."""
+    spatial: bool
+
+
+class Panels:
+    """Panels of one tab."""
+
+    def __init__(self, client: viser.ClientHandle, facts: Facts, actions: Actions) -> None:
+        self._gui, self._facts, self._actions = client.gui, facts, actions
+        self._quiet = False
+        self._build_decision()
+        self._build_controls()
+
+    def tell(self, text: str, colour: str = PLAIN) -> None:
+        """Show one sentence."""
+        self._message.content = (
+            f'<div id="viapoint-message" style="padding:0 0.9em 0.4em;color:{colour};font-size:0.9em;'
+            f'line-height:1.35;min-height:3.9em">{html.escape(text)}</div>'
+        )
+
+    def show_proposals(self, proposals: Sequence[Proposal], picked: int, maker: str, seconds: float) -> None:
+        """Show the table of proposals, the picked one in bold."""
+        rows = [
+            (
+                "you" if not each.rank else str(each.rank),
+                f"{each.reward:.2f}",
+                "-" if each.predicted is None else _millimetres(each.predicted),
+                _millimetres(each.clearance) if each.reachable else "out of reach",
+                f"{each.duration:.2f}",
+            )
+            for each in proposals
+        ]
+        self._pick.visible = len(proposals) > 1
+        if not proposals:
+            self._table.content = _note("There is no plan in this scene.")
+            return
+        names = ("rank", "expected reward", "predicted clearance", "computed clearance", "time")
+        units = ("", "", "mm", "mm", "s")
+        self._table.content = _table(names, units, rows, bold=picked) + _note(
+            f"{maker}, decided in {1e3 * seconds:.0f} ms"
+        )
+        options = tuple("you" if not each.rank else f"#{each.rank}" for each in proposals)
+        if tuple(self._pick.options) != options:
+            self._pick.options = options
+
+    def show_plots(self, plan: Profile | None, executed: Profile | None) -> None:
+        """Show speed, jerk and clearance of a plan and of its execution."""
+        for name, handle in self._plots.items():
+            lines = [] if plan is None else [(plan.time, getattr(plan, name), "plan", PALETTE.plan)]
+            if executed is not None and name != "jerk":
+                lines.append((executed.time, getattr(executed, name), "executed", PALETTE.executed))
+            data, series = _lines(lines)
+            if name == "clearance":
+                data = (data[0], *(np.minimum(1e3 * y, 1e3 * SHOWN_CLEARANCE) for y in data[1:]))
+            if len(handle.series) != len(series):
+                handle.data, handle.series = data, series
+            else:
+                handle.data = data
+
+    def show_comparison(self, results: Sequence[MethodResult], *, running: str = "") -> None:
+        """Show the table of methods; `running` names the one whose result is to come."""
+        rows = [
+            (
+                each.name, "yes" if each.success else "no", f"{each.reward:.2f}", _millimetres(each.clearance),
+                f"{each.jerk_ratio:.2f}", f"{1e3 * each.seconds:.0f}",
+            )
+            for each in results
+        ]  # fmt: skip
+        names = ("method", "success", "reward", "clearance", "jerk", "decided in")
+        note = (
+            f"{running} ..."
+            if running
+            else "Each row is simulated. Jerk is relative to the straight movement."
+        )
+        if not rows and not running:
+            note = "Press the button to let other methods decide in this scene."
+        head = _table(names, ("", "", "", "mm", "", "ms"), rows) if rows else ""
+        self._methods.content = head + _note(note)
+
+    def show_decided(self, duration: float, n_via: int) -> None:
+        """Set the sliders to a decision."""
+        self._quiet = True
+        try:
+            low, high = self._facts.duration_range
+            self._duration.value = float(np.clip(round(duration, 2), low, high))
+            self._vias.value = n_via
+        finally:
+            self._quiet = False
+
+    def show_selected(self, name: str, values: dict[str, float] | None) -> None:
+        """Show the size of the selected obstacle; None if none is selected."""
+        self._quiet = True
+        try:
+            for key, slider in self._sizes.items():
+                slider.visible = values is not None and key in values
+                if values is not None and key in values:
+                    slider.value = float(np.clip(values[key], slider.min, slider.max))
+            self._remove.disabled = values is None
+            self._selected.content = _note(
+                f"Selected: {name}" if values is not None else "Click an obstacle."
+            )
+        finally:
+            self._quiet = False
+
+    def show_running(self, *, running: bool) -> None:
+        """Change the button of the execution."""
+        self._execute.label = "Stop" if running else "Execute"
+
+    def show_code(self, code: str) -> None:
+        """Show Python code with a button that copies it."""
+        with self._gui.add_modal("This scene in Python") as modal:
+            escaped = html.escape(code)
+            self._gui.add_html(
+                f'<pre id="viapoint-code" style="background:#f5f5f2;padding:1em;border-radius:6px;overflow:auto;'
+                f'font-size:0.82em;max-height:26em">{escaped}</pre>'
+                "<button onclick=\"const code=document.getElementById('viapoint-code').textContent;"
+                "const done=()=>{this.textContent='Copied'};"
+                "navigator.clipboard?navigator.clipboard.writeText(code).then(done):done()"
+                '" style="padding:0.5em 1.2em;border:0;border-radius:6px;background:#2f6fb3;color:white;'
+                'cursor:pointer">Copy</button>'
+            )
+            self._gui.add_button("Close").on_click(lambda _: modal.close())
+
+    @property
+    def speed(self) -> float:
+        """Speed of the playback."""
+        return SPEEDS[self._speed.value]
+
+    def _build_decision(self) -> None:
+        gui = self._gui
+        panel = gui.add_panel()
+        with panel.add_tab("Decision"):
+            self._table = gui.add_html("")
+            self._pick = gui.add_button_group("Show", ("#1",), visible=False)
+            self._pick.on_click(
+                lambda event: self._actions.pick(list(self._pick.options).index(event.target.value))
+            )
+            self._plots = {
+                name: gui.add_uplot(
+                    *_lines(()), title=title,
+                    height=PLOT_HEIGHT, scales={"x": {"time": False}}, legend={"show": False},
+                    cursor={"show": True}, axes=({"size": 30}, {"size": 40}), padding=(10, 10, 0, 0),
+                )
+                for name, title in (
+                    ("speed", "speed of the hand [m/s]"),
+                    ("jerk", "jerk of the hand [m/s³]"),
+                    ("clearance", "clearance [mm]"),
+                )
+            }  # fmt: skip
+            blue, dark = (_css(each) for each in (PALETTE.plan, PALETTE.executed))
+            gui.add_html(
+                f'<div style="padding:0 0.9em;font-size:0.8em;color:#4a4f58">time [s] &nbsp; <b style="color:{blue}">'
+                f'plan</b> &nbsp; <b style="color:{dark}">executed</b></div>'
+            )
+        with panel.add_tab("Methods"):
+            self._methods = gui.add_html("")
+            gui.add_button("Compare in this scene").on_click(lambda _: self._actions.compare())
+        panel.dock_left()
+        panel.set_width(WIDTH)
+        self.show_comparison(())
+
+    def _build_controls(self) -> None:
+        gui, facts, actions = self._gui, self._facts, self._actions
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(WIDTH - 20)
+        gui.add_html(
+            f'<div style="padding:0 0.9em"><div style="font-weight:600">{html.escape(facts.title)}</div>'
+            f'<div style="font-size:0.82em;color:#6b7078">{html.escape(facts.subtitle)}</div></div>'
+        )
+        self._message = gui.add_html("")
+        self.tell("Getting ready.")
+        self._execute = gui.add_button("Execute", color="green", icon="player-play")
+        self._execute.on_click(lambda _: actions.execute())
+        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/2 x")
+        with gui.add_folder("Scene"):
+            kinds = gui.add_button_group("", facts.scene_kinds)
+            kinds.on_click(lambda event: actions.scene(event.target.value))
+        with gui.add_folder("Decision"):
+            self._build_decision_controls()
+        with gui.add_folder("Obstacles"):
+            self._build_obstacle_controls()
+        with gui.add_folder("Files", expand_by_default=False):
+            gui.add_button("Save scene (JSON)").on_click(lambda _: actions.save())
+            upload = gui.add_upload_button("Load scene (JSON)", mime_type="application/json")
+            upload.on_upload(lambda event: actions.load(event.target.value.content))
+            gui.add_button("Copy as Python").on_click(lambda _: actions.code())
+            gui.add_button("Save picture (PNG)").on_click(lambda _: actions.picture())
+            gui.add_button("Save film (MP4)").on_click(lambda _: actions.film())
+        gui.add_button("Reset the view").on_click(lambda _: actions.view())
+        drag = "Drag start, goal, via-point and obstacles with the mouse."
+        drag += " Hold Shift to move them up and down." if facts.spatial else ""
+        gui.add_html(_note(drag))
+
+    def _build_decision_controls(self) -> None:
+        gui, facts, actions = self._gui, self._facts, self._actions
+        low, high = facts.duration_range
+        self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
+        self._duration.on_update(self._unless_quiet(lambda event: actions.duration(event.target.value)))
+        self._vias = gui.add_slider("Via-points", 0, facts.most_vias, 1, facts.n_via)
+        self._vias.disabled = facts.most_vias == facts.n_via
+        self._vias.on_update(self._unless_quiet(lambda event: actions.vias(int(event.target.value))))
+        if facts.ranks:
+            checks = gui.add_dropdown(
+                "Exact checks", tuple(CHECKS), hint="Proposals whose clearance is computed"
+            )
+            checks.on_update(lambda event: actions.checks(CHECKS[event.target.value]))
+        gui.add_button("Decide anew").on_click(lambda _: actions.decide())
+
+    def _build_obstacle_controls(self) -> None:
+        gui, actions = self._gui, self._actions
+        self._selected = gui.add_html("")
+        bounds = {"radius": (0.01, 0.1, 0.001), "half-length": (0.0, 0.3, 0.005)}
+        bounds |= {"heading": (-90.0, 90.0, 1.0), "elevation": (-90.0, 90.0, 1.0)}
+        units = {"radius": "m", "half-length": "m", "heading": "deg", "elevation": "deg"}
+        self._sizes = {
+            name: gui.add_slider(f"{name.capitalize()} [{units[name]}]", *limits, limits[0], visible=False)
+            for name, limits in bounds.items()
+        }
+        for name, slider in self._sizes.items():
+            resize = functools.partial(actions.resize, name)
+            slider.on_update(self._unless_quiet(lambda event, resize=resize: resize(event.target.value)))  # type: ignore[misc]
+        add = gui.add_button_group("Add", self._facts.shapes)
+        add.on_click(lambda event: actions.add(event.target.value))
+        self._remove = gui.add_button("Remove the selected one", disabled=True)
+        self._remove.on_click(lambda _: actions.remove())
+        self.show_selected("", None)
+
+    def _unless_quiet(self, function: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback that ignores changes made by the page itself."""
+
+        def callback(event: Any) -> None:
+            if event.client is not None and not self._quiet:
+                function(event)
+
+        return callback
+
+
+def _lines(lines: Sequence[tuple[Any, Any, str, Colour]]) -> tuple[Any, Any]:
+    """Return data and series of a plot with lines on one common time axis."""
+    if not lines:
+        return (np.zeros(2), np.zeros(2)), ({"label": "time"}, *_series("nothing", PALETTE.plan))
+    time = max((line[0] for line in lines), key=lambda each: float(each[-1]))
+    columns = [np.interp(time, x, y) for x, y, *_ in lines]
+    series = [each for *_, label, colour in lines for each in _series(label, colour)]
+    return (time, *columns), ({"label": "time"}, *series)
+
+
+def _series(label: str, colour: Colour) -> tuple[Any, ...]:
+    line: dict[str, Any] = {"label": label, "stroke": _css(colour), "width": 2, "points": {"show": False}}
+    return (line | ({"dash": (6, 5)} if label == "executed" else {}),)
+
+
+def _table(
+    names: Sequence[str], units: Sequence[str], rows: Sequence[Sequence[str]], bold: int | None = None
+) -> str:
+    """Return a table as HTML."""
+    cell = "padding:0.28em 0.35em;text-align:right;vertical-align:bottom"
+    head = "".join(
+        f'<th style="{cell};font-weight:500;color:#6b7078">{name}{f" [{unit}]" if unit else ""}</th>'
+        for name, unit in zip(names, units, strict=True)
+    )
+    body = "".join(
+        f'<tr style="border-top:1px solid #e6e6e3;{"font-weight:700" if i == bold else ""}">'
+        + "".join(f'<td style="{cell}">{html.escape(value)}</td>' for value in row)
+        + "</tr>"
+        for i, row in enumerate(rows)
+    )
+    return (
+        '<div style="padding:0.2em 0.7em"><table style="width:100%;border-collapse:collapse;font-size:0.8em;'
+        f'line-height:1.25"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+
+
+def _note(text: str) -> str:
+    return f'<div style="padding:0.2em 0.9em;font-size:0.8em;color:#6b7078">{html.escape(text)}</div>'
+
+
+def _millimetres(length: float) -> str:
+    return "far" if length >= 0.999 else f"{1e3 * length:.0f}"
+
+
+def _css(colour: Colour) -> str:
+    return "#" + "".join(f"{round(255 * each):02x}" for each in colour)

@@ -1,0 +1,186 @@
+"""Scenes of the live page: their record, JSON files, and Python code that sets them up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
+from viapoint.envs.scenes.scene import Scenes
+
+FORMAT = "viapoint-scene"
+"""Value of the key `format` of a scene file."""
+LARGEST_FILE = 1 << 20
+"""Greatest size of a scene file, [bytes]."""
+DIGITS = 6
+"""Decimal places of coordinates in files and in code, [m]."""
+
+
+class LiveScene(NamedTuple):
+    """One scene with as many rows as it has obstacles."""
+
+    start: Float
+    """Shape (D,), [m]."""
+    goal: Float
+    """Shape (D,), [m]."""
+    obstacles: Float
+    """Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]."""
+    courses: Float
+    """Rows (velocity D, time, velocity D), shape (n, 2 D + 1), [m/s] and [s]; zero for obstacles at rest."""
+    jumps: Float
+    """Rows (time, target D), shape (j, D + 1), [s] and [m]."""
+
+    @classmethod
+    def of(cls, scenes: Scenes | ChangingScenes, row: int = 0) -> LiveScene:
+        """Return one scene of a batch."""
+        present, d = scenes.present[row], scenes.start.shape[-1]
+        courses, jumps = np.zeros((int(present.sum()), 2 * d + 1)), np.zeros((0, d + 1))
+        if isinstance(scenes, ChangingScenes):
+            courses, jumps = scenes.courses[row, present], scenes.jumps[row]
+            jumps = jumps[(jumps != 0.0).any(axis=-1)]
+        parts = (scenes.start[row], scenes.goal[row], scenes.obstacles[row, present], courses, jumps)
+        return cls(*(np.array(part, dtype=np.float64) for part in parts))
+
+    def options(self, *, changing: bool) -> dict[str, Float]:
+        """Return the options of `reset`; `changing` environments get courses and jumps, too."""
+        names = self._fields if changing else ("start", "goal", "obstacles")
+        return {name: getattr(self, name) for name in names}
+
+    def batch(self) -> ChangingScenes:
+        """Return the scene and its changes as a batch of one."""
+        jumps = np.zeros((1, MOST_JUMPS, self.jumps.shape[-1]))
+        jumps[0, : len(self.jumps)] = self.jumps
+        return ChangingScenes(
+            self.start[None], self.goal[None], self.obstacles[None], jumps, self.courses[None]
+        )
+
+    def without(self, row: int) -> LiveScene:
+        """Return the scene without an obstacle."""
+        rows = [i for i in range(len(self.obstacles)) if i != row]
+        return self._replace(obstacles=self.obstacles[rows], courses=self.courses[rows])
+
+    def with_obstacle(self, numbers: Float) -> LiveScene:
+        """Return the scene with one more obstacle at rest."""
+        course = np.zeros((1, len(numbers)))
+        return self._replace(
+            obstacles=np.concatenate((self.obstacles, numbers[None])),
+            courses=np.concatenate((self.courses, course)),
+        )
+
+    def with_row(self, row: int, numbers: Float) -> LiveScene:
+        """Return the scene with other numbers of one obstacle."""
+        obstacles = self.obstacles.copy()
+        obstacles[row] = numbers
+        return self._replace(obstacles=obstacles)
+
+
+def to_json(scene: LiveScene, env_id: str) -> str:
+    """Return a scene as the text of a JSON file.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.training.live.scene_file import LiveScene, from_json, to_json
+        >>> row = np.array([[-0.05, 0.35, 0.0, 0.0, 0.03]])
+        >>> none = np.zeros((1, 5)), np.zeros((0, 3))
+        >>> scene = LiveScene(np.array([-0.2, 0.3]), np.array([0.1, 0.4]), row, *none)
+        >>> from_json(to_json(scene, "viapoint/PlanarObstacles-v0"), dimension=2).goal.tolist()
+        [0.1, 0.4]
+    """
+    d = len(scene.start)
+    record: dict[str, Any] = {"format": FORMAT, "env": env_id}
+    record |= {"start": _rounded(scene.start), "goal": _rounded(scene.goal), "obstacles": []}
+    for row, course in zip(scene.obstacles, scene.courses, strict=True):
+        one: dict[str, Any] = {"shape": "capsule", "position": _rounded(row[:d])}
+        one |= {"half_axis": _rounded(row[d : 2 * d]), "radius": _rounded(row[-1])}
+        if course.any():
+            one["course"] = _rounded(course)
+        record["obstacles"].append(one)
+    if scene.jumps.size:
+        record["jumps"] = _rounded(scene.jumps)
+    return json.dumps(record, indent=1) + "\n"
+
+
+def from_json(text: str | bytes, dimension: int) -> LiveScene:
+    """Return the scene of a JSON file; whether a movement can start and end in it is checked later.
+
+    Args:
+        text: Content of the file.
+        dimension: Dimension D of the arm's space.
+
+    Raises:
+        ValueError: The text is no scene file, or a value has another shape or is not finite.
+    """
+    if len(text) > LARGEST_FILE:
+        raise ValueError(f"a scene file has at most {LARGEST_FILE} bytes, got {len(text)}")
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the scene file is not JSON: {error}") from None
+    if not isinstance(record, Mapping) or record.get("format") != FORMAT:
+        raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
+    obstacles = record.get("obstacles", [])
+    if not isinstance(obstacles, list):
+        raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
+    size = 2 * dimension + 1
+    rows, courses = np.zeros((len(obstacles), size)), np.zeros((len(obstacles), size))
+    for i, each in enumerate(obstacles):
+        rows[i], courses[i] = _obstacle(i, each, dimension)
+    jumps = _numbers("jumps", record.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
+    start, goal = (_numbers(name, record.get(name), (dimension,)) for name in ("start", "goal"))
+    return LiveScene(start, goal, rows, courses, jumps)
+
+
+def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, changing: bool) -> str:
+    """Return Python code that sets the scene up in Gymnasium."""
+    names = {name: value for name, value in env_kwargs.items() if name not in ("render_mode", "threads")}
+    given = "".join(f", {name}={getattr(value, 'name', value)!r}" for name, value in names.items())
+    lines = ["import gymnasium as gym", "", f'env = gym.make("viapoint.envs:{env_id}"{given})']
+    lines += ["options = {"]
+    options = scene.options(changing=changing)
+    for name, value in options.items():
+        if value.ndim == 1:
+            lines.append(f'    "{name}": {_rounded(value)},  # [m]')
+        else:
+            lines += [f'    "{name}": [', *(f"        {_rounded(row)}," for row in value), "    ],"]
+    lines += ["}", "observation, info = env.reset(options=options)"]
+    return "\n".join(lines) + "\n"
+
+
+def _obstacle(i: int, record: Any, dimension: int) -> tuple[Float, Float]:
+    """Return row and course of an obstacle of a file."""
+    name = f"obstacle {i}"
+    if not isinstance(record, Mapping):
+        raise ValueError(f"{name} of the scene file must be an object, got {record!r:.60}")
+    if record.get("shape") != "capsule":
+        raise ValueError(
+            f"{name} of the scene file must have the shape capsule, got {record.get('shape')!r:.60}"
+        )
+    centre = _numbers(f"{name}: position", record.get("position"), (dimension,))
+    half = _numbers(f"{name}: half_axis", record.get("half_axis", [0.0] * dimension), (dimension,))
+    radius = _numbers(f"{name}: radius", record.get("radius"), ())
+    course = _numbers(
+        f"{name}: course", record.get("course", [0.0] * (2 * dimension + 1)), (2 * dimension + 1,)
+    )
+    return np.array([*centre, *half, float(radius)]), course
+
+
+def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Float:
+    """Return finite numbers of a shape."""
+    wanted = "a number" if not shape else f"numbers of shape {shape}".replace("None", "n")
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.full(0, np.nan)
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        raise ValueError(f"{name} of the scene file must be {wanted}, finite, got {value!r:.60}")
+    return array
+
+
+def _rounded(values: Any) -> Any:
+    """Return numbers as lists of rounded floats."""
+    return (np.round(np.asarray(values, dtype=np.float64), DIGITS) + 0.0).tolist()

@@ -1,0 +1,296 @@
+"""Three-dimensional view of the live page in one tab: arm, obstacles, plans, and handles to drag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from viapoint.envs.common.arrays import in_space
+from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.envs.common.types import Float
+from viapoint.training.live.drawing import LOW, TALL, ArmDrawing, Triangles, obstacle_mesh, tube
+
+if TYPE_CHECKING:
+    import viser
+
+    from viapoint.envs.mdp.task import Task
+    from viapoint.training.live.scene_file import LiveScene
+
+Drag = Callable[[str, Float, bool], None]
+"""Function that is called with a handle's name, its new position (D,) [m], and True at the end of a drag."""
+
+FADE_STEPS = 8
+"""Steps in which an old plan fades."""
+PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032
+"""Radii of the plan, of other proposals, and of the executed path, [m]."""
+RADII = {"start": 0.012, "goal": 0.017, "via": 0.012}
+"""Radii of the handles, [m]."""
+OPACITY = 0.45
+"""Opacity of a planar arm, which hides what is below it."""
+LEVEL = 0.0
+"""Height of paths in the plane, [m]."""
+PLANAR_LIMITS, SPATIAL_LIMITS = (-0.75, 0.75), (-0.95, 0.95)
+"""Least and greatest coordinate to which something can be dragged, [m]."""
+
+
+class SceneView:
+    """View of one tab.
+
+    Args:
+        client: Tab.
+        task: Task of the environment.
+        drawing: Parts of the arm.
+        floor: Height of the table, [m].
+        on_drag: Function that is called while a handle is dragged.
+        on_pick: Function that is called with the index of a proposal that is clicked.
+        on_select: Function that is called with the row of an obstacle that is clicked.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        task: Task,
+        drawing: ArmDrawing,
+        floor: float,
+        *,
+        on_drag: Drag,
+        on_pick: Callable[[int], None],
+        on_select: Callable[[int], None],
+    ) -> None:
+        self._client, self._task, self._drawing, self._floor = client, task, drawing, floor
+        self._on_drag, self._on_pick, self._on_select = on_drag, on_pick, on_select
+        self._planar = not task.spatial
+        self._arm: list[Any] = []
+        self._handles: dict[str, Any] = {}
+        self._drops: dict[str, Any] = {}
+        self._obstacles: list[tuple[Any, Float]] = []
+        self._paths: dict[str, Any] = {}
+        self._thin: list[Any] = []
+        self._fading: list[tuple[Any, int]] = []
+        self._grab: dict[str, Float] = {}
+        self._table()
+        self._add_arm()
+        self.look_at_everything()
+
+    def look_at_everything(self) -> None:
+        """Move the camera to its first view: the plane from above, space from the side."""
+        camera = self._client.camera
+        if self._planar:
+            view: Any = ((-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0)
+        else:
+            view = ((1.75, -1.30, 1.25), (0.28, 0.0, 0.30), (0.0, 0.0, 1.0), 34.0)
+        camera.up_direction, camera.position, camera.look_at = view[2], view[0], view[1]
+        camera.fov = float(np.radians(view[3]))
+
+    def pose(self, joints: Float) -> None:
+        """Show the arm in a configuration, shape (J,), [rad]."""
+        for handle, (turn, position) in zip(self._arm, self._drawing.poses(joints), strict=True):
+            handle.wxyz, handle.position = turn, position
+
+    def show_scene(self, scene: LiveScene, selected: int | None = None) -> None:
+        """Show start, goal and obstacles."""
+        for name, point in (("start", scene.start), ("goal", scene.goal)):
+            self._place_handle(name, point)
+        self.show_obstacles(scene.obstacles, selected)
+
+    def show_obstacles(self, rows: Float, selected: int | None = None) -> None:
+        """Show obstacles; those whose shape is the same only move."""
+        d = self._task.arm.dimension
+        while len(self._obstacles) > len(rows):
+            self._obstacles.pop()[0].remove()
+        for i, row in enumerate(rows):
+            colour = _rgb(PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle))
+            if i < len(self._obstacles):
+                handle, shape = self._obstacles[i]
+                if not np.array_equal(shape, row[d:]):
+                    mesh = self._obstacle(row)
+                    handle.vertices, handle.faces = _single(mesh)
+                if tuple(handle.color) != colour:
+                    handle.color = colour
+            else:
+                handle = self._add_mesh(f"/obstacles/{i}", self._obstacle(row), colour)
+                self._make_draggable(handle, f"obstacle {i}")
+                handle.on_click(lambda _, row=i: self._on_select(row))
+                self._obstacles.append((handle, row[d:]))
+            handle.position = in_space(row[:d], 0.0)
+            self._obstacles[i] = handle, row[d:].copy()
+
+    def show_plan(self, path: Float | None, vias: Float, *, clear: bool) -> None:
+        """Show a plan; the one before fades.
+
+        Args:
+            path: Shape (P, D), [m]; None for no plan.
+            vias: Via-points, shape (K, D), [m].
+            clear: False if the plan touches something, which is shown in red.
+        """
+        old = self._paths.pop("plan", None)
+        if old is not None:
+            self._fading.append((old, FADE_STEPS))
+        names = [name for name in self._handles if name.startswith("via")]
+        for name in names[len(vias) :]:
+            self._handles.pop(name).remove()
+            if name in self._drops:
+                self._drops.pop(name).remove()
+        for i, via in enumerate(vias):
+            self._place_handle(f"via {i}", via)
+        if path is not None:
+            self._count = getattr(self, "_count", 0) + 1
+            colour = PALETTE.plan if clear else PALETTE.contact
+            mesh = tube(in_space(path, LEVEL), PLAN)
+            self._paths["plan"] = self._add_mesh(f"/plans/{self._count}", mesh, _rgb(colour), shadow=False)
+
+    def show_proposals(self, paths: Sequence[Float], clear: Sequence[bool] = ()) -> None:
+        """Show proposals as thin lines that can be clicked, those that touch something in red."""
+        for handle in self._thin[len(paths) :]:
+            handle.remove()
+        del self._thin[len(paths) :]
+        for i, (path, free) in enumerate(zip(paths, clear, strict=False)):
+            mesh = tube(in_space(path, LEVEL - 0.002), PROPOSAL)
+            colour = _rgb(_lighter(PALETTE.plan if free else PALETTE.contact))
+            if i == len(self._thin):
+                handle = self._add_mesh(f"/proposals/{i}", mesh, colour, opacity=0.8, shadow=False)
+                handle.on_click(lambda _, index=i: self._on_pick(index))
+                self._thin.append(handle)
+            else:
+                self._thin[i].vertices, self._thin[i].color = _single(mesh)[0], colour
+
+    def show_executed(self, hand: Float | None, *, contact: bool = False) -> None:
+        """Show the executed path, shape (T, D), [m]; None for none."""
+        handle = self._paths.pop("executed", None)
+        if handle is not None and hand is None:
+            handle.remove()
+        if hand is None or len(hand) < 2:
+            return
+        rows = np.unique(np.linspace(0, len(hand) - 1, 40).astype(int))
+        mesh = tube(in_space(hand[rows], LEVEL + 0.004), DONE)
+        colour = _rgb(PALETTE.contact if contact else PALETTE.executed)
+        self._paths["executed"] = self._add_mesh("/executed", mesh, colour, shadow=False)
+
+    def fade(self) -> bool:
+        """Fade old plans by one step, and return True while there are any."""
+        left = []
+        for handle, steps in self._fading[-4:]:
+            if steps > 1:
+                handle.opacity = 0.5 * (steps - 1) / FADE_STEPS
+                left.append((handle, steps - 1))
+            else:
+                handle.remove()
+        for handle, _ in self._fading[:-4]:
+            handle.remove()
+        self._fading = left
+        return bool(left)
+
+    def move_handle(self, name: str, point: Float) -> None:
+        """Move a handle to a position, shape (D,), [m]."""
+        place = in_space(point, LEVEL)
+        self._handles[name].position = place
+        if name in self._drops:
+            foot = np.array([*place[:2], self._floor])
+            self._drops[name].points = np.stack((place, foot))[None].astype(np.float32)
+
+    def _table(self) -> None:
+        scene, planar = self._client.scene, self._planar
+        centre = (-0.03, 0.35) if planar else (0.35, 0.0)
+        width, depth = (1.7, 1.5) if planar else (1.4, 1.6)
+        grey = (208, 208, 211)
+        scene.add_grid(
+            "/table", width=width, height=depth, cell_size=0.1, section_size=0.1, cell_color=grey, plane="xy",
+            section_color=grey, section_thickness=1.5, position=(*centre, self._floor), shadow_opacity=0.0,
+            plane_color=_rgb(PALETTE.table), plane_opacity=1.0,
+        )  # fmt: skip
+
+    def _add_arm(self) -> None:
+        opacity = OPACITY if self._planar else None
+        for i, part in enumerate(self._drawing.parts):
+            name = f"/arm/{i}"
+            if part.colour is None:
+                self._arm.append(self._client.scene.add_mesh_trimesh(name, part.mesh))
+            else:
+                mesh = Triangles(part.mesh.vertices, part.mesh.faces)
+                self._arm.append(self._add_mesh(name, mesh, part.colour, opacity=opacity))
+
+    def _add_mesh(
+        self,
+        name: str,
+        mesh: Triangles,
+        colour: tuple[int, int, int],
+        *,
+        opacity: float | None = None,
+        shadow: bool = True,
+    ) -> Any:
+        vertices, faces = _single(mesh)
+        return self._client.scene.add_mesh_simple(
+            name, vertices, faces, color=colour, opacity=opacity, cast_shadow=shadow, receive_shadow=shadow
+        )
+
+    def _obstacle(self, row: Float) -> Triangles:
+        return obstacle_mesh(row, self._floor, TALL if self._task.whole_arm else LOW)
+
+    def _place_handle(self, name: str, point: Float) -> None:
+        if name not in self._handles:
+            kind = name.split()[0]
+            colour = {"start": PALETTE.start, "goal": PALETTE.goal, "via": PALETTE.via}[kind]
+            radius = max(RADII[kind], 1.1 * self._task.arm.hand_radius if kind == "start" else 0.0)
+            handle = self._client.scene.add_icosphere(
+                f"/handles/{name}", radius=radius, color=_rgb(colour), subdivisions=3, cast_shadow=False
+            )
+            self._make_draggable(handle, name)
+            self._handles[name] = handle
+            if not self._planar:  # a line down to the table shows the place of the handle in space
+                self._drops[name] = self._client.scene.add_line_segments(
+                    f"/drops/{name}", np.zeros((1, 2, 3)), _rgb(_lighter(colour)), thickness=0.003
+                )
+        self.move_handle(name, point)
+
+    def _make_draggable(self, handle: Any, name: str) -> None:
+        """Let a handle be dragged: horizontally, or vertically in space while Shift is held."""
+
+        async def level(event: Any) -> None:
+            self._dragged(event, name, upright=False)
+
+        async def upright(event: Any) -> None:
+            self._dragged(event, name, upright=True)
+
+        handle.on_drag("left")(level)
+        if not self._planar:
+            handle.on_drag("left", modifier="shift")(upright)
+
+    def _dragged(self, event: Any, name: str, *, upright: bool) -> None:
+        """Tell the new position of a handle: where the pointer's ray meets its plane."""
+        eye = np.asarray(event.client.camera.position)
+        place = np.asarray(event.target.position, dtype=np.float64)
+        if event.phase == "start":
+            self._grab[name] = np.asarray(event.start_position) - place
+        grab = self._grab.get(name, np.zeros(3))
+        through, ray = place + grab, np.asarray(event.end_position) - eye
+        normal = np.array([0.0, 0.0, 1.0])
+        if upright:
+            normal = np.array([*(eye - through)[:2], 0.0])
+        slope = float(normal @ ray)
+        if abs(slope) < 1e-6 * float(np.linalg.norm(normal) * np.linalg.norm(ray)):
+            return
+        share = float(normal @ (through - eye)) / slope
+        if share <= 0.0:
+            return
+        point = eye + share * ray - grab
+        if upright:
+            point = np.array([*place[:2], max(point[2], 0.0)])
+        low, high = PLANAR_LIMITS if self._planar else SPATIAL_LIMITS
+        point = np.clip(point, low, high)
+        self._on_drag(name, point[: self._task.arm.dimension], event.phase == "end")
+
+
+def _single(mesh: Triangles) -> tuple[Any, Any]:
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
+
+
+def _rgb(colour: Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * each) for each in colour)
+    return red, green, blue
+
+
+def _lighter(colour: Colour) -> Colour:
+    red, green, blue = (0.45 * each + 0.55 for each in colour)
+    return red, green, blue

@@ -1,0 +1,489 @@
+"""Session of one tab of the live page: its scene, its decisions and its movements, in one thread of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.scene import problems
+from viapoint.training.live.comparison import MethodResult
+from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
+from viapoint.training.live.job_thread import Job, JobThread
+from viapoint.training.live.media import png
+from viapoint.training.live.movements import (
+    Profile,
+    Segment,
+    describe_outcome,
+    execute_replanning,
+    execute_stepwise,
+    execute_whole,
+    executed_profile,
+    plan_profile,
+)
+from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
+from viapoint.training.live.panels import BAD, GOOD, PLAIN, Actions, Panels
+from viapoint.training.live.playback import Playback
+from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
+from viapoint.training.live.scene_view import SceneView
+
+if TYPE_CHECKING:
+    import viser
+
+    from viapoint.training.live.shared import Shared
+
+FADE_EVERY = 0.08
+"""Time between two steps of fading, [s]."""
+
+
+class Session:
+    """Session of one tab.
+
+    All work is done in one thread. Jobs of the same key replace each other while they wait, so that a fast drag skips
+    positions instead of lagging behind.
+
+    Args:
+        client: Tab.
+        shared: Task and agent, which all tabs share.
+        on_end: Function that is called when the session has ended.
+    """
+
+    def __init__(self, client: viser.ClientHandle, shared: Shared, on_end: Callable[[], object]) -> None:
+        self._on_end = on_end
+        self._client, self._shared, self._task = client, shared, shared.task
+        self._checks, self._n_via = 0, shared.task.action.n_via
+        self._by_hand: tuple[Float, float] | None = None
+        self._duration: float | None = None
+        self._selected: int | None = None
+        self._decision: Decision | None = None
+        self._proposals: tuple[Proposal, ...] = ()
+        self._picked = 0
+        self._playing: Iterator[float] | None = None
+        self._next_picture = self._next_fade = 0.0
+        self.decisions = 0
+        """Number of decisions so far."""
+        self.latency = 0.0
+        """Time from the last change to its picture, on the side of the server, [s]."""
+        self._fading = False
+        self._envs: tuple[Any, ...] = ()
+        self._jobs = JobThread(
+            f"viapoint-tab-{client.client_id}", begin=self._open, animate=self._animate, end=self._end,
+            tell=self._tell_error,
+        )  # fmt: skip
+        self._jobs.start()
+
+    @property
+    def scene(self) -> LiveScene:
+        """Present scene."""
+        return self._scene
+
+    @property
+    def proposal(self) -> Proposal | None:
+        """Plan that is shown; None if there is none."""
+        return self._proposals[self._picked] if self._proposals else None
+
+    @property
+    def camera(self) -> viser.CameraHandle:
+        """Camera of the tab."""
+        return self._client.camera
+
+    @property
+    def movement(self) -> tuple[Segment, ...]:
+        """Last movement that was played."""
+        return tuple(self._playback.done)
+
+    @property
+    def alive(self) -> bool:
+        """True until the thread has ended."""
+        return self._jobs.is_alive()
+
+    @property
+    def idle(self) -> bool:
+        """True if nothing waits to be done and nothing moves."""
+        return self._jobs.idle and self._playing is None
+
+    def close(self) -> None:
+        """Stop the thread, which closes the environments."""
+        self._jobs.close()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the end of the thread."""
+        self._jobs.join(timeout)
+
+    def post(self, key: str, job: Job) -> None:
+        """Let the thread do a job; a waiting one of the same key is replaced."""
+        self._jobs.post(key, job)
+
+    def load(self, content: bytes) -> None:
+        """Go to the scene of a JSON file; an impossible one is refused on the page."""
+        self.post("load", lambda: self._load(content))
+
+    # The thread
+
+    def _open(self) -> None:
+        shared = self._shared
+        self._env = shared.make_env()
+        self._step_env = shared.make_step_env()
+        self._envs = tuple(env for env in (self._env, self._step_env) if env is not None)
+        self._kinds = shared.scene_kinds()
+        floor = float(self._env.model.geom("table").pos[2])
+        self._client.gui.set_panel_label("Viapoint")
+        self._panels = Panels(self._client, shared.facts(tuple(self._kinds)), self._actions())
+        with self._client.atomic():
+            self._view = SceneView(
+                self._client, self._task, shared.drawing(self._env.model), floor,
+                on_drag=lambda *event: self.post(f"drag {event[0]}", lambda: self._drag(*event)),
+                on_pick=lambda index: self.post("pick", lambda: self._pick(index)),
+                on_select=lambda row: self.post("select", lambda: self._select(row)),
+            )  # fmt: skip
+        self._playback = Playback(self._client, self._view, lambda: self._scene)
+        self._jobs.guard(lambda: self._draw_scene(next(iter(self._kinds))))
+
+    def _end(self) -> None:
+        for env in self._envs:
+            env.close()
+        self._on_end()
+
+    def _tell_error(self, sentence: str) -> None:
+        self._panels.tell(sentence, BAD)
+
+    def _animate(self) -> bool:
+        """Fade old plans, show the next picture of a movement when it is due, and return True if there is more."""
+        now = time.monotonic()
+        if now >= self._next_fade:
+            self._next_fade = now + FADE_EVERY
+            self._fading = self._view.fade()
+        if self._playing is not None and now >= self._next_picture:
+            self._jobs.guard(self._advance)
+        return self._playing is not None or self._fading
+
+    def _advance(self) -> None:
+        assert self._playing is not None
+        try:
+            wait = next(self._playing)
+        except BaseException as end:
+            self._playing = None
+            self._panels.show_running(running=False)
+            if not isinstance(end, StopIteration):
+                raise
+            self._finish()
+            return
+        self._next_picture = time.monotonic() + wait
+
+    # Scenes
+
+    def _draw_scene(self, kind: str) -> None:
+        self._take(self._kinds[kind]())
+
+    def _take(self, scene: LiveScene) -> None:
+        """Go to another scene."""
+        most = self._task.observation.n_rows
+        if len(scene.obstacles) > most:
+            raise ValueError(
+                f"{self._shared.env_id} has at most {most} obstacles, got {len(scene.obstacles)}"
+            )
+        self._by_hand = self._duration = self._selected = None
+        self._set_scene(scene, changed=True)
+        self._panels.show_selected("", None)
+
+    def _set_scene(self, scene: LiveScene, *, changed: bool) -> None:
+        """Show a scene and decide in it."""
+        begin = time.perf_counter()
+        self._stop()
+        self._view.show_executed(None)
+        self._scene = scene
+        with self._client.atomic():
+            self._view.show_scene(scene, self._selected)
+            self._view.pose(np.asarray(self._task.arm.inverse_kinematics(scene.start)))
+        if changed:
+            self._panels.show_comparison(())
+        self._decide(begin)
+
+    def _drag(self, name: str, point: Float, end: bool) -> None:
+        """Move what is dragged."""
+        kind, _, number = name.partition(" ")
+        if kind == "goal" and self._playing is not None and self._task.replanning:
+            self._move_goal(point)
+        elif kind == "via":
+            self._move_via(int(number), point)
+        elif kind == "obstacle":
+            if int(number) >= len(self._scene.obstacles):
+                return
+            row = self._scene.obstacles[int(number)].copy()
+            row[: len(point)] = point
+            if self._selected != int(number):
+                self._select(int(number))
+            self._set_scene(self._scene.with_row(int(number), row), changed=True)
+        else:
+            self._by_hand = None
+            jumps = self._scene.jumps[:0] if kind == "goal" else self._scene.jumps
+            self._set_scene(self._scene._replace(**{kind: point}, jumps=jumps), changed=True)
+
+    def _move_goal(self, point: Float) -> None:
+        """Move the goal while the arm moves; an impossible one is refused."""
+        scene = self._scene._replace(goal=point, jumps=self._scene.jumps[:0])
+        margin = float(self._task.arm.reach_margin(point))
+        if margin < 0.0:
+            self._view.move_handle("goal", self._scene.goal)
+            raise ValueError(f"the goal would be {-margin:.3f} m out of the arm's reach")
+        self._scene = scene
+        self._view.move_handle("goal", point)
+
+    def _move_via(self, number: int, point: Float) -> None:
+        """Plan through a via-point that was dragged."""
+        if self.proposal is None:
+            return
+        vias = np.array(self.proposal.plan.waypoints[1:-1])
+        if number < len(vias):
+            vias[number] = point
+            self._by_hand = vias, self.proposal.duration
+            self._set_scene(self._scene, changed=False)
+
+    def _select(self, row: int | None) -> None:
+        """Select an obstacle, or none."""
+        self._selected = row
+        self._view.show_obstacles(self._scene.obstacles, row)
+        if row is None or row >= len(self._scene.obstacles):
+            self._panels.show_selected("", None)
+        else:
+            self._panels.show_selected(f"obstacle {row}", sizes_of(self._scene.obstacles[row]))
+
+    def _resize(self, name: str, value: float) -> None:
+        row = self._selected
+        if row is None or row >= len(self._scene.obstacles):
+            return
+        numbers = resized(self._scene.obstacles[row], name, value)
+        self._set_scene(self._scene.with_row(row, numbers), changed=True)
+
+    def _add(self, shape: str) -> None:
+        scene = self._scene.with_obstacle(new_obstacle(self._scene, shape))
+        most = self._task.observation.n_rows
+        if len(scene.obstacles) > most:
+            raise ValueError(f"{self._shared.env_id} has at most {most} obstacles")
+        self._selected = len(scene.obstacles) - 1
+        self._set_scene(scene, changed=True)
+        self._panels.show_selected(f"obstacle {self._selected}", sizes_of(scene.obstacles[-1]))
+
+    def _remove(self) -> None:
+        row, self._selected = self._selected, None
+        if row is not None and row < len(self._scene.obstacles):
+            self._set_scene(self._scene.without(row), changed=True)
+        self._panels.show_selected("", None)
+
+    # Decisions
+
+    def _observe(self) -> Any:
+        """Return the first observation in the scene, after a check of the scene."""
+        scene = self._scene
+        for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
+            if wrong.any():
+                raise ValueError(reason(0))
+        observation, _ = self._env.reset(options=scene.options(changing=self._task.replanning))
+        return observation
+
+    def _decide(self, begin: float) -> None:
+        """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
+        self._proposals, self._picked = (), 0
+        try:
+            observation = self._observe()
+        except ValueError:
+            self._view.show_plan(None, np.zeros((0, self._task.arm.dimension)), clear=False)
+            self._view.show_proposals([])
+            self._panels.show_proposals((), 0, "", 0.0)
+            self._panels.show_plots(None, None)
+            raise
+        self._decision = decision = self._shared.decisions.choose(
+            observation, n_via=self._n_via, checks=self._checks
+        )
+        chosen = decision.chosen
+        if self._by_hand is not None:
+            chosen = self._shared.decisions.evaluate(observation, plan_by_hand(self._scene, *self._by_hand))
+        elif self._duration is not None:
+            vias = np.asarray(chosen.plan.waypoints[1:-1])
+            chosen = self._shared.decisions.evaluate(
+                observation, plan_by_hand(self._scene, vias, self._duration)
+            )
+        self._proposals = (chosen,)
+        self._show_plan()
+        self._client.flush()
+        self.decisions += 1
+        self.latency = time.perf_counter() - begin
+        self.post("later proposals", lambda: self._add_proposals(observation, decision))
+
+    def _show_plan(self) -> None:
+        """Show the picked proposal, and say what it does."""
+        plan = self.proposal
+        assert plan is not None
+        with self._client.atomic():
+            self._view.show_plan(plan.path(), np.asarray(plan.plan.waypoints[1:-1]), clear=plan.clear)
+            if self._proposals[1:] == ():
+                self._view.show_proposals([])
+        self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
+        self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD)
+
+    def _add_proposals(self, observation: Any, decision: Decision) -> None:
+        """Show the other proposals, and the profile of the plan."""
+        if decision is not self._decision or self._playing is not None:
+            return
+        others = self._shared.decisions.proposals(observation, decision)
+        own = self._proposals[0]
+        by_hand = own.rank == 0
+        self._proposals = (own, *others) if by_hand else others
+        self._show_details()
+
+    def _show_details(self, executed: Profile | None = None) -> None:
+        plan, decision = self.proposal, self._decision
+        if plan is None or decision is None:
+            return
+        others = self._proposals
+        with self._client.atomic():
+            self._view.show_proposals([each.path() for each in others], [each.clear for each in others])
+        self._panels.show_proposals(self._proposals, self._picked, decision.maker, decision.seconds)
+        self._panels.show_plots(plan_profile(self._task, self._scene, plan.plan), executed)
+
+    def _pick(self, index: int) -> None:
+        """Show another proposal as the plan."""
+        if index < len(self._proposals):
+            self._stop()
+            self._view.show_executed(None)
+            self._picked = index
+            proposals = self._proposals
+            self._show_plan()
+            self._proposals = proposals
+            self._show_details()
+
+    def _redecide(self, **changes: Any) -> None:
+        """Decide anew after a change of the settings of decisions."""
+        for name, value in changes.items():
+            setattr(self, name, value)
+        self._set_scene(self._scene, changed=False)
+
+    # Movements
+
+    def _stop(self) -> None:
+        if self._playing is not None:
+            self._playing = None
+            self._panels.show_running(running=False)
+
+    def _execute(self) -> None:
+        """Begin to play the simulated movement, or stop it."""
+        if self._playing is not None:
+            self._stop()
+            return
+        if self.proposal is None:
+            raise ValueError("there is no plan to execute: move what stands in the way first")
+        self._panels.show_running(running=True)
+        self._playing = self._playback.play(self._segments(), self._panels.speed)
+        self._next_picture = 0.0
+
+    def _segments(self) -> Iterator[Segment]:
+        plan = self.proposal
+        assert plan is not None
+        if self._task.replanning:
+            decisions = self._shared.decisions
+            return execute_replanning(
+                self._env, decisions, self._scene, plan.plan, lambda: self._scene.goal, self._checks
+            )
+        if self._step_env is not None and plan.rank == 1:
+            return execute_stepwise(self._step_env, self._shared.agent, self._scene)
+        return execute_whole(self._env, self._scene, plan.plan)
+
+    def _finish(self) -> None:
+        """Say what came of the movement, and show its profile."""
+        segments = self._playback.done
+        info = segments[-1].info
+        text = describe_outcome({name: np.asarray(value).reshape(-1)[0] for name, value in info.items()})
+        self._panels.tell(text, GOOD if text.startswith("Success") else BAD)
+        if not any(each.restarted for each in segments):
+            self._show_details(executed_profile(segments))
+
+    def _compare(self) -> None:
+        """Compare methods, one job for each, so that changes of the scene come between."""
+        scene, results = self._scene, list[MethodResult]()
+        self._observe()
+        rows = self._shared.comparison(scene, self._checks)
+
+        def step() -> None:
+            if scene is not self._scene:
+                return
+            following = next(rows, None)
+            self._panels.show_comparison(results, running=following[0] if following else "")
+            if following is not None:
+                self._client.flush()
+                with self._shared.comparing:
+                    results.append(following[1]())
+                self.post("later comparison", step)
+
+        step()
+
+    # Files
+
+    def _load(self, content: bytes) -> None:
+        scene = from_json(content, self._task.arm.dimension)
+        for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
+            if wrong.any():
+                raise ValueError(f"the scene file is impossible: {reason(0)}")
+        self._take(scene)
+
+    def _save(self) -> None:
+        text = to_json(self._scene, self._shared.env_id)
+        self._download("scene.json", text.encode())
+
+    def _code(self) -> None:
+        shared = self._shared
+        changing = self._task.replanning
+        self._panels.show_code(to_python(self._scene, shared.env_id, shared.env_kwargs, changing=changing))
+
+    def _picture(self) -> None:
+        self._download("viapoint.png", png(self._playback.photograph("png")))
+
+    def _film(self) -> None:
+        """Render a film of the movement, picture by picture, in the browser."""
+        if self.proposal is None:
+            raise ValueError("there is no plan to film: move what stands in the way first")
+        self._stop()
+        self._panels.tell("Rendering the film.", PLAIN)
+        self._client.flush()
+        self._download("viapoint.mp4", self._playback.film(self._segments(), self._panels.speed))
+        self._finish()
+
+    def _download(self, name: str, content: bytes) -> None:
+        self._client.send_file_download(name, content, save_immediately=True)
+
+    def _actions(self) -> Actions:
+        """Return the functions that the panels call; each posts a job."""
+
+        def later(key: str, function: Callable[..., None]) -> Any:
+            return lambda *values: self.post(key, lambda: function(*values))
+
+        return Actions(
+            scene=later("scene", self._draw_scene),
+            duration=later("duration", self._set_duration),
+            vias=later("vias", lambda n: self._redecide(_n_via=n, _by_hand=None)),
+            checks=later("checks", lambda n: self._redecide(_checks=n)),
+            pick=later("pick", self._pick),
+            add=later("add", self._add),
+            remove=later("remove", self._remove),
+            resize=later("resize", self._resize),
+            decide=later("decide", self._decide_anew),
+            execute=later("execute", self._execute),
+            compare=later("compare", self._compare),
+            save=later("save", self._save),
+            load=self.load,
+            code=later("code", self._code),
+            picture=later("picture", self._picture),
+            film=later("film", self._film),
+            view=later("view", lambda: self._view.look_at_everything()),
+        )
+
+    def _set_duration(self, duration: float) -> None:
+        if self._by_hand is not None:
+            self._redecide(_by_hand=(self._by_hand[0], duration))
+        else:
+            self._redecide(_duration=duration)
+
+    def _decide_anew(self) -> None:
+        self._redecide(_by_hand=None, _duration=None, _n_via=self._task.action.n_via)
