@@ -35,6 +35,8 @@ class EnvConfig:
     """True if the links must clear the obstacles, too; False for the hand alone."""
     n_obstacles: int | tuple[int, int] = (1, 5)
     """Number of obstacles, or the fewest and the most."""
+    uniform_share: float = 0.0
+    """Share of episodes whose ends and obstacles are uniform in the workspace."""
     duration_range: tuple[float, float] = (0.6, 1.2)
     """Shortest and longest movement, [s]."""
     reward_weights: RewardWeights | Mapping[str, float] | None = None
@@ -84,7 +86,9 @@ class EnvConfig:
             whole_arm=bool(self.whole_arm),
             action=self._action_layout(arm.dimension),
             weights=self.weights_kind.of(self.reward_weights),
-            scenes=distribution_of(arm)(n_obstacles=fewest_and_most(self.n_obstacles)),
+            scenes=distribution_of(arm)(
+                n_obstacles=fewest_and_most(self.n_obstacles), uniform_share=self.uniform_share
+            ),
             replanning=self.replanning,
             stepwise=self.stepwise,
         )

@@ -57,6 +57,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
         n_via: Number of via-points of an action.
         n_obstacles: Number of obstacles, or the fewest and the most.
+        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         moving_obstacles: True if the obstacles move.
         n_jumps: Number of jumps of the target, or the fewest and the most.
         decide_at: Events that end a decision: some of `horizon`, `target`, `course`, `clearance`.

@@ -107,6 +107,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
         n_via: Number of via-points of an action.
         n_obstacles: Number of obstacles, or the fewest and the most.
+        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.RewardWeights`.

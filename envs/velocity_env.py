@@ -93,6 +93,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         arm: Arm that moves, a record or its name.
         whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
         n_obstacles: Number of obstacles, or the fewest and the most.
+        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         control_step: Time for which an action holds, [s].
         duration_range: Shortest and longest movement of the twin, [s]; the longest and the settling time are the limit.
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.StepRewardWeights`.

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
     from viapoint.training.search.geometry_search import GeometrySearch
+    from viapoint.training.search.observe_candidates import ObserveCandidates, VectorObserveCandidates
     from viapoint.training.study.config import Study
     from viapoint.training.study.run import run_study
 else:
@@ -27,11 +28,13 @@ else:
         "EvaluationResult": "viapoint.training.evaluation.evaluator",
         "GeometrySearch": "viapoint.training.search.geometry_search",
         "LostEpisodesCallback": "viapoint.training.rollouts.ray_vec_env",
+        "ObserveCandidates": "viapoint.training.search.observe_candidates",
         "RayVecEnv": "viapoint.training.rollouts.ray_vec_env",
         "Run": "viapoint.training.runs.run_dir",
         "SceneExtractor": "viapoint.training.algorithms.extractors",
         "Study": "viapoint.training.study.config",
         "TrainConfig": "viapoint.training.config.configs",
+        "VectorObserveCandidates": "viapoint.training.search.observe_candidates",
         "ViaQ": "viapoint.training.algorithms.viaq",
         "ViaVecEnv": "viapoint.training.rollouts.vec_env",
         "evaluate": "viapoint.training.evaluation.evaluator",
@@ -56,11 +59,13 @@ __all__ = [
     "EvaluationResult",
     "GeometrySearch",
     "LostEpisodesCallback",
+    "ObserveCandidates",
     "RayVecEnv",
     "Run",
     "SceneExtractor",
     "Study",
     "TrainConfig",
+    "VectorObserveCandidates",
     "ViaQ",
     "ViaVecEnv",
     "evaluate",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import check_increasing_pair
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 Timing = Literal["optimal", "learned"]
@@ -286,18 +286,6 @@ def _arrays(*values: Array) -> tuple[Array, ...]:
         return tuple(v if hasattr(v, "shape") else np.asarray(v, dtype=np.float64) for v in values)
     except (TypeError, ValueError):
         raise ValueError(f"actions, places and durations must be arrays of numbers, got {values!r}") from None
-
-
-def check_increasing_pair(name: str, pair: Any) -> None:
-    """Check that a pair is two positive finite numbers in increasing order."""
-    try:
-        low, high = pair
-    except (TypeError, ValueError):
-        low = high = None
-    if not all(isinstance(value, Real) and not isinstance(value, bool) for value in (low, high)):
-        raise ValueError(f"{name} must be two numbers, got {pair!r}")
-    if not (0.0 < low < high < float("inf")):
-        raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
 
 
 MAX_START_OFFSET = 1e-3

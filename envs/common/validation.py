@@ -23,6 +23,18 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return int(value)
 
 
+def check_increasing_pair(name: str, pair: Any) -> None:
+    """Check that a pair is two positive finite numbers in increasing order."""
+    try:
+        low, high = pair
+    except (TypeError, ValueError):
+        low = high = None
+    if not all(isinstance(value, Real) and not isinstance(value, bool) for value in (low, high)):
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
+    if not (0.0 < low < high < float("inf")):
+        raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
+
+
 def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of arguments, independent of later changes of the caller's lists and mappings."""
     return {

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import ClassVar
 
-from viapoint.envs.actions.via_points import check_increasing_pair
+from viapoint.envs.common.validation import check_increasing_pair
 from viapoint.envs.scenes.families import MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
 
@@ -23,6 +24,9 @@ class SceneDistribution:
 
     n_obstacles: tuple[int, int] = (1, 5)
     """Fewest and most obstacles."""
+    uniform_share: float = 0.0
+    """Share of scenes with ends and obstacles that are uniform in the workspace, see
+    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     distance: tuple[float, float] = (0.25, 0.45)
     """Distance from start to goal, [m]."""
     post_radius: tuple[float, float] = (0.012, 0.045)
@@ -51,6 +55,7 @@ class SceneDistribution:
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
 
@@ -63,6 +68,9 @@ class SpaceDistribution(SpatialSizes):
 
     n_obstacles: tuple[int, int] = (1, 6)
     """Fewest and most obstacles; a scene has at least as many as its family needs."""
+    uniform_share: float = 0.0
+    """Share of scenes with ends and obstacles that are uniform in the workspace, see
+    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     families: tuple[str, ...] = TRAINED
     """Names of families, drawn with equal chances; a repeated name is drawn more often. Families that need more than
     the greatest number of obstacles are left out."""
@@ -82,6 +90,7 @@ class SpaceDistribution(SpatialSizes):
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:
             raise ValueError(
@@ -111,3 +120,14 @@ def check_count(pair: Sequence[int], name: str, limit: int) -> None:
     fewest, most = pair
     if not 0 <= fewest <= most <= limit:
         raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}, got {pair}")
+
+
+def check_share(share: float, name: str) -> None:
+    """Check a share.
+
+    Raises:
+        ValueError: The value is no number from 0 to 1.
+    """
+    number = isinstance(share, Real) and not isinstance(share, bool)
+    if not number or not 0.0 <= share <= 1.0:
+        raise ValueError(f"{name} must be a number from 0 to 1, got {share!r}")

@@ -22,6 +22,7 @@ from viapoint.envs.scenes.planar_families import FAMILY_ROWS
 from viapoint.envs.scenes.planar_obstacles import FamilyObstacles, HandObstacles, WholeArmObstacles
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.scenes.spatial_obstacles import SpatialObstacles
+from viapoint.envs.scenes.uniform import UniformScenes
 
 Distribution = SceneDistribution | SpaceDistribution
 
@@ -29,6 +30,8 @@ FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
 TOGETHER = 640
 """Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
+UNIFORM_GROUPS = (4, 8, *[16] * 400)
+"""Attempts at a uniform scene that are drawn one after the other."""
 SHARED_GROUPS = 8
 """Groups of attempts at a scene that share the number :attr:`ObstacleSampler.fixed`."""
 
@@ -151,6 +154,57 @@ class SceneSampler:
         return rows, Scenes(feasible.start, feasible.goal, obstacles)
 
 
+class UniformSampler(SceneSampler):
+    """Rejection sampler of scenes that are uniform in the workspace, see :class:`UniformScenes`.
+
+    Args:
+        collision_model: Arm that moves, and the bodies that must clear the obstacles.
+        distribution: Distribution of scenes, of the same dimension.
+    """
+
+    def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
+        order = DRAW_ORDER[distribution.dimension]._replace(groups=UNIFORM_GROUPS)
+        super().__init__(collision_model, distribution, order=order)
+        self._uniform = UniformScenes(collision_model, distribution)
+
+    @property
+    def _size(self) -> int:
+        return self._uniform.size
+
+    def _attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
+        return self._uniform(uniforms, ends)
+
+
+class MixedSampler(SceneSampler):
+    """Sampler of scenes of which a share is uniform in the workspace.
+
+    The first random number of each scene says from which of the two samplers it comes.
+
+    Args:
+        collision_model: Arm that moves, and the bodies that must clear the obstacles.
+        distribution: Distribution of scenes, of the same dimension, with the share.
+    """
+
+    def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
+        super().__init__(collision_model, distribution)
+        self._uniform = UniformSampler(collision_model, distribution)
+
+    def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
+        """Sample one scene from each generator, see :meth:`SceneSampler.__call__`."""
+        number, d = len(generators), self.arm.dimension
+        uniform = np.array([each.random() for each in generators]) < self.distribution.uniform_share
+        most = self.distribution.n_obstacles[1]
+        scenes = Scenes(np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, most, 2 * d + 1)))
+        for rows, sample in (
+            (np.flatnonzero(uniform), self._uniform),
+            (np.flatnonzero(~uniform), super().__call__),
+        ):
+            if rows.size:
+                some = None if ends is None else (ends[0][rows], ends[1][rows])
+                scenes.put(rows, sample([generators[int(row)] for row in rows], some))
+        return scenes
+
+
 class AttemptNumbers:
     """Uniform numbers for attempts at N scenes.
 
@@ -218,6 +272,12 @@ class AttemptNumbers:
             generator.random(out=drawn[begin : begin + attempts])
             begin += attempts
         return states
+
+
+def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -> SceneSampler:
+    """Return the sampler of a distribution."""
+    kind = MixedSampler if distribution.uniform_share else SceneSampler
+    return kind(collision_model, distribution)
 
 
 def _obstacle_sampler(collision_model: CollisionModel, distribution: Distribution) -> ObstacleSampler:

@@ -79,6 +79,28 @@ def test_nothing_is_shared_between_two_configurations():
         (TrainConfig, {"n_envs": 10**9}, "n_envs must be a whole number, from 1 to 65536"),
         (TrainConfig, {"seed": 2**32}, "seed must be a whole number, from 0 to 4294967295"),
         (TrainConfig, {"checkpoint_every": 0}, "checkpoint_every"),
+        *[
+            (
+                TrainConfig,
+                {"stop_when_stalled": share},
+                "stop_when_stalled must be a number over 0 and below 1",
+            )
+            for share in (0.0, 1.0, -0.3, True, "0.3", float("nan"))
+        ],
+        (TrainConfig, {"stop_when_stalled": 0.3}, r"n_timesteps must be over min_timesteps \(40000\)"),
+        (TrainConfig, {"observe_candidates": 16}, "observe_candidates must be 0 for viaq"),
+        (
+            TrainConfig,
+            {"observe_candidates": 16, "algo": "sac", "env": "viapoint/PlanarObstaclesStep-v0"},
+            "observe_candidates must be 0 .* on viapoint/PlanarObstaclesStep-v0",
+        ),
+        (TrainConfig, {"observe_candidates": -1}, "observe_candidates must be a whole number, 0 or more"),
+        (TrainConfig, {"min_timesteps": 5}, "min_timesteps needs stop_when_stalled"),
+        (
+            TrainConfig,
+            {"stop_when_stalled": 0.3, "n_timesteps": 10**5, "eval_every": 0},
+            "stop_when_stalled needs validations",
+        ),
         (TrainConfig, {"env": "viapoint/PlanarObstaclesStep-v0"}, "viaq decides on whole movements"),
         (
             TrainConfig,

@@ -9,15 +9,25 @@ import numpy as np
 import pytest
 
 from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.sampler import UniformSampler
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planners.baselines import METHODS, make_method
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget, screen
 from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import scene_set
-from viapoint.training.scene_sets.generate import SETS, SIZES, WITHOUT_OBSTACLES, hard_families, lots, remake
-from viapoint.training.scene_sets.scene_search import Kinds, Source, redrawn, search
+from viapoint.training.scene_sets.generate import (
+    SEEDS,
+    SETS,
+    SIZES,
+    WITHOUT_OBSTACLES,
+    hard_families,
+    lots,
+    remake,
+)
+from viapoint.training.scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, load, shipped_path
+from viapoint.training.search.geometry_search import GeometrySearch
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
 ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
@@ -52,10 +62,11 @@ def results():
         each.close()
 
 
-def test_shipped_sets_are_whole_and_distinct_and_every_share_is_known(shipped):
+def test_shipped_sets_are_whole_and_distinct_and_shares_are_known_unless_uniform(shipped):
     size = WITHOUT_OBSTACLES if "Reach" in shipped.env_id else SIZES[shipped.name]
     assert len(shipped.share) == len(shipped.family) == size
-    assert ((shipped.share > 0.0) & (shipped.share <= 1.0)).all()
+    known = (shipped.share > 0.0) & (shipped.share <= 1.0)
+    assert np.isnan(shipped.share).all() if shipped.name == "uniform" else known.all()
     assert len(np.unique(shipped.scenes.start, axis=0)) == size
 
 
@@ -69,7 +80,7 @@ def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_fa
         assert (shipped.share < 0.05).all()
     else:
         assert (shipped.family == "").all()
-        if "Reach" not in shipped.env_id:
+        if "Reach" not in shipped.env_id and shipped.name != "uniform":
             assert (np.bincount(shipped.band, minlength=len(BANDS)) == len(shipped.share) / len(BANDS)).all()
 
 
@@ -89,8 +100,9 @@ def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, results):
     assert straight.all() if "Reach" in shipped.env_id else not straight.any()
 
 
-def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads():
-    some = load("hard", ENV_ID).take(slice(0, 5))
+@pytest.mark.parametrize("name", ["hard", "uniform"])
+def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads(name):
+    some = load(name, ENV_ID).take(slice(0, 5))
     assert remake(some, threads=1).sha256 == some.sha256
 
 
@@ -105,6 +117,21 @@ def test_scenes_that_are_searched_for_are_of_the_kind_asked_for_and_solved_and_c
     assert simulation(found.scenes, found.solution).success.all()
     for one, other in zip(redrawn(gates().source, found.number), found.scenes, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_uniform_scenes_are_those_of_the_sampler_that_have_a_solution(simulation):
+    task = simulation.task
+    (lot,) = lots(task, "uniform", 3)
+    found = first_solved(simulation, dataclasses.replace(lot.source, block=4), 3, "uniform")
+    assert simulation(found.scenes, found.solution).success.all()
+    drawn = UniformSampler(task.collision_model, task.scenes)([np.random.default_rng(SEEDS["uniform"])] * 4)
+    for one, other in zip(drawn.take(found.number), found.scenes, strict=True):
+        np.testing.assert_array_equal(one, other)
+    left = np.setdiff1d(np.arange(found.number[-1]), found.number)
+    search = GeometrySearch(task, 512)
+    for row in left:  # no other method solves them either
+        action = search.decide(simulation.observe(drawn.take([row])))
+        assert not simulation(drawn.take([row]), action).success.any()
 
 
 def test_what_is_too_rare_is_said_to_be_missing(simulation):
@@ -209,7 +236,7 @@ def test_a_small_archive_that_claims_a_huge_array_is_refused(frozen, tmp_path, m
 
 
 def test_what_is_no_set_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="validation, test, hard"):
+    with pytest.raises(ValueError, match="validation, test, hard, uniform"):
         load("tests", ENV_ID)
     with pytest.raises(ValueError, match="for viapoint/PlanarObstacles-v0, not for viapoint/PlanarReach-v0"):
         load(shipped_path("test", ENV_ID), "viapoint/PlanarReach-v0")

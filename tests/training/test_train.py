@@ -7,6 +7,7 @@ import signal
 
 import numpy as np
 import pytest
+from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
@@ -157,6 +158,76 @@ def test_a_finished_run_can_be_extended(tmp_path):
     assert Run(run.folder).config.n_timesteps == 128
     again = train(TrainConfig(out=run.folder, resume=True, progress=False))
     assert curve(again) == curve(longer)
+
+
+STALLING = {"stop_when_stalled": 0.4, "min_timesteps": 128, "n_timesteps": 640}
+"""Training that stalls unless success rises."""
+
+
+def with_success(monkeypatch, rates):
+    """Let validations at 0, 64, 128, ... decisions find these rates of success."""
+    evaluate = callback.evaluate_methods
+
+    def measured(methods, *args, **kwargs):
+        result = evaluate(methods, *args, **kwargs)
+        rate = rates[methods[0]._model.num_timesteps // 64]
+        (only,) = result.results
+        number = len(only.success)
+        only.outcomes["is_success"][:] = np.arange(number) < round(rate * number)
+        return result
+
+    monkeypatch.setattr(callback, "evaluate_methods", measured)
+
+
+@pytest.mark.parametrize("algo", ["viaq", "ppo"])
+def test_a_training_that_stalls_ends_there_and_says_so(algo, tmp_path, monkeypatch, shipped):
+    with_success(monkeypatch, [0.0, 0.1, 0.2, 0.5, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0])
+    heard = Heard()
+    run = train(config(tmp_path / "run", algo, **STALLING), heard)
+    # Success rises at 192 decisions; at 320, 128 of them are 40 %.
+    assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192, 256, 320]
+    assert (run.stopped, run.decisions) == ("stalled", 320)
+    assert json.loads((run.folder / "end.json").read_text()) == {
+        "stopped": "stalled", "decisions": 320, "best_decisions": 192
+    }  # fmt: skip
+    assert load_model(run.final).num_timesteps == 320
+    assert heard.ended == 1
+    again = train(TrainConfig(out=run.folder, resume=True, n_timesteps=1280, progress=False))
+    same_result(run, again)
+    assert (again.stopped, again.decisions) == ("stalled", 320)
+
+
+class Heard(BaseCallback):
+    """Callback that counts its ends."""
+
+    ended = 0
+
+    def _on_step(self):
+        return True
+
+    def _on_training_end(self):
+        self.ended += 1
+
+
+def test_a_stalling_run_is_the_same_with_and_without_interruption(tmp_path, monkeypatch, shipped):
+    with_success(monkeypatch, [0.0, 0.1, 0.2, 0.5, 0.4, 0.5])
+    whole = train(config(tmp_path / "whole", **STALLING))
+    with monkeypatch.context() as patch:
+        kill_after(patch, 18)  # between the checkpoints at 256 and 320 decisions
+        with pytest.raises(SystemError, match="killed"):
+            train(config(tmp_path / "killed", **STALLING))
+    killed = Run(tmp_path / "killed")
+    assert (killed.stopped, killed.decisions) == (None, 256)
+    same_result(whole, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
+    assert (killed.stopped, killed.decisions) == ("stalled", 320)
+
+
+def test_a_training_that_goes_on_rising_spends_its_budget(tmp_path, monkeypatch, shipped):
+    with_success(monkeypatch, [0.1 * i for i in range(11)])
+    run = train(config(tmp_path / "run", **STALLING))
+    assert (run.stopped, run.decisions) == ("budget", 640)
+    other = train(config(tmp_path / "other"))  # never asked to stop
+    assert (other.stopped, other.decisions) == ("budget", STEPS)
 
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):

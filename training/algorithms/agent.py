@@ -19,8 +19,9 @@ from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, own_en
 from viapoint.training.algorithms.sb3_archive import algorithm_of, environment_of, open_archive
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
 from viapoint.training.search.geometry_search import scene_from_rest
+from viapoint.training.search.observe_candidates import with_candidates
 
 
 class Agent(BaseAlgorithm):
@@ -52,6 +53,17 @@ class Agent(BaseAlgorithm):
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of that environment, without those that belong to its id."""
         return env_arguments(self.get_env())[1]
+
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        """Return actions and no state; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.predict`.
+
+        An agent that observes candidates computes their margins where the observation lacks them.
+        """
+        number = 0 if self.env is None else observed_candidates(self.env)
+        if number:
+            (task,) = self.env.get_attr("task", [0])  # type: ignore[union-attr]
+            observation = with_candidates(observation, task, number)
+        return super().predict(observation, *args, **kwargs)
 
     def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.

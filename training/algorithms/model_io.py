@@ -40,7 +40,7 @@ from viapoint.training.io.model_limits import (
     check_env_arguments,
     parameter_budget,
 )
-from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
+from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments, observed_candidates
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
@@ -194,14 +194,16 @@ def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
     assert env is not None
     hyperparameters = dict(record["hyperparameters"])
     hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
-    return build(
-        record["algorithm"],
-        record["policy"],
-        env,
-        hyperparameters,
-        discount_unit=record["discount_unit"],
-        seed=seed,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # as in load_model
+        return build(
+            record["algorithm"],
+            record["policy"],
+            env,
+            hyperparameters,
+            discount_unit=record["discount_unit"],
+            seed=seed,
+        )
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
@@ -211,6 +213,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
+    number = observed_candidates(model.get_env())  # type: ignore[arg-type]
     policies = {kind: each for each, kind in _policies(name).items()}
     stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
     return {
@@ -218,7 +221,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         "viapoint": importlib.metadata.version("viapoint"),
         "algorithm": name,
         "policy": policies[model.policy_class],
-        "env": {"id": env_id, "kwargs": _encode(env_kwargs)},
+        "env": {"id": env_id, "kwargs": _encode(env_kwargs), **({"candidates": number} if number else {})},
         "num_timesteps": model.num_timesteps,
         "discount_unit": unit_of(model),
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
@@ -265,7 +268,7 @@ def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
     if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
         raise ValueError(f"environment {record['id']!r} is not known")
     check_env_arguments(record["kwargs"])
-    return ViaVecEnv(record["id"], 1, **record["kwargs"])
+    return ViaVecEnv(record["id"], 1, observe_candidates=record.get("candidates", 0), **record["kwargs"])
 
 
 def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:

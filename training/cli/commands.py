@@ -38,7 +38,9 @@ def train(config: TrainConfig) -> None:
     run = training.train(config)
     last = run.curve[-1] if run.curve else None
     reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
-    print(f"trained for {run.config.total_timesteps} decisions{reached}: {run.folder}")
+    stalled = run.stopped == "stalled"
+    number = run.decisions if stalled else run.config.total_timesteps
+    print(f"trained for {number} decisions{' until it stalled' * stalled}{reached}: {run.folder}")
 
 
 def evaluate(config: EvaluateConfig) -> None:

@@ -26,6 +26,7 @@ BASELINES = (
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
+    "observe_candidates": "--observe-candidates says how many candidates are observed",
     "env_id": "--env names the environment",
     "id": "--env names the environment",
     "render_mode": "viapoint play films",
@@ -87,6 +88,38 @@ def check_whole(name: str, value: Any, least: int) -> None:
     if not known or value < least or (most is not None and value > most):
         allowed = f"{least} or more" if most is None else f"from {least} to {most}"
         raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
+
+
+def check_observed(number: int, algo: str, env: str) -> None:
+    """Check that an algorithm can observe candidates in an environment."""
+    if number and (algo == "viaq" or env in STEP_TASKS):
+        raise ValueError(
+            "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
+            f"control step, got {number} for {algo} on {env}"
+        )
+
+
+def check_stalling(share: Any, asked: int | None, interval: int, limits: tuple[int, int]) -> None:
+    """Check the settings of a training that ends when it stalls.
+
+    Args:
+        share: Share of the decisions without a rise of success; None for a training that does not end early.
+        asked: `min_timesteps` as given.
+        interval: Decisions between two validations, 0 for none.
+        limits: Fewest and most decisions.
+    """
+    if share is None:
+        if asked is not None:
+            raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
+        return
+    if not _is_number(share) or not 0.0 < share < 1.0:
+        raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
+    if not interval:
+        raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
+    if limits[0] >= limits[1]:
+        raise ValueError(
+            f"n_timesteps must be over min_timesteps ({limits[0]}) with stop_when_stalled, got {limits[1]}"
+        )
 
 
 def check_baselines(names: tuple[str, ...]) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import tyro
 
 from viapoint.envs.registration import ENV_IDS, STEP_TASKS
+from viapoint.training.config.base import Config
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
@@ -22,7 +21,9 @@ from viapoint.training.config.checks import (
     check_folder,
     check_has_scenes,
     check_hyperparameters,
+    check_observed,
     check_rollout_workers,
+    check_stalling,
     check_whole,
     check_whole_movements,
 )
@@ -46,55 +47,6 @@ else:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    """Configuration of a command; paths may be given as strings."""
-
-    least: ClassVar[Mapping[str, int]] = {}
-    """Least values of the whole numbers, by name; None is allowed where it is the default."""
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A value is not allowed; the message lists the allowed values.
-        """
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, str) and "Path" in str(each.type):
-                object.__setattr__(self, each.name, Path(value))
-            if each.name in self.least and not (value is None and each.default is None):
-                check_whole(each.name, value, self.least[each.name])
-        self._check()
-
-    def _check(self) -> None:
-        """Check what is not a whole number."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        plain = {Path: str, tuple: list}
-        return {
-            name: next((to(value) for kind, to in plain.items() if isinstance(value, kind)), value)
-            for name, value in values.items()
-        }
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Self:
-        """Return the configuration that plain values describe.
-
-        Raises:
-            ValueError: A name is unknown or a value is not allowed.
-        """
-        names = [each.name for each in dataclasses.fields(cls)]
-        unknown = sorted(set(record) - set(names))
-        if unknown:
-            raise ValueError(f"{cls.__name__} knows {', '.join(names)}, not {unknown[0]!r}")
-        return cls(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
 class TrainConfig(Config):
     """Train an agent.
 
@@ -114,8 +66,10 @@ class TrainConfig(Config):
         "seed": 0,
         "eval_scenes": 1,
         "n_timesteps": 1,
+        "min_timesteps": 1,
         "n_envs": 1,
         "eval_every": 0,
+        "observe_candidates": 0,
         "checkpoint_every": 1,
         "rollout_workers": 0,
     }
@@ -128,8 +82,12 @@ class TrainConfig(Config):
     """Seed of all random numbers."""
     n_timesteps: int | None = None
     """Decisions; default: the preset's."""
+    stop_when_stalled: float | None = None
+    """Stop if success stalls for this share of decisions."""
+    min_timesteps: int | None = None
+    """Decisions before it may stop; default: the preset's."""
     n_envs: int | None = None
-    """Environments that are stepped together; default: that of the preset."""
+    """Environments stepped together; default: the preset's."""
     out: AnyPath | None = None
     """Run folder; default: runs/<environment>-<algorithm>-<seed>."""
     resume: bool = False
@@ -140,6 +98,8 @@ class TrainConfig(Config):
     """Validation scenes in each evaluation."""
     checkpoint_every: int | None = None
     """Decisions between checkpoints; default: the preset's."""
+    observe_candidates: int = 0
+    """Plans whose clearance is observed; not for viaq."""
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
@@ -162,11 +122,14 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
+        check_observed(self.observe_candidates, self.algo, self.env)
         check_env_kwargs(self.env_kwargs)
         check_rollout_workers(self.rollout_workers, self.on, None if self.resume else self.copies)
         check_hyperparameters(self.algo, self.hyperparameters)
         if self.discount_unit is not None:
             check_discount_unit(self.algo, self.discount_unit, self.env)
+        limits = self.least_timesteps, self.total_timesteps
+        check_stalling(self.stop_when_stalled, self.min_timesteps, self.evaluation_interval, limits)
 
     @property
     def preset(self) -> Preset:
@@ -177,6 +140,11 @@ class TrainConfig(Config):
     def total_timesteps(self) -> int:
         """Decisions in total."""
         return self.n_timesteps or self.preset.n_timesteps
+
+    @property
+    def least_timesteps(self) -> int:
+        """Decisions before which a stalled training goes on."""
+        return self.min_timesteps or self.preset.n_timesteps
 
     @property
     def copies(self) -> int:
@@ -255,7 +223,7 @@ class EvaluateConfig(Config):
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
-    """Scene set: validation, test, hard, or a scene file."""
+    """Scene set: validation, test, hard, uniform, or a scene file."""
     n_scenes: int | None = None
     """Number of scenes, evenly spread over the set; all if not given."""
     json: Path | None = None
@@ -299,7 +267,7 @@ class PlayConfig(Config):
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
-    """Scene set: validation, test, hard, or a scene file."""
+    """Scene set: validation, test, hard, uniform, or a scene file."""
     n_scenes: int = 8
     """Number of scenes, evenly spread over the set."""
     checks: int = 0

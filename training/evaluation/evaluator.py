@@ -193,7 +193,7 @@ def evaluate(
             `name` and `decide`, such as a :class:`GeometrySearch`; None to evaluate baselines alone.
         env: Id of the environment; that of the agent if not given.
         env_kwargs: Keyword arguments of the environment; those of the agent if not given.
-        scenes: `validation`, `test`, `hard`, the path of a scene file, or a scene set.
+        scenes: `validation`, `test`, `hard`, `uniform`, the path of a scene file, or a scene set.
         n_scenes: Number of scenes, evenly spread over the set; all if not given.
         checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
             agent's own setting if not given.

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
@@ -18,6 +19,7 @@ from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.envs.worker_env import WorkerVectorEnv
 from viapoint.training.config.discount import ELAPSED
+from viapoint.training.search.candidates import OBSERVED
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -27,6 +29,15 @@ REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration"
 """Metrics of an episode that the info dictionaries report."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which the info dictionaries report."""
+OBSERVE_CANDIDATES = "viapoint.training.search.observe_candidates:VectorObserveCandidates"
+"""Entry point of the wrapper that adds the margins of candidates to observations."""
+
+
+def observed_candidates(env: VecEnv) -> int:
+    """Return the number of candidate plans whose margins are part of an environment's observations; 0 for none."""
+    space: Any = env.observation_space
+    parts = getattr(space, "spaces", {})
+    return int(parts[OBSERVED].shape[0]) if OBSERVED in parts else 0
 
 
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
@@ -66,10 +77,13 @@ class ViaVecEnv(VecEnv):
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
         workers: Processes that share the copies; 0 for none. Results do not depend on it.
+        observe_candidates: Number of candidate plans whose computed margins are part of the observation, see
+            :class:`~viapoint.training.search.observe_candidates.ObserveCandidates`; 0 for none.
         **kwargs: Keyword arguments of the environment.
 
     Raises:
-        ValueError: There is no such environment, or it does not start the next episode in the step that ends the last.
+        ValueError: There is no such environment, it does not start the next episode in the step that ends the last, or
+            it has no candidates to observe.
 
     Example:
         >>> import numpy as np
@@ -85,7 +99,14 @@ class ViaVecEnv(VecEnv):
     """
 
     def __init__(
-        self, env_id: str, num_envs: int, seed: int | None = None, *, workers: int = 0, **kwargs: Any
+        self,
+        env_id: str,
+        num_envs: int,
+        seed: int | None = None,
+        *,
+        workers: int = 0,
+        observe_candidates: int = 0,
+        **kwargs: Any,
     ) -> None:
         check_registered(env_id)
         if workers and env_id not in ENV_IDS:
@@ -97,6 +118,9 @@ class ViaVecEnv(VecEnv):
             raise ValueError(
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
             )
+        if observe_candidates:
+            wrapper: Any = load_env_creator(OBSERVE_CANDIDATES)
+            self.venv = wrapper(self.venv, observe_candidates)
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)

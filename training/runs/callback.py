@@ -60,6 +60,10 @@ class TrainingStoppedError(Exception):
     """Exit code of shells for Ctrl-C."""
 
 
+class TrainingStalledError(Exception):
+    """Training ended before its limit, as the success on the validation scenes did not rise any more."""
+
+
 class RunCallback(BaseCallback):
     """Callback that validates, keeps the best model, writes checkpoints and logs, and shows progress.
 
@@ -99,6 +103,20 @@ class RunCallback(BaseCallback):
         self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
         self._best = (float(state["best"][0]), float(state["best"][1]))
         self._next = {name: int(state["next"][name]) for name in self._next}
+
+    @property
+    def stalled(self) -> bool:
+        """Flag: at the last validation the highest success had not risen for long enough to end the training."""
+        share = self.config.stop_when_stalled
+        if share is None or not self.curve:
+            return False
+        now = self.curve[-1]["decisions"]
+        return bool(now >= self.config.least_timesteps and now - self.best_record["decisions"] >= share * now)
+
+    @property
+    def best_record(self) -> dict[str, Any]:
+        """First record of the highest success in the learning curve."""
+        return max(self.curve, key=lambda record: record["success"]["rate"])  # the first of several
 
     @property
     def seconds(self) -> float:
@@ -165,6 +183,9 @@ class RunCallback(BaseCallback):
                 f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
                 "goes on from there (viapoint train --resume, or viapoint demo again)"
             )
+        if self.stalled:
+            self._save_checkpoint()
+            raise TrainingStalledError
 
     def _on_training_end(self) -> None:
         self._run_due_actions(final=True)

@@ -2,6 +2,7 @@
 
 config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
 learning_curve.jsonl              one line for each evaluation on the validation scenes
+end.json                          why training ended: its budget was spent, or success stalled
 checkpoints/<decisions>/          for an exact continuation; the last two are kept
 best/  final/                     models: best on the validation scenes, last
 evaluations/<name>.json           what `viapoint evaluate` and `viapoint demo` measured
@@ -192,6 +193,20 @@ class Run:
         if passed_over:
             raise passed_over[0]
         return None, []
+
+    @property
+    def stopped(self) -> str | None:
+        """Reason why training ended: `budget` or `stalled`, see `stop_when_stalled`; None while it has not ended."""
+        path = self.folder / "end.json"
+        return str(read_json(path)["stopped"]) if path.is_file() else None
+
+    def write_end(self, record: Mapping[str, Any] | None) -> None:
+        """Write why and where training ended; None removes the file while training goes on."""
+        path = self.folder / "end.json"
+        if record is None:
+            path.unlink(missing_ok=True)
+        else:
+            write_json(path, record)
 
     def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
         """Write the result of an evaluation under a name."""

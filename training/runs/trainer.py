@@ -23,7 +23,7 @@ from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
 from viapoint.training.io.installed import versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
+from viapoint.training.runs.callback import RunCallback, TrainingStalledError, TrainingStoppedError
 from viapoint.training.runs.run_dir import Run, check_free, check_unchanged
 
 __all__ = [
@@ -46,7 +46,9 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
     """Train an agent and write everything about the training to a run folder.
 
     With `config.resume` the run in the folder continues with its own configuration from its last checkpoint, to the
-    same result as if it had never stopped; `n_timesteps` may extend it.
+    same result as if it had never stopped; `n_timesteps` may extend it. A training that has ended because it stalled
+    (`stop_when_stalled`) stays as it is. Where a checkpoint is read, the decision to end depends on the learning curve
+    alone, so it is the same with and without interruption.
 
     Args:
         config: Environment, algorithm, seed, run folder and everything else that a training depends on.
@@ -99,6 +101,7 @@ def resolved(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(
         config,
         n_timesteps=config.total_timesteps,
+        min_timesteps=None if config.stop_when_stalled is None else config.least_timesteps,
         n_envs=config.copies,
         eval_every=config.evaluation_interval,
         checkpoint_every=config.checkpoint_interval,
@@ -126,12 +129,12 @@ def training_env(config: TrainConfig) -> ViaVecEnv:
         ImportError: Ray is asked for and not installed.
         ValueError: There is no such environment or cluster.
     """
-    workers = config.rollout_workers
+    shared = {"workers": config.rollout_workers, "observe_candidates": config.observe_candidates}
     if config.on == "local":
-        return ViaVecEnv(config.env, config.copies, workers=workers, **config.env_kwargs)
+        return ViaVecEnv(config.env, config.copies, **shared, **config.env_kwargs)
     from viapoint.training.rollouts.ray_vec_env import RayVecEnv
 
-    env = RayVecEnv(config.env, config.copies, workers=workers, on=config.on, **config.env_kwargs)
+    env = RayVecEnv(config.env, config.copies, on=config.on, **shared, **config.env_kwargs)
     assert isinstance(env, ViaVecEnv)
     return env
 
@@ -235,11 +238,24 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
         monitor.restore(restored)
     run.write_curve(monitor.curve)
     remaining = run.config.total_timesteps - model.num_timesteps
-    if remaining > 0:
+    if remaining > 0 and not monitor.stalled:
+        run.write_end(None)
         given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
         callbacks = [monitor, ElapsedTimeCallback(), *given]
-        model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
+        try:
+            model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
+        except TrainingStalledError:
+            for each in given:
+                each.on_training_end()
     run.save("final", model)
+    best = monitor.best_record["decisions"] if monitor.curve else None
+    run.write_end(
+        {
+            "stopped": "stalled" if monitor.stalled else "budget",
+            "decisions": model.num_timesteps,
+            "best_decisions": best,
+        }
+    )
 
 
 @contextmanager

@@ -6,7 +6,8 @@
 set in each band of the solution share. `hard` holds equal numbers of scenes of several families, all with a share below
 5 %. No agent in the plane is trained on these families; in space they are the narrow ones, of which `tunnel` is never
 trained on. Every scene was solved in simulation by at least one of at most 4,096 random actions, which gives its
-difficulty, and by the planner.
+difficulty, and by the planner. `uniform` holds scenes in which nothing is placed about a feasible path
+(:mod:`viapoint.envs.scenes.uniform`): the first ones that have a solution. Their shares are not measured.
 
 The search for scenes uses estimates of their shares, which change with the program. Each scene of a file therefore has
 its number among the drawn scenes. The command draws these scenes again, measures their shares, and compares hashes.
@@ -26,12 +27,19 @@ import numpy as np
 from viapoint.envs.mdp.task import Task, family_sampler
 from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.families import scene_families
-from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.replanning import SIZES as REPLANNING_SIZES
 from viapoint.training.scene_sets.replanning import make_replanning
-from viapoint.training.scene_sets.scene_search import Kinds, Source, measured, redrawn, search
+from viapoint.training.scene_sets.scene_search import (
+    Kinds,
+    Source,
+    first_solved,
+    measured,
+    redrawn,
+    search,
+)
 from viapoint.training.scene_sets.scene_set import (
     BAND_EDGES,
     BANDS,
@@ -42,14 +50,14 @@ from viapoint.training.scene_sets.scene_set import (
     shipped_path,
 )
 
-SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017}
+SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017, "uniform": 4_000_037}
 """First seeds of the sets; training draws from seeds below a million."""
-SIZES = {"validation": 500, "test": 1000, "hard": 500}
+SIZES = {"validation": 500, "test": 1000, "hard": 500, "uniform": 500}
 WITHOUT_OBSTACLES = 100
 """Number of scenes of a set without obstacles."""
 HARDEST = BAND_EDGES[1]
 """Upper limit of the shares of hard scenes."""
-ALL = ("validation", "test", "hard")
+ALL = ("validation", "test", "hard", "uniform")
 SETS = {
     "viapoint/PlanarReach-v0": ALL[:2],
     "viapoint/PlanarObstacles-v0": ALL,
@@ -76,7 +84,7 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
 
     Args:
         task: Task of the scenes.
-        name: `validation`, `test` or `hard`.
+        name: `validation`, `test`, `hard` or `uniform`.
         size: Number of scenes, a multiple of the bands or families.
     """
     seed = SEEDS[name]
@@ -92,8 +100,11 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
             Lot(family, _source(sampler, seeds[family], block=64), hard, seeds[family])
             for family, sampler in families.items()
         ]
+    any_ = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
+    if name == "uniform":
+        sampler = UniformSampler(task.collision_model, task.scenes)
+        return [Lot(DRAWN, _source(sampler, seed, block=64), any_, seed)]
     if task.scenes.n_obstacles[1] == 0:
-        any_ = Kinds(of_share=lambda share: np.zeros(len(share), np.int64), names=("any",), quota=size)
         return [Lot(DRAWN, _source(task.sampler(), seed, block=WITHOUT_OBSTACLES), any_, seed)]
     rare = not task.whole_arm  # few scenes are hard where the hand alone must clear
     levels = ((0.03, 2048), (0.013, 16384)) if rare else ((0.03, 1024),)
@@ -112,7 +123,7 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
 
     Args:
         env_id: Environment of the scenes.
-        name: `validation`, `test` or `hard`.
+        name: `validation`, `test`, `hard` or `uniform`.
         size: Number of scenes N, a multiple of the bands or families; by default the set's.
         threads: Of the simulation, 0 for one per core; the result does not depend on it.
 
@@ -122,12 +133,13 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
     simulation = SceneSimulation(env_id, threads=threads)
     size = size or (SIZES[name] if simulation.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
     parts = lots(simulation.task, name, size)
-    found = [
-        search(
-            simulation, lot.source, lot.kinds, seed=lot.seed, label=f"{env_id} {name} {lot.family}".strip()
-        )
-        for lot in parts
-    ]
+    found = []
+    for lot in parts:
+        label = f"{env_id} {name} {lot.family}".strip()
+        if name == "uniform":
+            found.append(first_solved(simulation, lot.source, size, label))
+        else:
+            found.append(search(simulation, lot.source, lot.kinds, seed=lot.seed, label=label))
     simulation.close()
     order = np.arange(size).reshape(len(parts), -1).T.ravel()  # families in turn
     return FrozenScenes(
@@ -158,7 +170,8 @@ def remake(frozen: FrozenScenes, threads: int = 0) -> FrozenScenes:
         scenes = redrawn(lot.source, frozen.number[rows])
         Scenes(starts, goals, obstacles).put(rows, scenes)
         label = f"{frozen.env_id} {frozen.name} {lot.family}".strip()
-        share[rows] = measured(simulation, scenes, lot.seed, label)
+        if not np.isnan(share[rows]).all():
+            share[rows] = measured(simulation, scenes, lot.seed, label)
     again = dataclasses.replace(frozen, scenes=Scenes(starts, goals, obstacles), share=share)
     solved = simulation(again.scenes, again.solution).success
     simulation.close()
@@ -212,6 +225,8 @@ def compare_with_shipped(sets: Iterable[FrozenScenes], arguments: argparse.Names
 
 def _bands(frozen: FrozenScenes) -> str:
     """Return the number of scenes in each band as text."""
+    if np.isnan(frozen.share).all():
+        return f"{len(frozen.share)} scenes"
     counts = ", ".join(f"{label}: {int(np.sum(frozen.band == i))}" for i, label in enumerate(BANDS))
     return f"{len(frozen.share)} scenes ({counts})"
 

@@ -1,4 +1,4 @@
-"""Search for scenes of given difficulty: draw, estimate, measure and certify until there are enough of each kind."""
+"""Search for scenes: draw, estimate, measure and certify until there are enough, of each difficulty or of any."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.search.geometry_search import GeometrySearch
 
 SPARE, SAFE = 1.2, 1.1
 """Factors on the number of scenes that are taken by their estimated share, and on this estimate, as it errs."""
@@ -23,6 +24,8 @@ AT_ONCE = 64
 """Scenes that are measured at once."""
 QUICK = PlannerBudget(generations=4)
 """Budget of the planner in space, where simulation takes longer."""
+SECOND_CHANCE = 4096
+"""Candidate plans of scenes that the planner does not solve."""
 MOST_DRAWN, MOST_ROUNDS = 1 << 18, 20
 """Limits of the scenes drawn and of the rounds of measuring or planning."""
 
@@ -107,6 +110,38 @@ def search(
     raise RuntimeError(
         f"{label}: after {MOST_ROUNDS} rounds there still lack {_named(missing, kinds)} scenes"
     )
+
+
+def first_solved(simulation: SceneSimulation, source: Source, number: int, label: str) -> Found:
+    """Return the first scenes that have a known solution; their solution shares are not measured.
+
+    The planner looks for solutions with its usual budget. Where it finds none, the best of SECOND_CHANCE plans by
+    computed geometry is simulated.
+
+    Args:
+        simulation: Simulation.
+        source: Source of the scenes.
+        number: Number of scenes, N.
+        label: Text beside the progress bar.
+    """
+    planner, geometry = Planner(simulation), GeometrySearch(simulation.task, SECOND_CHANCE, refinements=4)
+    kept: list[tuple[Scenes, Float, Int]] = []
+    drawn = 0
+    while sum(len(numbers) for *_, numbers in kept) < number:
+        scenes = source.draw(source.block)
+        for rows in _lots(scenes, f"{label}: planner"):
+            some, numbers = scenes.take(rows), drawn + np.arange(source.block)[rows]
+            planned = planner(some)
+            action, solved = planned.action, planned.success.copy()
+            left = np.flatnonzero(~solved)
+            if left.size:
+                action[left] = geometry.decide(simulation.observe(some.take(left)))
+                solved[left] = simulation(some.take(left), action[left]).success
+            kept.append((some.take(solved), action[solved], numbers[solved]))
+        drawn += source.block
+    scenes = Scenes(*(np.concatenate(f)[:number] for f in zip(*(each for each, *_ in kept), strict=True)))
+    solution, numbers = (np.concatenate([each[i] for each in kept])[:number] for i in (1, 2))
+    return Found(scenes, np.full(number, np.nan), solution, numbers)
 
 
 def redrawn(source: Source, number: Int) -> Scenes:

@@ -20,7 +20,7 @@ from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import new_simulation
 
-SETS = ("validation", "test", "hard")
+SETS = ("validation", "test", "hard", "uniform")
 """Names of the sets; an environment need not have all."""
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
 """Bands of the solution share, from easy to hard."""
@@ -187,10 +187,11 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
         raise ValueError("a solution share is not between 0 and 1")
 
 
-ACTION_ARGUMENTS = frozenset(
-    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
+OTHER_ARGUMENTS = frozenset(
+    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height", "uniform_share"}
 )
-"""Arguments of an environment that its scenes do not depend on; without replanning, `duration_range` is another."""
+"""Arguments of an environment with which frozen scenes remain scenes of it; without replanning, `duration_range` is
+another."""
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}
 """Seeds of the sets that can be drawn, far from training seeds and from each other."""
 NUMBERS = {"validation": 500, "test": 1_000}
@@ -198,8 +199,8 @@ NUMBERS = {"validation": 500, "test": 1_000}
 
 
 def scene_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment that its scenes depend on."""
-    others = ACTION_ARGUMENTS if env_id in REPLANNING_TASKS else ACTION_ARGUMENTS | {"duration_range"}
+    """Return the arguments of an environment with which frozen scenes are no scenes of it."""
+    others = OTHER_ARGUMENTS if env_id in REPLANNING_TASKS else OTHER_ARGUMENTS | {"duration_range"}
     return {name: value for name, value in env_kwargs.items() if name not in others}
 
 

@@ -21,8 +21,9 @@ from optuna.distributions import (
 from optuna.pruners import BasePruner
 from optuna.samplers import BaseSampler
 
+from viapoint.training.config.base import Config
 from viapoint.training.config.checks import check_whole
-from viapoint.training.config.configs import Config, TrainConfig
+from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import Algorithm
 from viapoint.training.io.files import BadFileError
 from viapoint.training.io.yaml_file import read_yaml
