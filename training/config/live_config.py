@@ -7,8 +7,9 @@ from typing import Annotated, ClassVar
 
 import tyro
 
+from viapoint.training.config.base import Config
 from viapoint.training.config.checks import check_env
-from viapoint.training.config.configs import AGENT, ENV, PRETRAINED, Config, take_pretrained
+from viapoint.training.config.configs import AGENT, ENV, PRETRAINED, take_pretrained
 
 
 @dataclass(frozen=True, kw_only=True)
