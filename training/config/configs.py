@@ -295,13 +295,19 @@ class BenchConfig(Config):
     """Environments in the batch."""
     repeats: int = 9
     """Alternating measurements of each side, of which the fastest counts."""
+    workers: int = 0
+    """Worker processes to compare with as many threads; 0 leaves the comparison out."""
     json: Path | None = None
     """JSON file for the figures."""
 
-    least: ClassVar = {"num_envs": 1, "repeats": 1}
+    least: ClassVar = {"num_envs": 1, "repeats": 1, "workers": 0}
 
     def _check(self) -> None:
         check_env(self.env)
+        if self.workers > self.num_envs:
+            raise ValueError(
+                f"workers must be at most num_envs, which is {self.num_envs}, got {self.workers}"
+            )
         check_whole_movements(self.env)
         check_file("json", self.json)
 
