@@ -54,6 +54,7 @@ def bench(config: BenchConfig) -> list[Ratio]:
         _single(config.env, config.repeats, resets=True),
         *(_sampling(shared, config.repeats) for shared in (True, False)),
         _make_vec_env(config.env, min(config.num_envs, 64), config.repeats),
+        *([_workers(config.env, config.num_envs, config.workers, config.repeats)] if config.workers else []),
     ]
 
 
@@ -216,6 +217,24 @@ def _make_vec_env(env_id: str, num_envs: int, repeats: int) -> Ratio:
     return Ratio(
         f"make_vec_env against ViaVecEnv, {num_envs} environments", theirs, mine, "decisions/s", theirs / mine
     )
+
+
+def _workers(env_id: str, num_envs: int, workers: int, repeats: int) -> Ratio:
+    """Return decisions per second of worker processes and of as many threads."""
+    envs = [
+        gym.make_vec(env_id, num_envs=num_envs, workers=workers, threads=1),
+        gym.make_vec(env_id, num_envs=num_envs, threads=workers),
+    ]
+    for env in envs:
+        env.reset(seed=0)
+    actions = _actions(envs[0].single_action_space, num_envs)
+    mine, threads = (
+        num_envs / each for each in fastest(repeats, *(partial(env.step, actions) for env in envs))
+    )
+    for env in envs:
+        env.close()
+    name = f"make_vec, {num_envs} environments, {workers} workers against {workers} threads"
+    return Ratio(name, mine, threads, "decisions/s", mine / threads)
 
 
 def _shown(value: float) -> str:
