@@ -49,7 +49,8 @@ def trainings(monkeypatch):
             if callback is not None and decisions < config.n_timesteps:
                 callback.num_timesteps = decisions
                 callback._on_rollout_start()
-        run.final.mkdir()
+
+        run.final.mkdir(exist_ok=True)
         return run
 
     monkeypatch.setattr(module, "train", train)
@@ -197,10 +198,25 @@ def test_a_search_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path, train
 def test_a_trial_continues_the_run_of_its_earlier_attempt(tmp_path, trainings):
     tuning = Tuning.create(tmp_path / "a", search(trials=1))
     taken = tuning._next_trial(1)
-    Run.create(resolved(tuning.search.training(taken.trial.params, 0, tmp_path / "a/trials/0000/seed-0")))
+    run = Run.create(
+        resolved(tuning.search.training(taken.trial.params, 0, tmp_path / "a/trials/0000/seed-0"))
+    )
+    run.write_curve([{"decisions": 64, "success": {"rate": 0.5}}])
+    run.final.mkdir()  # as Ctrl-C leaves it
     taken.lock.release()
     Tuning(tmp_path / "a").work(workers=0)
     assert [each.resume for each in trainings] == [True]
+    assert tuning.best.value != 0.5
+
+
+def test_a_run_that_had_ended_is_not_trained_again(tmp_path, trainings):
+    tuning = Tuning.create(tmp_path / "a", search(trials=1))
+    taken = tuning._next_trial(1)
+    module.train(tuning.search.training(taken.trial.params, 0, tmp_path / "a/trials/0000/seed-0"))
+    taken.lock.release()
+    Tuning(tmp_path / "a").work(workers=0)
+    assert len(trainings) == 1
+    assert tuning.best.value == 10.0 * taken.trial.params["learning_rate"]
 
 
 def test_trials_of_living_processes_are_neither_repeated_nor_exceeded(tmp_path, trainings):

@@ -334,8 +334,10 @@ def train_trial(
 
 def _train(config: TrainConfig, callback: BaseCallback | None) -> Run:
     """Train, or continue what an earlier attempt began; a finished run is returned as it is."""
-    if (config.folder / "final").is_dir():
-        return Run(config.folder)
+    if (config.folder / "final").is_dir():  # a training that was stopped has one, too
+        run = Run(config.folder)
+        if run.curve and run.curve[-1]["decisions"] >= config.total_timesteps:
+            return run
     resume = (config.folder / "config.json").is_file()
     return train(dataclasses.replace(config, resume=resume), callback)
 
