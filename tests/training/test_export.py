@@ -154,11 +154,15 @@ def test_files_that_are_there_stay(tmp_path, capsys):
     assert (tmp_path / "README.md").read_text() == "mine"
 
 
-def test_environment_names_in_foreign_archives_are_not_trusted(tmp_path):
-    """A name is one of registered environments, so Gymnasium imports no module that an archive names."""
-    env = gym.make(ENV)
-    model = SAC("MultiInputPolicy", env, buffer_size=10, policy_kwargs={"net_arch": [4]})
-    model.viapoint_env = {"id": "os:system-v0", "kwargs": {}}
+def test_environment_names_in_foreign_archives_import_nothing(tmp_path, monkeypatch):
+    """Gymnasium would import the module before the colon."""
+    (tmp_path / "canary.py").write_text(f"open({str(tmp_path / 'sung')!r}, 'w')")
+    monkeypatch.syspath_prepend(tmp_path)
+    model = SAC("MultiInputPolicy", gym.make(ENV), buffer_size=10, policy_kwargs={"net_arch": [4]})
+    model.viapoint_env = {"id": "canary:Bird-v0", "kwargs": {}}
     model.save(tmp_path / "model.zip")
-    with pytest.raises(BadFileError, match="os:system-v0"):
+    with pytest.raises(BadFileError, match="canary:Bird-v0"):
         load_agent(tmp_path / "model.zip", trust=True)
+    with pytest.raises(SystemExit):
+        cli_run("import-sb3", tmp_path / "model.zip", "--out", tmp_path / "back", "--trust")
+    assert not (tmp_path / "sung").exists()
