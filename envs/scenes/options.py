@@ -9,6 +9,7 @@ import numpy as np
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.geometry.shapes import obstacle_rows
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
@@ -39,6 +40,7 @@ def draw_given(
         ValueError: A scene is impossible, with the reason.
     """
     collision_model, arm, number = sampler.collision_model, sampler.collision_model.arm, len(generators)
+    options = _with_rows(options, arm.dimension)
     nothing = Scenes(
         np.full((number, arm.dimension), np.nan),
         np.full((number, arm.dimension), np.nan),
@@ -90,7 +92,8 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
 
     Args:
         options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
-            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m].
+            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m]; or a list of spheres and capsules, or
+            of their dictionaries, for all scenes, or N such lists.
         sampled: Scenes to overwrite.
         arm: Arm, for the dimension D.
 
@@ -98,6 +101,7 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
         ValueError: An array is not finite or has another shape, or a name is unknown.
     """
     refuse_unknown_options(options, GIVEN)
+    options = _with_rows(options, arm.dimension)
     fields = sampled._asdict()
     for name, field in fields.items():
         if name in options:
@@ -105,6 +109,16 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
         else:
             fields[name] = field.copy()
     return Scenes(**fields)
+
+
+def _with_rows(options: Mapping[str, Any], dimension: int) -> Mapping[str, Any]:
+    """Return options with obstacles that are shapes or dictionaries as rows."""
+    if "obstacles" not in options:
+        return options
+    try:
+        return {**options, "obstacles": obstacle_rows(options["obstacles"], dimension)}
+    except ValueError as error:
+        raise ValueError(f"options['obstacles']: {error}") from None
 
 
 def refuse_unknown_options(options: Mapping[str, Any], known: Sequence[str]) -> None:

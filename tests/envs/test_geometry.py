@@ -1,9 +1,11 @@
 """Signed distances of all shapes are those of independent libraries, and records say what is not allowed."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -22,11 +24,14 @@ from viapoint.envs import (
     as_obstacles,
     nearest_distance,
     observation_rows,
+    obstacle_rows,
     obstacles_from_json,
+    obstacles_from_rows,
     obstacles_to_json,
     signed_distances,
 )
 from viapoint.envs.geometry import shapes
+from viapoint.training import GeometrySearch
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from geometry import Probes, agreement, random_shape
@@ -420,3 +425,69 @@ def test_probes_are_near_contact(generator):
     probes = Probes.around(shape, 100, generator, long=True)
     assert (np.abs(probes.clearance(shape)) < 0.006).mean() > 0.3
     assert PointCloud([(0.0, 0.0, 0.0)]).radius == 0.01
+
+
+BARS = [Capsule.between((-0.1, 0.35), (0.0, 0.38), 0.02), Sphere(0.03, position=(0.1, 0.5, 0.0))]
+ENDS = {"start": (-0.3, 0.3), "goal": (0.2, 0.35)}
+
+
+def test_reset_takes_shapes_and_dictionaries_as_obstacles():
+    env = gym.make("viapoint/PlanarObstacles-v0").unwrapped
+    rows = obstacle_rows(BARS, 2)
+    wanted, _ = env.reset(seed=0, options={**ENDS, "obstacles": rows})
+    for obstacles in (BARS, tuple(each.to_dict() for each in BARS)):
+        observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": obstacles})
+        np.testing.assert_array_equal(observation["obstacles"], wanted["obstacles"])
+    assert [each.kind for each in obstacles_from_rows(env.batch.scenes.obstacles[0])] == ["capsule", "sphere"]
+    again = obstacle_rows(obstacles_from_rows(env.batch.scenes.obstacles[0]), 2)
+    np.testing.assert_allclose(again, rows, atol=1e-12)
+    several, _ = env.reset(seed=1, options={"obstacles": BARS})  # start and goal are drawn clear of them
+    assert several["obstacles"][-7] == 0.0
+    env.close()
+
+
+def test_a_batch_takes_a_list_of_obstacles_for_each_scene():
+    envs = gym.make_vec("viapoint/PandaObstacles-v0", num_envs=3).unwrapped
+    ball = Sphere(0.04, position=(0.5, 0.1, 0.4))
+    envs.reset(
+        seed=0, options={"obstacles": [[ball], [], [ball, Capsule(0.02, 0.1, position=(0.6, -0.2, 0.3))]]}
+    )
+    assert envs.scenes.present.sum(axis=1).tolist() == [1, 0, 2]
+    envs.reset(seed=0, options={"obstacles": [ball]})
+    assert envs.scenes.present.sum(axis=1).tolist() == [1, 1, 1]
+    with pytest.raises(
+        ValueError, match=r"options\['obstacles'\]: scene 1: obstacle 0: environments simulate spheres"
+    ):
+        envs.reset(options={"obstacles": [[], [Box((0.1, 0.1, 0.1))], []]})
+    envs.close()
+
+
+def test_plans_avoid_shapes_as_they_avoid_rows():
+    search = GeometrySearch("viapoint/PlanarObstacles-v0", 32)
+    plans = [search.plan(**ENDS, obstacles=each) for each in (BARS, obstacle_rows(BARS, 2).tolist())]
+    np.testing.assert_array_equal(plans[0].waypoints, plans[1].waypoints)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "reason"),
+    [
+        (
+            Box((0.1, 0.1, 0.1)),
+            "obstacle 1: environments simulate spheres and capsules; box is for distances only",
+        ),
+        (Sphere(0.02, position=(0.1, 0.4, 0.1)), "obstacle 1: sphere must lie in the plane, with z = 0"),
+        (Capsule(0.02, 0.1, position=(0.1, 0.4, 0.0)), "obstacle 1: capsule must lie in the plane"),
+        (
+            Sphere(np.full(3, 0.02), position=np.zeros((3, 3))),
+            "obstacle 1: sphere must be one shape, got a batch",
+        ),
+        ({"shape": "sphere", "radius": 0}, "obstacle 1: sphere: radius must be greater than 0, got 0"),
+        ({"shape": "sphere", "radius": 0.5, "position": (0.1, 0.4, 0.0)}, "has a radius over 0.1 m"),
+        ({"shape": "sphere", "radius": 0.1, "position": (-0.3, 0.3, 0.0)}, "touches the arm at the start"),
+    ],
+)
+def test_obstacles_that_environments_lack_are_refused_with_their_index(obstacle, reason):
+    env = gym.make("viapoint/PlanarObstacles-v0")
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        env.reset(seed=0, options={**ENDS, "obstacles": [BARS[0], obstacle]})
+    env.close()

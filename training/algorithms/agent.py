@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sb3_contrib
@@ -22,6 +23,9 @@ from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
 from viapoint.training.search.geometry_search import scene_from_rest
 from viapoint.training.search.observe_candidates import with_candidates
+
+if TYPE_CHECKING:
+    from viapoint.envs.geometry.shape import Shape
 
 
 class Agent(BaseAlgorithm):
@@ -65,7 +69,9 @@ class Agent(BaseAlgorithm):
             observation = with_candidates(observation, task, number)
         return super().predict(observation, *args, **kwargs)
 
-    def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
+    def plan(
+        self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | Sequence[Shape] | None = None
+    ) -> Plan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.
 
         The plan is the one that an environment with this scene would execute after `predict`.
@@ -73,8 +79,9 @@ class Agent(BaseAlgorithm):
         Args:
             start: Position of the hand, shape (D,), [m].
             goal: Position of the target, shape (D,), [m].
-            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; None for none. At most as many
-                as the environment of the agent may have.
+            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; or a list of spheres and
+                capsules of :mod:`viapoint.envs`; None for none. At most as many as the environment of the agent may
+                have.
 
         Raises:
             ValueError: An argument has another shape or is not finite, the scene is impossible, or an action of the

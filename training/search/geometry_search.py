@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Numbers, Single
+from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shapes import obstacle_rows
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes, problems
@@ -141,7 +143,9 @@ class GeometrySearch:
             return self.decide(parts).astype(np.float32), None
         return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
 
-    def plan(self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None) -> Plan:
+    def plan(
+        self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | Sequence[Shape] | None = None
+    ) -> Plan:
         """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
 
         Where no candidate stays clear and in reach, the plan is the one with the least violation.
@@ -149,7 +153,8 @@ class GeometrySearch:
         Args:
             start: Hand position, shape (D,), [m].
             goal: Goal position, shape (D,), [m].
-            obstacles: Rows of centre (D), half-axis (D) and radius, shape (n, 2 D + 1), [m]; None for none.
+            obstacles: Rows of centre (D), half-axis (D) and radius, shape (n, 2 D + 1), [m]; or a list of spheres and
+                capsules of :mod:`viapoint.envs`; None for none.
 
         Raises:
             ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
@@ -201,7 +206,7 @@ def score_plans(
 
 
 def scene_from_rest(
-    task: Task, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | None = None
+    task: Task, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | Sequence[Shape] | None = None
 ) -> Scenes:
     """Return one scene with a start, a goal and obstacles that stand still; see :meth:`GeometrySearch.plan`.
 
@@ -210,7 +215,8 @@ def scene_from_rest(
     """
     d = task.arm.dimension
     first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
-    given = np.zeros((0, 2 * d + 1)) if obstacles is None or np.size(obstacles) == 0 else obstacles
+    given = obstacle_rows([] if obstacles is None else obstacles, d)
+    given = given if np.size(given) else np.zeros((0, 2 * d + 1))
     scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
     for wrong, reason in problems(scene, task.collision_model):
         if wrong.any():
