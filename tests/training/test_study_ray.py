@@ -1,12 +1,17 @@
 """Runner on a Ray cluster of two nodes on this machine: same results, and nothing is lost with a process."""
 
+import dataclasses
+import hashlib
+import json
 import os
 from pathlib import Path
 
 import pytest
 import runner_jobs
 
+from viapoint.training import Study, run_study
 from viapoint.training.io.ray_cluster import LOOPBACK, check_versions, import_ray
+from viapoint.training.study.jobs import baseline_jobs, pairs, training_jobs
 from viapoint.training.study.runner import Job, make_runner
 
 
@@ -35,22 +40,58 @@ def job(function, *arguments, label="", **settings):
     return Job(label=label or function.__name__, function=function, arguments=arguments, **settings)
 
 
-def test_jobs_run_on_all_nodes_and_killed_ones_go_on(cluster, tmp_path):
-    (tmp_path / "twice").mkdir()
-    (tmp_path / "twice" / "calls").write_text("5")
+def results_in(folder):
+    """Everything that may not depend on where a study ran: weights, evaluations, and learning curves without times."""
+    found = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix == ".safetensors" and "checkpoints" not in name:
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif "evaluations" in name or "baselines" in name:
+            found[name] = json.loads(path.read_text())
+        elif path.suffix == ".jsonl":
+            curve = [json.loads(line) for line in path.read_text().splitlines()]
+            found[name] = [(each["decisions"], each["success"], each["jerk_ratio"]) for each in curve]
+    return found
+
+
+def test_a_study_has_the_same_results_as_on_this_machine(cluster, tmp_path):
+    """One training is killed in the middle, and goes on from the checkpoint that the driver has."""
+    agent = {
+        "n_timesteps": 320,
+        "checkpoint_every": 64,
+        "eval_every": 128,
+        "eval_scenes": 8,
+        "checks": [0, 4],
+    }
+    few = {"learning_starts": 64, "gradient_steps": 2, "policy_kwargs": {"candidates": 16}}
+    given = {
+        "environments": {"viapoint/PlanarObstacles-v0": {"n_scenes": 8, "scenes": ["test"]}},
+        "agents": {"viaq": {**agent, "hyperparameters": few}},
+        "baselines": ["search64"],
+    }
+    here, there = (Study.from_dict({**given, "out": str(tmp_path / name)}) for name in ("here", "there"))
+    run_study(here, workers=0, only=["train", "evaluate", "baselines"])
+    steps = ("train", "evaluate")
     jobs = [
-        job(runner_jobs.die_first, "twice", 6, label="twice", folder="twice"),
-        job(runner_jobs.square, 3),
+        dataclasses.replace(each, function=runner_jobs.train_then_die) for each in training_jobs(there, steps)
+    ]
+    jobs += baseline_jobs(there, pairs(there))
+    jobs += [
+        job(runner_jobs.fill_disk, "disk", folder="disk"),
         job(runner_jobs.fail, "because"),
         job(runner_jobs.surroundings),
     ]
-    with make_runner("ray", tmp_path) as runner:
+    with make_runner("ray", there.out) as runner:
         answers = {each.label: answer for each, answer in runner.run(jobs)}
-    assert answers["twice"].value == 7
-    assert (tmp_path / "twice" / "calls").read_text() == "7"
-    assert answers["square"].value == 9
     assert answers["fail"].error == "ValueError: because"
     assert answers["surroundings"].value == ("1", 1)
+    assert answers["fill_disk"].value == "written"  # on the other node
+    assert answers["PlanarObstacles-v0 viaq seed 0"].value.startswith("node: test, alone")
+    (there.out / "disk" / "tried").unlink()
+    assert results_in(there.out) == results_in(here.out)
+    assert len(results_in(here.out)) == 6
+    assert list(training_jobs(there, steps)) == []
 
 
 def test_nodes_with_other_versions_are_refused_by_name():
