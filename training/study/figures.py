@@ -19,7 +19,7 @@ from viapoint.training.evaluation.statistics import interquartile_mean
 from viapoint.training.io.files import write_bytes
 from viapoint.training.plotting.plots import AXES, style_axes
 from viapoint.training.scene_sets.scene_set import BANDS
-from viapoint.training.study.page import chosen, figure_name, short
+from viapoint.training.study.page import chosen, figure_name, has_figure, short
 
 Numbers = Mapping[str, Any]
 DOTS_PER_INCH, SHADES = 100, 96
@@ -33,7 +33,7 @@ def draw_figures(record: Numbers, folder: Path, shown: Sequence[str] = ()) -> li
     """Draw the figures of all environments that have rows, and return the paths."""
     paths = []
     for name, numbers in record["environments"].items():
-        if any(each["kind"] == "agent" for each in numbers["rows"]):
+        if has_figure(numbers):
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(_environment(name, numbers, folder / figure_name(name), shown))
     counted = [name for name, numbers in record["environments"].items() if len(_series(numbers)) > 1]
@@ -57,7 +57,7 @@ def _environment(name: str, numbers: Numbers, path: Path, shown: Sequence[str]) 
     parts: Any = figure.subfigures(2, 1, hspace=0.04) if sets else (figure, None)
     above, below = parts
     colours = _colours(numbers)
-    _learning(above.subplots(1, len(AXES), sharey=True), numbers, colours)
+    _learning(above.subplots(1, len(AXES), sharey=True), rows, colours, legend=below is None)
     above.suptitle(f"{short(name)}: learning", fontsize=10)
     if below is not None:
         for ax, each in zip(below.subplots(1, len(sets), squeeze=False, sharey=True)[0], sets, strict=True):
@@ -76,18 +76,20 @@ def _colours(numbers: Numbers) -> dict[str, Any]:
     return {name: AGENT_COLOURS(i % 10) for i, name in enumerate(agents)} | greys
 
 
-def _learning(axes: Any, numbers: Numbers, colours: Mapping[str, Any]) -> None:
+def _learning(axes: Any, rows: Sequence[Numbers], colours: Mapping[str, Any], *, legend: bool) -> None:
     """Draw success on validation scenes against three clocks: interquartile mean and range of the seeds."""
-    curves = {each["name"]: (each["label"], each["curve"]) for each in numbers["rows"] if each.get("curve")}
+    curves = {each["name"]: (each["label"], each["curve"]) for each in rows if each.get("curve")}
     for ax, (key, label, scale) in zip(axes, AXES, strict=True):
         for name, (words, curve) in curves.items():
             if len(curve["success"]) < 2:
                 continue
-            x = scale * np.array(curve[key][1:])  # the first point, at zero, has no place on a log axis
-            rates = 100.0 * np.array(curve["success"][1:])
-            ax.plot(
-                x, [interquartile_mean(e) for e in rates], color=colours[name], linewidth=1.6, label=words
-            )
+            x = scale * np.array([curve[key][1] / 2.0, *curve[key][1:]])  # a log axis has no place for zero
+            rates = 100.0 * np.array(curve["success"])
+            middle = [interquartile_mean(each) for each in rates]
+            style: Any = {"color": colours[name]}
+            ax.plot(x[1:], middle[1:], linewidth=1.6, label=words, **style)
+            ax.plot(x[:2], middle[:2], linewidth=1.0, linestyle=":", **style)
+            ax.plot(x[:1], middle[:1], marker="o", markersize=4, fillstyle="none", **style)
             ax.fill_between(
                 x, rates.min(axis=1), rates.max(axis=1), color=colours[name], alpha=0.18, linewidth=0.0
             )
@@ -98,7 +100,7 @@ def _learning(axes: Any, numbers: Numbers, colours: Mapping[str, Any]) -> None:
         ax.set_xlabel(label, fontsize=8)
         _tidy(ax)
     axes[0].set_ylabel("success without checks,\nvalidation scenes [%]", fontsize=8)
-    if axes[0].get_legend_handles_labels()[0]:
+    if legend and axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(frameon=False, fontsize=7.5, loc="best")
 
 
@@ -110,8 +112,9 @@ def _abilities(
     here = [each for each in rows if name in each["sets"] and each["sets"][name]["by_band"]]
     seen: dict[str, int] = {}
     for i, each in enumerate(here):
-        marker = MARKERS[seen.get(each["name"], 0) % len(MARKERS)]
-        seen[each["name"]] = seen.get(each["name"], 0) + 1
+        group = each["name"] if each["kind"] == "agent" else "baselines"
+        marker = MARKERS[seen.get(group, 0) % len(MARKERS)]
+        seen[group] = seen.get(group, 0) + 1
         x = np.arange(len(bands)) + 0.8 * ((i + 0.5) / len(here) - 0.5)
         rate, low, high = 100.0 * np.array([each["sets"][name]["by_band"][band] for band in bands]).T
         error = np.maximum([rate - low, high - rate], 0.0)
@@ -129,13 +132,16 @@ def _series(numbers: Numbers) -> dict[str, list[Numbers]]:
     """Return the rows with different numbers of checks, by agent or kind of search."""
     found: dict[str, list[Numbers]] = {}
     for each in numbers["rows"]:
-        if each["checks"] is None or not each["sets"] or each.get("untrained") or each.get("unrevised"):
+        made, kind = each["made"], each["kind"]
+        changed = kind == "baseline" and (made["env_kwargs"] or made["time_of"] or made["n_scenes"])
+        if each["checks"] is None or changed or each.get("untrained") or each.get("unrevised"):
             continue
         name = each["name"] if each["kind"] == "agent" else each["method"]
         found.setdefault(name, []).append(each)
-    return {
-        name: sorted(rows, key=lambda each: each["checks"]) for name, rows in found.items() if len(rows) > 2
-    }
+    found = {name: sorted(rows, key=lambda each: each["checks"]) for name, rows in found.items() if len(rows) > 2}
+    first = next(iter(numbers["sets"]), "")
+    failing = [each for rows in found.values() for each in rows if first in each["sets"]]
+    return found if any(np.mean(each["sets"][first]["each"]) < 1.0 for each in failing) else {}
 
 
 def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:

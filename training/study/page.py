@@ -105,6 +105,13 @@ def figure_name(environment: str) -> str:
     return "_".join(["results", *words]).lower() + ".png"
 
 
+def has_figure(numbers: Numbers) -> bool:
+    """Return whether an environment has learning curves, or success by band of an agent."""
+    agents = [each for each in numbers["rows"] if each["kind"] == "agent"]
+    bands = any(found["by_band"] for each in agents for found in each["sets"].values())
+    return bands or any(each.get("curve") for each in agents)
+
+
 def short(environment: str) -> str:
     """Return the name of an environment without namespace and version."""
     return environment.rpartition("/")[2].removesuffix("-v0")
@@ -245,6 +252,7 @@ FUNCTIONS = {
     "by_family": by_family,
     "table": table,
     "figure_name": figure_name,
+    "has_figure": has_figure,
     "BANDS": BANDS,
 }
 """Functions and constants of templates by name."""
