@@ -138,7 +138,9 @@ def _series(numbers: Numbers) -> dict[str, list[Numbers]]:
             continue
         name = each["name"] if each["kind"] == "agent" else each["method"]
         found.setdefault(name, []).append(each)
-    found = {name: sorted(rows, key=lambda each: each["checks"]) for name, rows in found.items() if len(rows) > 2}
+    found = {
+        name: sorted(rows, key=lambda each: each["checks"]) for name, rows in found.items() if len(rows) > 2
+    }
     first = next(iter(numbers["sets"]), "")
     failing = [each for rows in found.values() for each in rows if first in each["sets"]]
     return found if any(np.mean(each["sets"][first]["each"]) < 1.0 for each in failing) else {}
