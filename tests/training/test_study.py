@@ -18,7 +18,7 @@ from viapoint.training.study.results import gather
 ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 SMALL = {
     "seeds": [0, 1],
-    "environments": {ENV: {"n_scenes": 8}},
+    "environments": {ENV: {"n_scenes": 8, "scenes": ["test", "hard"]}},
     "agents": {
         "viaq": {
             "n_timesteps": 64,
