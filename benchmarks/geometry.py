@@ -1,6 +1,6 @@
 """Measure the distances of `viapoint.envs.geometry`: agreement with coal and MuJoCo, and time for each distance.
 
-    OMP_NUM_THREADS=1 python benchmarks/geometry.py --poses 10000
+    OMP_NUM_THREADS=1 python benchmarks/geometry.py --out docs/geometry.json
 
 Rows are shapes, each against spheres and capsules of random sizes and poses. Columns of agreement:
 
@@ -18,7 +18,7 @@ Columns of time, for batches of 10,000 distances, [ns] each:
     engine     this package
     plain      a NumPy expression of the same formula, written out; none for formulas that take a page
     ratio      engine / plain
-    coal       coal.distance in a loop
+    coal       coal.distance in a loop, with the probes' shapes and poses made in Python
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
 import argparse
+import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -314,43 +316,60 @@ def nanoseconds(function: Callable[[], Any], number: int, repeats: int) -> float
     return 1e9 * min(times) / number
 
 
-def speed(kind: str, *, long: bool, repeats: int = 30) -> str:
-    """Return the columns of times."""
+class Speed(NamedTuple):
+    """Times of one distance, [ns]."""
+
+    engine: float
+    plain: float | None
+    coal: float
+
+
+def speed(kind: str, *, long: bool, repeats: int = 30) -> Speed:
+    """Measure the distances of a random shape of a kind from spheres, or from capsules if `long`."""
     generator = np.random.default_rng(0)
     shape = random_shape(kind, generator)
     probes = Probes.around(shape, BATCH, generator, long=long)
     ends = (probes.first, probes.second) if long else (probes.first,)
-    plain = (plain_segment if long else plain_point)(shape)
+    formula: Callable[..., Any] | None = (plain_segment if long else plain_point)(shape)
     ours: Callable[..., Any] = shape.segment_distance if long else shape.distance
     engine = nanoseconds(lambda: ours(*ends), BATCH, repeats)
     few = Probes(*(each[:1000] for each in probes))
     coal = nanoseconds(lambda: coal_distances(shape, few), 1000, 3)
-    if plain is None:
-        return f"{engine:9.1f} {'-':>9s} {'-':>6s} {coal:9.0f}"
-    np.testing.assert_allclose(ours(*ends), plain(*ends), atol=1e-9)  # type: ignore[operator]
-    written = nanoseconds(lambda: plain(*ends), BATCH, repeats)  # type: ignore[operator]
-    return f"{engine:9.1f} {written:9.1f} {engine / written:6.2f} {coal:9.0f}"
+    if formula is None:
+        return Speed(engine, None, coal)
+    np.testing.assert_allclose(ours(*ends), formula(*ends), atol=1e-9)
+    return Speed(engine, nanoseconds(lambda: formula(*ends), BATCH, repeats), coal)
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print both tables, and write them to a file."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--poses", type=int, default=10_000, help="poses of each row; 0 for no agreement")
-    poses = parser.parse_args().poses
+    parser.add_argument("--out", type=Path, help="JSON file of the results")
+    options = parser.parse_args()
     rows = [(kind, long) for kind in SHAPES for long in (False, True)]
-    if poses:
+    found: dict[str, list[dict[str, Any]]] = {"agreement": [], "times": []}
+    if options.poses:
         print(f"{'shape':14s} {'':8s} {'coal':>9s} {'MuJoCo':>9s} {'depth':>9s} contacts wrong through")
-    for kind, long in rows if poses else ():
-        found = agreement(kind, poses, 0, long=long)
+    for kind, long in rows if options.poses else ():
+        agreed, probe = agreement(kind, options.poses, 0, long=long), "capsules" if long else "spheres"
+        found["agreement"].append({"shape": kind, "probe": probe, "poses": options.poses, **agreed._asdict()})
         print(
-            f"{kind:14s} {'capsules' if long else 'spheres':8s} {found.coal:9.1e} {found.mujoco:9.1e} "
-            f"{found.depth:9.1e} {found.contacts:8d} {found.wrong:5d} {found.through:7d}"
+            f"{kind:14s} {probe:8s} {agreed.coal:9.1e} {agreed.mujoco:9.1e} {agreed.depth:9.1e} "
+            f"{agreed.contacts:8d} {agreed.wrong:5d} {agreed.through:7d}"
         )
     print(f"\n{'shape':14s} {'':8s} {'engine':>9s} {'plain':>9s} {'ratio':>6s} {'coal':>9s}")
     for kind, long in rows:
-        print(f"{kind:14s} {'capsules' if long else 'spheres':8s} {speed(kind, long=long)}")
+        took, probe = speed(kind, long=long), "capsules" if long else "spheres"
+        found["times"].append({"shape": kind, "probe": probe, **took._asdict()})
+        plain = f"{'-':>9s} {'-':>6s}"
+        if took.plain is not None:
+            plain = f"{took.plain:9.1f} {took.engine / took.plain:6.2f}"
+        print(f"{kind:14s} {probe:8s} {took.engine:9.1f} {plain} {took.coal:9.0f}")
+    if options.out:
+        options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ SHAPES: dict[str, type[Shape]] = {
 """Shapes by their names in dictionaries."""
 FLAT = 1e-9
 """Greatest height of obstacles in the plane, [m]; rounding of quaternions."""
-ROW_SIZE = len(SHAPES) + 13
-"""Number of values of one obstacle in :func:`observation_rows`."""
+POSE_SIZE = 13
+"""Number of values of one obstacle in :func:`observation_rows` after those of its kind."""
 
 
 def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
@@ -203,7 +203,7 @@ def nearest_distance(
 
 
 def observation_rows(obstacles: Sequence[Shape], n_rows: int) -> Single:
-    """Return obstacles as rows of numbers for networks, shape (n_rows, ROW_SIZE); absent rows are zero.
+    """Return obstacles as rows of numbers for networks, one for each; absent rows are zero.
 
     A row is (shape one-hot, centre 3, rotation 6, half lengths 3, present): the centre and half lengths are those of
     the bounding box along the axes of the shape's frame, [m], and the rotation is the first two axes of the frame (Zhou
@@ -217,11 +217,12 @@ def observation_rows(obstacles: Sequence[Shape], n_rows: int) -> Single:
     """
     if len(obstacles) > n_rows:
         raise ValueError(f"there may be at most {n_rows} obstacles, got {len(obstacles)}")
-    rows, kinds = np.zeros((n_rows, ROW_SIZE), np.float32), list(SHAPES)
+    kinds = list(SHAPES)
+    rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
     for row, each in zip(rows, obstacles, strict=False):
         row[kinds.index(each.kind)] = 1.0
         centre, half = each.box()
-        row[len(SHAPES) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
+        row[len(kinds) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
     return rows
 
 

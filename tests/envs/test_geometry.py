@@ -266,7 +266,9 @@ def test_a_wall_seen_from_above_covers_its_side():
 
 @ALL
 def test_json_keeps_obstacles_as_they_are(kind, generator):
-    shape = random_shape(kind, generator)
+    every = [random_shape(kind, generator) for _ in range(30)]
+    assert obstacles_from_json(obstacles_to_json(every)) == every
+    shape = every[0]
     named = as_obstacle({**shape.to_dict(), "name": "it"})
     assert named.name == "it"
     assert named != shape
