@@ -122,8 +122,8 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
     rows, records = [], {}
     for row in rows_in(study, env):
         wanted = row.described(env)
-        found = _records(study, env, row, sets)
-        new = _measured(study, env, row, found, planner) if all(found.values()) and found else None
+        found = {name: some for name, some in _records(study, env, row, sets).items() if some}
+        new = _measured(study, env, row, found, planner) if found else None
         kept = _kept(old.get(row.id), wanted, same)
         chosen = new if new is not None and (kept is None or _covers(new, kept)) else kept
         if chosen is None:
@@ -197,7 +197,7 @@ def trained(study: Study, env: Environment, agent: Agent) -> list[Cell]:
 def _measured(
     study: Study, env: Environment, row: Row, records: Records, planner: Mapping[str, Numbers]
 ) -> Numbers:
-    """Return the numbers of a row: those of the seeds that are measured on every set."""
+    """Return the numbers of a row: those of the seeds that are measured on all sets on which any is."""
     sets = sets_of(env, row.entry if isinstance(row.entry, Baseline) else None)
     found: Numbers = {}
     if isinstance(row.entry, Agent):
