@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-PATIENCE = 20.0
+PATIENCE = 40.0
 """Time limit of an answer of the browser, [s]."""
 SIZE = 1280, 800
 """Width and height of the window, [pixels]."""

@@ -2,6 +2,7 @@
 
 import json
 import socket
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +14,12 @@ pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 import trimesh
+from viser import transforms
 
+import viapoint.envs as ve
 from viapoint.envs.registration import ENV_IDS
 from viapoint.training import load_agent
+from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.live import drawing, movements, obstacle_editing
@@ -23,6 +27,7 @@ from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
 from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
 from viapoint.training.live.shared import Shared
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 MOVING = "viapoint/PlanarMovingObstacles-v0"
@@ -181,6 +186,40 @@ def test_tubes_are_closed_and_have_their_radius():
     assert solid.volume == pytest.approx(length * octagon, rel=0.02)
 
 
+def test_an_arm_of_ones_own_is_drawn_from_its_file():
+    """The drawn hand is where the arm's hand is, wherever the file puts the arm."""
+    names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+    file = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+    arm = ve.load_arm(file, hand_site="hand", joints=names, home=home, velocity_limit=np.pi)
+    drawn = drawing.ArmDrawing(arm, arm.compile(0, True), file)
+    away = []
+    for hand in np.random.default_rng(0).uniform(*arm.workspace, (8, 3)):
+        corners = [
+            transforms.SO3(turn).as_matrix() @ np.asarray(part.mesh.vertices).T + place[:, None]
+            for (turn, place), part in zip(
+                drawn.poses(arm.inverse_kinematics(hand)), drawn.parts, strict=True
+            )
+        ]
+        away.append(np.linalg.norm(np.concatenate(corners, axis=1).T - hand, axis=-1).min())
+    assert max(away) < 0.08
+    np.testing.assert_allclose(away, away[0], atol=1e-6)  # the hand does not move in its link
+    with pytest.raises(ValueError, match="cannot be drawn"):
+        drawing.ArmDrawing(arm, arm.compile(0, True), file.with_name("index.md"))
+
+
+def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
+    env_id = "viapoint/PlanarObstaclesStep-v0"
+    agent = SAC("MultiInputPolicy", ViaVecEnv(env_id, num_envs=1), buffer_size=2, seed=0)
+    some = Shared(env_id, agent, model_file=None, seed=0, env_kwargs={})
+    scene, env = some.scene_kinds()["Random"](), some.make_step_env()
+    (segment,) = movements.execute_stepwise(env, agent, scene)
+    assert env.terminated[0] or env.truncated[0]
+    np.testing.assert_allclose(segment.hand[0], scene.start, atol=0.01)
+    assert len(segment.time) == len(segment.hand) == len(segment.path)
+    assert some.decisions.choose(some.make_env().reset(seed=0)[0]).maker.startswith("search")
+
+
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA, MOVING])
 def test_python_code_sets_the_scene_up(env_id, shared):
     some = shared(env_id)
@@ -202,9 +241,13 @@ def test_python_code_sets_the_scene_up(env_id, shared):
         ({"goal": [0.1, float("nan")]}, "goal of the scene file"),
         ({"goal": None}, "goal of the scene file"),
         ({"obstacles": 3}, "must be a list"),
-        ({"obstacles": [3]}, "obstacle 0 of the scene file must be an object"),
-        ({"obstacles": [{"shape": "cube"}]}, "shape capsule"),
-        ({"obstacles": [{"shape": "capsule", "position": [0, 0], "radius": "x"}]}, "obstacle 0: radius"),
+        ({"obstacles": [3]}, "obstacle 0 of the scene file"),
+        ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
+        ({"obstacles": [{"shape": "sphere", "radius": "x"}]}, "obstacle 0 of the scene file"),
+        ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
+        ({"obstacles": [{"shape": "box", "size": [0.1, 0.1, 0.1]}]}, "spheres and capsules, got a box"),
+        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane z = 0"),
+        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "obstacle 0: course"),
         ({"jumps": [[1.0]]}, "jumps"),
     ],
 )

@@ -21,8 +21,6 @@ PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v
 MESSAGE = "#viapoint-message"
 SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
 """Displacements, [m]."""
-READY = 10.0
-"""Time in which a page must be ready, [s]."""
 UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
 """Message of the library's client at every press on something that can be dragged; it changes nothing."""
 
@@ -46,10 +44,10 @@ def opened(browser):
     def tab(page):
         before = set(page.sessions)
         tabs.append(browser.tab(page.url))
-        (session,) = wait_for(lambda: set(page.sessions) - before, READY)
-        wait_for(lambda: session.idle and session.proposal is not None, READY)
-        wait_for(lambda: "plan" in tabs[-1].text(MESSAGE), READY)
-        wait_for(lambda: steady(tabs[-1]), READY)
+        (session,) = wait_for(lambda: set(page.sessions) - before)
+        wait_for(lambda: session.idle and session.proposal is not None)
+        wait_for(lambda: "plan" in tabs[-1].text(MESSAGE))
+        wait_for(lambda: steady(tabs[-1]))
         return tabs[-1], session
 
     yield page, tab
@@ -164,14 +162,18 @@ def test_tabs_are_independent_and_leave_nothing_behind(opened):
 def test_a_goal_is_dragged_while_the_arm_moves(opened):
     open_page, open_tab = opened
     tab, session = open_tab(open_page(REPLANNING))
-    goal = session.scene.goal
-    aside = goal + ASIDE
-    tab.press("button", "Execute")
-    wait_for(lambda: not session.idle)
-    drag(tab, session, goal, aside)
-    wait_for(lambda: "Success" in tab.text(MESSAGE))
-    assert np.linalg.norm(session.scene.goal - aside) < 0.01
+    for attempt in range(4):  # on a busy machine the movement may be over before the goal is dragged
+        goal = session.scene.goal
+        aside = goal + (ASIDE, -ASIDE)[attempt % 2]
+        tab.press("button", "Execute")
+        wait_for(lambda: not session.idle)
+        drag(tab, session, goal, aside, steps=3)
+        settled(session)
+        assert np.linalg.norm(session.scene.goal - aside) < 0.01
+        if "Success" in tab.text(MESSAGE):
+            break
     hand = np.concatenate([each.hand for each in session.movement])
+    assert "Success" in tab.text(MESSAGE)
     assert np.linalg.norm(hand[-1] - session.scene.goal) < 0.01
     time_ = np.concatenate([each.time for each in session.movement])
     speed = np.diff(hand, axis=0) / np.diff(time_)[:, None]

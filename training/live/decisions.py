@@ -125,7 +125,7 @@ class DecisionMaker:
             )
         seconds = time.perf_counter() - begin
         action = np.asarray(action, dtype=np.float32)
-        (chosen,) = self._proposals(observation, task, action[None], maker)
+        (chosen,) = _computed_proposals(observation, task, action[None])
         return Decision(chosen, action, maker, seconds, task, considered)
 
     def action(self, observation: Observation, checks: int = 0) -> Float:

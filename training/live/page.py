@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
+import torch
 import viser
 
 from viapoint.envs.registration import check_registered
@@ -117,8 +118,8 @@ class LivePage:
 
 def run(config: Any) -> None:
     """Serve the live page until Ctrl-C; see :class:`LivePage`."""
-    agent = config.agent
-    with LivePage(agent, env=config.env, host=config.host, port=config.port, seed=config.seed) as page:
+    torch.set_num_threads(1)  # decisions are small, and the page has threads of its own
+    with LivePage(config.agent, env=config.env, host=config.host, port=config.port, seed=config.seed) as page:
         if not is_loopback(config.host):
             print(
                 f"viapoint: warning: {config.host} lets other machines on the network use this page; "

@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shapes import as_obstacle
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 
@@ -16,6 +20,8 @@ FORMAT = "viapoint-scene"
 """Value of the key `format` of a scene file."""
 LARGEST_FILE = 1 << 20
 """Greatest size of a scene file, [bytes]."""
+FLAT = 1e-6
+"""Greatest height of an obstacle of a planar arm, [m]."""
 DIGITS = 6
 """Decimal places of coordinates in files and in code, [m]."""
 
@@ -90,12 +96,10 @@ def to_json(scene: LiveScene, env_id: str) -> str:
         >>> from_json(to_json(scene, "viapoint/PlanarObstacles-v0"), dimension=2).goal.tolist()
         [0.1, 0.4]
     """
-    d = len(scene.start)
     record: dict[str, Any] = {"format": FORMAT, "env": env_id}
     record |= {"start": _rounded(scene.start), "goal": _rounded(scene.goal), "obstacles": []}
     for row, course in zip(scene.obstacles, scene.courses, strict=True):
-        one: dict[str, Any] = {"shape": "capsule", "position": _rounded(row[:d])}
-        one |= {"half_axis": _rounded(row[d : 2 * d]), "radius": _rounded(row[-1])}
+        one = shape_of(row).to_dict()
         if course.any():
             one["course"] = _rounded(course)
         record["obstacles"].append(one)
@@ -150,22 +154,36 @@ def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, c
     return "\n".join(lines) + "\n"
 
 
+def shape_of(row: Float) -> Shape:
+    """Return the shape of an obstacle, from its row of centre (D), half-axis (D) and radius, [m]."""
+    d = (len(row) - 1) // 2
+    centre, half, radius = row[:d], row[d : 2 * d], float(row[-1])
+    if half.any():
+        return Capsule.between(centre - half, centre + half, radius)
+    return Sphere(radius, position=in_space(centre))
+
+
+def _row_of(shape: Shape, dimension: int) -> Float:
+    """Return the row of a shape that environments can have."""
+    half = shape.half_axis if isinstance(shape, Capsule) else np.zeros(3)
+    if not isinstance(shape, Sphere | Capsule):
+        raise ValueError(f"environments have spheres and capsules, got a {shape.kind}")
+    if dimension == 2 and (abs(shape.position[2]) > FLAT or abs(half[2]) > FLAT):
+        raise ValueError(f"obstacles of a planar arm lie in the plane z = 0, got {shape.to_dict()}")
+    return np.array([*shape.position[:dimension], *half[:dimension], shape.radius], dtype=np.float64)
+
+
 def _obstacle(i: int, record: Any, dimension: int) -> tuple[Float, Float]:
     """Return row and course of an obstacle of a file."""
-    name = f"obstacle {i}"
-    if not isinstance(record, Mapping):
-        raise ValueError(f"{name} of the scene file must be an object, got {record!r:.60}")
-    if record.get("shape") != "capsule":
-        raise ValueError(
-            f"{name} of the scene file must have the shape capsule, got {record.get('shape')!r:.60}"
-        )
-    centre = _numbers(f"{name}: position", record.get("position"), (dimension,))
-    half = _numbers(f"{name}: half_axis", record.get("half_axis", [0.0] * dimension), (dimension,))
-    radius = _numbers(f"{name}: radius", record.get("radius"), ())
-    course = _numbers(
-        f"{name}: course", record.get("course", [0.0] * (2 * dimension + 1)), (2 * dimension + 1,)
-    )
-    return np.array([*centre, *half, float(radius)]), course
+    course, rest = None, record
+    if isinstance(record, Mapping):
+        course, rest = record.get("course"), {name: v for name, v in record.items() if name != "course"}
+    try:
+        row = _row_of(as_obstacle(rest), dimension)
+    except ValueError as error:
+        raise ValueError(f"obstacle {i} of the scene file: {error}") from None
+    size = 2 * dimension + 1
+    return row, _numbers(f"obstacle {i}: course", np.zeros(size) if course is None else course, (size,))
 
 
 def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Float:

@@ -29,6 +29,8 @@ RADII = {"start": 0.012, "goal": 0.017, "via": 0.012}
 """Radii of the handles, [m]."""
 OPACITY = 0.45
 """Opacity of a planar arm, which hides what is below it."""
+GRID = 0.1
+"""Distance of the lines on the table, [m]."""
 LEVEL = 0.0
 """Height of paths in the plane, [m]."""
 PLANAR_LIMITS, SPATIAL_LIMITS = (-0.75, 0.75), (-0.95, 0.95)
@@ -194,12 +196,19 @@ class SceneView:
         scene, planar = self._client.scene, self._planar
         centre = (-0.03, 0.35) if planar else (0.35, 0.0)
         width, depth = (1.7, 1.5) if planar else (1.4, 1.6)
-        grey = (208, 208, 211)
-        scene.add_grid(
-            "/table", width=width, height=depth, cell_size=0.1, section_size=0.1, cell_color=grey, plane="xy",
-            section_color=grey, section_thickness=1.5, position=(*centre, self._floor), shadow_opacity=0.0,
-            plane_color=_rgb(PALETTE.table), plane_opacity=1.0,
+        scene.add_box(
+            "/table", dimensions=(width, depth, 0.01), color=_rgb(PALETTE.table), cast_shadow=False,
+            receive_shadow=False, position=(*centre, self._floor - 0.008),
         )  # fmt: skip
+        ends = [
+            ((x, -depth / 2, 0.0), (x, depth / 2, 0.0)) for x in np.arange(-width / 2, width / 2 + 1e-9, GRID)
+        ]
+        ends += [
+            ((-width / 2, y, 0.0), (width / 2, y, 0.0)) for y in np.arange(-depth / 2, depth / 2 + 1e-9, GRID)
+        ]
+        scene.add_line_segments(
+            "/grid", np.array(ends), (214, 214, 218), thickness=0.0016, position=(*centre, self._floor)
+        )
 
     def _add_arm(self) -> None:
         opacity = OPACITY if self._planar else None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.scene import problems
+from viapoint.envs.scenes.scene import Scenes, problems
 from viapoint.training.live.comparison import MethodResult
 from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
 from viapoint.training.live.job_thread import Job, JobThread
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
     from viapoint.training.live.shared import Shared
 
+LATENCIES = 200
+"""Changes whose latency is kept."""
 FADE_EVERY = 0.08
 """Time between two steps of fading, [s]."""
 
@@ -65,8 +68,8 @@ class Session:
         self._next_picture = self._next_fade = 0.0
         self.decisions = 0
         """Number of decisions so far."""
-        self.latency = 0.0
-        """Time from the last change to its picture, on the side of the server, [s]."""
+        self.latencies: deque[float] = deque(maxlen=LATENCIES)
+        """Times from the last changes to the messages with their plans, [s]."""
         self._fading = False
         self._envs: tuple[Any, ...] = ()
         self._jobs = JobThread(
@@ -281,8 +284,12 @@ class Session:
         for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
             if wrong.any():
                 raise ValueError(reason(0))
-        observation, _ = self._env.reset(options=scene.options(changing=self._task.replanning))
-        return observation
+        if self._task.replanning:
+            return self._env.reset(options=scene.options(changing=True))[0]
+        joints, rows = np.asarray(self._task.arm.inverse_kinematics(scene.start[None])), scene.batch()
+        missing = self._task.observation.n_rows - rows.obstacles.shape[1]
+        obstacles = np.pad(rows.obstacles, ((0, 0), (0, missing), (0, 0)))
+        return self._task.observation.observe(joints, rows.start, Scenes(rows.start, rows.goal, obstacles))
 
     def _decide(self, begin: float) -> None:
         """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
@@ -310,7 +317,7 @@ class Session:
         self._show_plan()
         self._client.flush()
         self.decisions += 1
-        self.latency = time.perf_counter() - begin
+        self.latencies.append(time.perf_counter() - begin)
         self.post("later proposals", lambda: self._add_proposals(observation, decision))
 
     def _show_plan(self) -> None:

@@ -1,0 +1,53 @@
+"""Time from a change on the live page to the message with the new plan: `python benchmarks/live.py`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from viapoint.training.live.page import LivePage
+
+INWARDS = {
+    "viapoint/PlanarObstacles-v0": (-0.05, 0.38),
+    "viapoint/PlanarWholeArm-v0": (-0.05, 0.38),
+    "viapoint/PandaObstacles-v0": (0.5, 0.0),
+}
+"""Environments, and a place in the middle of their workspace, [m]."""
+DRAGS, STEPS = 4, 10
+"""Number of drags, and of positions in each."""
+DISTANCE = 0.03
+"""Length of a drag along each horizontal axis, [m]."""
+
+
+def main() -> None:
+    """Drag the goal to and fro in a headless Chromium, and print the latencies of the server."""
+    sys.path.append(str(Path(__file__).parents[1] / "tests" / "training"))
+    import browser
+    from test_live_page import drag, steady
+
+    window = browser.Browser()
+    print("environment, changes, median [ms], 95 % [ms]")
+    for env_id, middle in INWARDS.items():
+        with LivePage(env_id, port=0, seed=3) as page:
+            tab = window.tab(page.url)
+            (session,) = browser.wait_for(lambda page=page: page.sessions)
+            browser.wait_for(lambda s=session: s.idle and s.proposal)
+            browser.wait_for(lambda t=tab: steady(t))
+            goal = session.scene.goal
+            other = goal.copy()
+            other[:2] += DISTANCE * np.sign(middle - goal[:2])
+            for k in range(DRAGS):
+                drag(tab, session, session.scene.goal, (other, goal)[k % 2], steps=STEPS)
+                time.sleep(0.3)
+                browser.wait_for(lambda s=session: s.idle)
+            taken = 1e3 * np.array(session.latencies)
+            print(f"{env_id}, {len(taken)}, {np.median(taken):.0f}, {np.quantile(taken, 0.95):.0f}")
+            tab.close()
+    window.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Pictures of the live page for README and docs/live.md, from a headless Chromium."""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from pathlib import Path
+
+from matplotlib.font_manager import findfont
+from PIL import Image, ImageDraw, ImageFont
+
+from viapoint.training.live.page import LivePage
+
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "docs" / "images"
+SIZE = 1320, 850
+"""Size of the window, [pixels]."""
+LEFT, RIGHT = 352, 988
+"""Columns of the numbers beside the panels, [pixels]."""
+PANELS = (
+    (LEFT, 150),
+    (LEFT, 270),
+    (LEFT, 550),
+    (RIGHT, 122),
+    (RIGHT, 170),
+    (RIGHT, 255),
+    (RIGHT, 365),
+    (RIGHT, 500),
+)
+"""Places of the numbers of the panels' parts, [pixels]."""
+ASIDE = 24
+"""Distance of a number from what it marks in the scene, [pixels]."""
+
+
+def main() -> None:
+    """Write both pictures."""
+    sys.path.append(str(ROOT / "tests" / "training"))
+    import browser
+    from test_live_page import on_screen
+
+    browser.SIZE = SIZE
+    window = browser.Browser()
+    with LivePage("viapoint/PandaObstacles-v0", port=0, seed=3) as page:
+        tab = window.tab(page.url)
+        tab.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=SIZE[0],
+            height=SIZE[1],
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        (session,) = browser.wait_for(lambda: page.sessions)
+        browser.wait_for(lambda: session.idle and session.proposal)
+        tab.run(
+            "document.querySelectorAll('.mantine-Notification-closeButton').forEach(each => each.click())"
+        )
+        time.sleep(2.0)
+        via = on_screen(tab, session, session.proposal.plan.waypoints[1])
+        obstacle = on_screen(tab, session, session.scene.obstacles[0, :3])
+        plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
+    window.close()
+    plain.save(IMAGES / "live.webp", quality=82, method=6)
+    marked, font = plain.copy(), ImageFont.truetype(findfont("DejaVu Sans:bold"), 15)
+    draw = ImageDraw.Draw(marked)
+    for number, place in enumerate((*PANELS, *((x + ASIDE, y + ASIDE) for x, y in (via, obstacle))), start=1):
+        draw.circle(place, 12, fill=(20, 33, 69), outline="white", width=2)
+        draw.text(place, str(number), fill="white", font=font, anchor="mm")
+    marked.save(IMAGES / "live_annotated.webp", quality=82, method=6)
+
+
+if __name__ == "__main__":
+    main()
