@@ -4,10 +4,12 @@ import json
 import re
 import shlex
 import sys
+import threading
 from pathlib import Path
 
 import optuna
 import pytest
+from filelock import FileLock
 from optuna.trial import TrialState
 
 from viapoint.training import TrainConfig
@@ -219,6 +221,24 @@ def test_a_run_that_had_ended_is_not_trained_again(tmp_path, trainings):
     assert tuning.best.value == 10.0 * taken.trial.params["learning_rate"]
 
 
+def test_an_earlier_attempt_may_still_be_writing_its_checkpoint(tmp_path, trainings, monkeypatch):
+    config = search().training({"learning_rate": 1e-3}, 0, tmp_path / "run")
+    Run.create(resolved(config))
+    train, lock = module.train, FileLock(tmp_path / "run" / "lock", thread_local=False)
+    lock.acquire()
+    held = []
+    monkeypatch.setattr(module, "train", lambda *each: (held.append(lock.is_locked), train(*each))[1])
+    ending = threading.Timer(0.2, lock.release)
+    ending.start()
+    module._train(config, None)
+    assert held == [False]
+    (tmp_path / "run" / "final").rmdir()
+    lock.acquire()
+    monkeypatch.setattr(module, "SAVING_TIME", 0.1)
+    module._train(config, None)  # which raises the error that names the other process
+    assert held == [False, True]
+
+
 def test_trials_of_living_processes_are_neither_repeated_nor_exceeded(tmp_path, trainings):
     one = Tuning.create(tmp_path / "a", search(trials=3))
     two = Tuning.create(tmp_path / "a", search(trials=3))
@@ -326,6 +346,10 @@ def test_the_command_trains_reports_and_names_a_command_that_trains_the_best(tmp
     }
     assert (tmp_path / "out" / "curves.png").stat().st_size > 1000
     assert not list((tmp_path / "out" / "trials").glob("*/*/checkpoints"))
+    first, second = read_json(tmp_path / "out" / "trials.json")["trials"]
+    assert first["parameters"]["policy_kwargs.net_arch"] in ([8], [8, 8])
+    assert first["validation"].keys() == {"64", "96"}
+    assert (second["state"], len(second["scores"])) == ("complete", 1)
 
 
 def test_the_important_parameter_is_found(tmp_path, trainings):

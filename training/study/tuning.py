@@ -4,6 +4,7 @@ tuning.json       description of the search and version of the package
 journal.log       trials: Optuna's journal, to which every process appends
 trials/<number>/  run folders of each trial, one for each seed; trials/<number>.lock while a process works on it
 report.md         table of trials, importance of parameters, counts of pruned trials
+trials.json       all trials as plain values
 best.json         configuration of the best trial, as TrainConfig.from_json reads it
 curves.png        learning curves
 
@@ -13,11 +14,11 @@ process recognises an abandoned trial, marks it as failed and repeats it: its tr
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,8 @@ from viapoint.training.study.runner import Job, make_runner
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace, stored
 from viapoint.training.study.tuning_report import best_training, write_report
 
+SAVING_TIME = 60.0
+"""Time that an abandoned training has to write its checkpoint and end, [s]."""
 MOST_REPEATS = 3
 """Number of times that a trial is repeated whose process ends without a result."""
 
@@ -339,6 +342,9 @@ def _train(config: TrainConfig, callback: BaseCallback | None) -> Run:
         if run.curve and run.curve[-1]["decisions"] >= config.total_timesteps:
             return run
     resume = (config.folder / "config.json").is_file()
+    if resume:  # the process of the earlier attempt may still write its checkpoint
+        with contextlib.suppress(Timeout), FileLock(config.folder / "lock", timeout=SAVING_TIME):
+            pass
     return train(dataclasses.replace(config, resume=resume), callback)
 
 
@@ -361,6 +367,7 @@ class PruningCallback(BaseCallback):
         """Report the validations of a learning curve that were not reported before."""
         for record in curve[self._reported :]:
             step = record["decisions"] // self.every * self.every
+            step = record["decisions"] if step in self._steps else step  # the last one
             if step and step not in self._steps:
                 self.trial.report(record["success"]["rate"], step)
                 self._steps.add(step)
@@ -394,7 +401,7 @@ def check_models(search: SearchSpace) -> None:
                 raise ValueError(f"{config.algo} cannot be made with {shown}: {error}") from None
 
 
-@contextmanager
+@contextlib.contextmanager
 def _environment(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[ViaVecEnv]:
     try:
         env = ViaVecEnv(env_id, 1, **env_kwargs)

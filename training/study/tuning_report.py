@@ -43,14 +43,28 @@ class Results(Protocol):
 
 
 def write_report(tuning: Results) -> Path:
-    """Write `report.md`, `curves.png` and, if a trial is finished, `best.json`; return the path of the report."""
+    """Write `report.md`, `trials.json`, `curves.png` and, if a trial is finished, `best.json`; return the first."""
     best = tuning.best
     if best is not None:
         write_json(tuning.folder / "best.json", best_training(tuning, best).as_json())
+    write_json(tuning.folder / "trials.json", {"trials": [_record(each) for each in tuning.trials]})
     draw_curves(tuning, tuning.folder / "curves.png")
     path = tuning.folder / "report.md"
     write_bytes(path, report(tuning).encode())
     return path
+
+
+def _record(trial: FrozenTrial) -> dict[str, Any]:
+    """Return a trial as plain values."""
+    return {
+        "number": trial.number,
+        "state": trial.state.name.lower(),
+        "parameters": {name: plain(value) for name, value in trial.params.items()},
+        "scores": trial.user_attrs.get("scores", []),
+        "validation": {str(step): rate for step, rate in sorted(trial.intermediate_values.items())},
+        "seconds": round(trial.duration.total_seconds(), 1) if trial.duration else None,
+        **({"error": trial.user_attrs[ERROR]} if ERROR in trial.user_attrs else {}),
+    }
 
 
 def best_training(tuning: Results, best: FrozenTrial) -> TrainConfig:
@@ -183,4 +197,4 @@ def draw_curves(tuning: Results, path: Path) -> None:
     if handles:
         axes.legend(handles.values(), handles.keys(), frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=110)
