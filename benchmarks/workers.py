@@ -2,7 +2,8 @@
 
     python benchmarks/workers.py --json docs/vectorized.json
 
-takes about two minutes on two idle cores. The predictions for more cores are those of the model on docs/vectorized.md.
+takes about two minutes on two idle cores. Parts of a step are processor times, which other load hardly changes.
+The predictions for more cores are those of the model on docs/vectorized.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.worker_process import WorkerProcess
 from viapoint.training import RayVecEnv, ViaVecEnv
 
 ENVS = ("viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0")
@@ -36,7 +36,7 @@ print(count)
 
 
 def measured(env_id: str, num_envs: int, repeats: int) -> dict[str, Any]:
-    """Return decisions per second of each way, and the parts of a step, [s]."""
+    """Return decisions per second of each way, and the parts of a step in processor time, [s]."""
     envs = {
         **{f"threads={k}": gym.make_vec(env_id, num_envs=num_envs, threads=k) for k in (1, 2)},
         **{f"workers={w}": gym.make_vec(env_id, num_envs=num_envs, workers=w, threads=1) for w in (1, 2)},
@@ -50,23 +50,22 @@ def measured(env_id: str, num_envs: int, repeats: int) -> dict[str, Any]:
         env.reset() if isinstance(env, ViaVecEnv) else env.reset(seed=0)
         env.step(actions[0])
     physics = timed(envs["threads=1"].unwrapped._simulator, "rollout")
-    waits = {w: timed_waits(envs[f"workers={w}"]) for w in (1, 2)}
     times: dict[str, list[float]] = {name: [] for name in envs}
+    busy: dict[str, list[float]] = {name: [] for name in envs}
     free = []
     for action in actions[1:]:  # equal seeds: all ways have the same scenes
         free.append(free_cores())
         for name, env in envs.items():
-            began = time.perf_counter()
+            began, worked = time.perf_counter(), time.thread_time()
             env.step(action)
+            busy[name].append(time.thread_time() - worked)
             times[name].append(time.perf_counter() - began)
     step = {name: float(np.median(each)) for name, each in times.items()}
-    serial = {
-        w: float(np.median(np.subtract(times[f"workers={w}"], waits[w].of_each(repeats)))) for w in waits
-    }
+    engine = float(np.median(physics.of_each(repeats)))
     parts = {
-        "engine": float(np.median(physics.of_each(repeats))),
-        "python": step["threads=1"] - float(np.median(physics.of_each(repeats))),
-        "serial": serial[2],
+        "engine": engine,
+        "python": float(np.median(busy["threads=1"])) - engine,
+        "serial": float(np.median(busy["workers=2"])),
         "message": message_time(envs["workers=2"]),
         "infos of SB3": infos_time(envs["ViaVecEnv, workers=2"], actions[0]),
     }
@@ -94,26 +93,26 @@ def free_cores() -> float:
 
 
 class Stopwatch:
-    """Sum of the times of a function's calls, [s], in the order of the calls."""
+    """Processor times of the calls of a function, [s]."""
 
     def __init__(self) -> None:
-        self.spans: list[tuple[float, float]] = []
+        self.spans: list[float] = []
 
     def wrap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the function with a clock."""
 
         def clocked(*args: Any, **kwargs: Any) -> Any:
-            began = time.perf_counter()
+            began = time.thread_time()
             try:
                 return function(*args, **kwargs)
             finally:
-                self.spans.append((began, time.perf_counter() - began))
+                self.spans.append(time.thread_time() - began)
 
         return clocked
 
     def of_each(self, steps: int) -> list[float]:
         """Return the sums in each of the last steps, which have equally many calls."""
-        return np.array([each for _, each in self.spans]).reshape(steps, -1).sum(axis=1).tolist()
+        return np.array(self.spans).reshape(steps, -1).sum(axis=1).tolist()
 
 
 def timed(owner: Any, name: str) -> Stopwatch:
@@ -123,25 +122,6 @@ def timed(owner: Any, name: str) -> Stopwatch:
     return watch
 
 
-def timed_waits(env: Any) -> Stopwatch:
-    """Clock the time in which the parent waits for its workers."""
-    watch = Stopwatch()
-    for worker in env.unwrapped._workers:
-        assert isinstance(worker, WorkerProcess)
-        worker._connection = Clocked(worker._connection, watch)
-    return watch
-
-
-class Clocked:
-    """Connection whose `recv` is clocked."""
-
-    def __init__(self, connection: Any, watch: Stopwatch) -> None:
-        self._connection, self.recv = connection, watch.wrap(connection.recv)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._connection, name)
-
-
 def message_time(env: Any) -> float:
     """Return the time of a question to one worker and its answer, [s]."""
     times = []
@@ -149,7 +129,7 @@ def message_time(env: Any) -> float:
         began = time.perf_counter()
         env.unwrapped.get_attr("num_envs")
         times.append(time.perf_counter() - began)
-    return float(np.median(times)) / env.unwrapped.n_workers
+    return float(np.min(times)) / env.unwrapped.n_workers
 
 
 def infos_time(env: ViaVecEnv, actions: Any) -> float:
@@ -158,9 +138,9 @@ def infos_time(env: ViaVecEnv, actions: Any) -> float:
     step = inner.step(actions)
     env.venv = type("Replay", (), {"step": staticmethod(lambda _: step)})()
     for _ in range(20):
-        began = time.perf_counter()
+        began = time.thread_time()
         env.step(actions)
-        times.append(time.perf_counter() - began)
+        times.append(time.thread_time() - began)
     env.venv = inner
     return float(np.median(times))
 

@@ -337,7 +337,7 @@ class _NativeRayVecEnv(ViaVecEnv, RayVecEnv):
     @property
     def restarts(self) -> int:
         """Number of actors that died and were replaced."""
-        return int(self.venv.restarts)
+        return int(self.venv.unwrapped.restarts)
 
     def close(self) -> None:
         """End the actors."""
