@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from viapoint.training.algorithms.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
+    from viapoint.training.live.page import LivePage
     from viapoint.training.rollouts.ray_vec_env import LostEpisodesCallback, RayVecEnv
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
@@ -30,6 +31,7 @@ else:
         "LostEpisodesCallback": "viapoint.training.rollouts.ray_vec_env",
         "ObserveCandidates": "viapoint.training.search.observe_candidates",
         "RayVecEnv": "viapoint.training.rollouts.ray_vec_env",
+        "LivePage": "viapoint.training.live.page",
         "Run": "viapoint.training.runs.run_dir",
         "SceneExtractor": "viapoint.training.algorithms.extractors",
         "Study": "viapoint.training.study.config",
@@ -58,6 +60,7 @@ __all__ = [
     "ElapsedTimeCallback",
     "EvaluationResult",
     "GeometrySearch",
+    "LivePage",
     "LostEpisodesCallback",
     "ObserveCandidates",
     "RayVecEnv",

@@ -43,6 +43,12 @@ class LivePage:
     Raises:
         ValueError: The agent cannot be loaded, or an argument is not allowed.
         OSError: The port is occupied, or the address is not one of this machine.
+
+    Example:
+        >>> from viapoint.training import LivePage
+        >>> with LivePage("viapoint/PlanarObstacles-v0", port=0) as page:
+        ...     page.url.rpartition(":")[0]  # page.wait() would serve it until Ctrl-C
+        'http://127.0.0.1'
     """
 
     def __init__(
