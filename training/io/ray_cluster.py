@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from viapoint.training.io.installed import installed
@@ -23,11 +24,19 @@ def import_ray() -> Any:
     """
     for name, value in SILENCE.items():
         os.environ.setdefault(name, value)
+    if _has_token():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")  # a driver sends no token without it
     try:
         import ray
     except ImportError:
         raise ImportError("Ray is not installed: pip install 'viapoint[cluster]'", name="ray") from None
     return ray
+
+
+def _has_token() -> bool:
+    """Return whether this machine has a token for clusters, in one of the places where Ray looks for it."""
+    path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token"
+    return bool(os.environ.get("RAY_AUTH_TOKEN")) or Path(path).is_file()
 
 
 def connect(address: str | None = None, cpus: int | None = None) -> bool:
