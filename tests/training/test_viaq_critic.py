@@ -19,7 +19,7 @@ import viapoint.envs.sim.outcome
 import viapoint.training.search.geometry_search
 import viapoint.training.search.plan_checks
 from viapoint.envs.registration import TASKS
-from viapoint.training.algorithms import viaq_policy
+from viapoint.training.algorithms import pair_networks, viaq_policy
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
 from viapoint.training.algorithms.pair_networks import PART, PairMinimum, Poses, cut_obstacles, pair_features
 from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
@@ -27,6 +27,7 @@ from viapoint.training.algorithms.viaq import ViaQ
 from viapoint.training.algorithms.viaq_critic import Values, _Saturated
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 from viapoint.training.search.candidates import best_duration, candidate_actions
+from viapoint.training.search.geometry_search import score_plans
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",
@@ -82,6 +83,28 @@ def test_nothing_is_learned_or_decided_from_the_geometry_of_obstacles(env_id, mo
     model.policy.checks = 4
     with pytest.raises(AssertionError, match="geometry"):
         model.predict(observation)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", [WHOLE, MOVING])
+@pytest.mark.parametrize("checks", [1, 3, 11, 64])
+def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(env_id, checks, monkeypatch):
+    model, env = small(env_id)
+    observation, scored = env.reset(), []
+
+    def score(observation, actions, task, margins):
+        merits = score_plans(observation, actions, task, margins)
+        scored.append((actions, merits))
+        return merits
+
+    monkeypatch.setattr(viaq_policy, "score_plans", score)
+    model.policy.checks = checks
+    decided = model.policy.decide(observation)
+    actions, merits = (np.concatenate(each, axis=1) for each in zip(*scored, strict=True))
+    assert actions.shape[1] == min(checks, 48)  # there are 48 candidates
+    np.testing.assert_array_equal(decided, actions[np.arange(8), merits.argmax(axis=1)])
+    if env_id == MOVING:  # the plan under way is among them
+        assert (actions == 0.0).all(axis=-1).any(axis=1).all()
     env.close()
 
 
@@ -166,6 +189,28 @@ def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles():
     expected = torch.stack(single).amin(dim=0)
     assert torch.allclose(whole[:3], expected[:3], atol=1e-5)
     assert (whole[3] == 1.0).all()
+
+
+@pytest.mark.parametrize("bodies", [0, 2])
+def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_minimum(bodies, monkeypatch):
+    poses, rows, _ = scene(bodies=max(bodies, 1))
+    poses = poses._replace(half_length=torch.tensor([0.1, 0.2]), radius=torch.tensor([0.03, 0.05]))
+    if not bodies:
+        poses = Poses(poses.centre, None, poses.time)
+    network = PairMinimum(3, bodies, 8)
+    present = np.array([[True, True, True], [True, False, True], [False, True, False], [False, False, False]])
+    velocity = np.random.default_rng(1).uniform(-0.2, 0.2, (4, 3, 3))
+    for moving in (None, velocity):
+        parts = cut_obstacles(rows, present, moving)
+        with torch.no_grad():
+            whole = network(poses, parts)
+        least = []
+        for near in (0.0, 0.12, np.inf):
+            monkeypatch.setattr(pair_networks, "NEAR", near)
+            least.append(network.of_near_pairs(poses, parts))
+            assert (least[-1] >= whole - 1e-6).all()
+        assert not bodies or (least[0] > whole + 1e-3).any()  # one pair of links is not enough
+        assert torch.allclose(least[-1], whole, atol=1e-6)
 
 
 def test_only_what_was_carried_out_counts_where_one_says_until_when():

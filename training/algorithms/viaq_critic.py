@@ -132,11 +132,18 @@ class ViaQCritic(nn.Module):
         )
         """w_s, w_c, w_g and w_m, initialised from the reward weights and adapted to the rewards."""
 
-    def forward(self, inputs: PlanInputs) -> Values:
-        """Return the predictions for each plan."""
+    def forward(self, inputs: PlanInputs, *, near: bool = False) -> Values:
+        """Return the predictions for each plan.
+
+        Args:
+            inputs: Inputs of the plans.
+            near: Evaluate near pairs only, see :meth:`PairMinimum.of_near_pairs`; without gradients.
+        """
         ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         plan = torch.cat((ends, inputs.actions), dim=-1)
-        if self.form == "places":
+        if self.form == "places" and near:
+            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts)
+        elif self.form == "places":
             margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
         else:
             margin = self._of_actions(plan, inputs.scene)

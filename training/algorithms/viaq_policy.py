@@ -18,10 +18,19 @@ from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
 from viapoint.training.algorithms.pair_networks import Poses, cut_obstacles
-from viapoint.training.algorithms.viaq_critic import Form, PlanInputs, Pooling, SceneInputs, ViaQCritic
+from viapoint.training.algorithms.viaq_critic import (
+    Form,
+    PlanInputs,
+    Pooling,
+    SceneInputs,
+    ViaQCritic,
+)
 from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import score_plans
-from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
+from viapoint.training.search.plan_checks import (
+    CLEARANCE_MARGIN,
+    REACH_MARGIN,
+)
 from viapoint.training.search.planned_movements import (
     Observation,
     direction,
@@ -179,15 +188,22 @@ class ViaQPolicy(BasePolicy):
         observation: Observation,
         actions: Numbers,
         scene: SceneInputs | None = None,
-        shares: Numbers | None = None,
+        *,
+        coarse: bool = False,
     ) -> Numbers:
         """Return the ranking criterion of H actions in each of B scenes, shape (B, H); see :meth:`ViaQCritic.merit`.
 
         In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
+
+        Args:
+            observation: Parts of B observations, shape (B, .) each.
+            actions: Shape (B, H, m).
+            scene: Inputs that belong to the scenes; computed if not given.
+            coarse: Evaluate the pair networks for near pairs and at most CHECKED_INSTANTS instants only.
         """
-        values: Numbers = self.critic.merit(
-            self.critic(self.inputs(observation, actions, scene, shares))
-        ).numpy()
+        shares = self.shares[:: max(self.instants // CHECKED_INSTANTS, 1)] if coarse else self.shares
+        inputs = self.inputs(observation, actions, scene, shares)
+        values: Numbers = self.critic.merit(self.critic(inputs, near=coarse)).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
@@ -204,21 +220,24 @@ class ViaQPolicy(BasePolicy):
             return actions, values
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
         actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
-        shares = self.shares[:: max(self.instants // CHECKED_INSTANTS, 1)] if self.checks else self.shares
-        values = self.values(observation, actions, scene, shares)
+        coarse = self.checks > 0
+        values = self.values(observation, actions, scene, coarse=coarse)
         for each in range(self.refinements):
             near = self._near(actions, values, each)
             actions = np.concatenate((actions, near), axis=1)
-            values = np.concatenate((values, self.values(observation, near, scene, shares)), axis=1)
+            values = np.concatenate((values, self.values(observation, near, scene, coarse=coarse)), axis=1)
         return actions, values
 
     def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
         """Return candidates around the best ones, shape (B, per_refinement, m)."""
         best = min(N_ELITES, actions.shape[1])
         top = np.argpartition(-values, best - 1, axis=1)[:, :best]
-        chosen = np.take_along_axis(actions, top[..., None], axis=1)
+        return self._around(np.take_along_axis(actions, top[..., None], axis=1), each)
+
+    def _around(self, centres: Numbers, each: int) -> Numbers:
+        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
         steps = normal_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
-        around = chosen[:, np.arange(self.per_refinement) % best]
+        around = centres[:, np.arange(self.per_refinement) % centres.shape[1]]
         return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
     def decide(self, observation: Observation) -> Numbers:
@@ -227,18 +246,22 @@ class ViaQPolicy(BasePolicy):
         rows = np.arange(len(actions))
         if not self.checks:
             return np.asarray(actions[rows, values.argmax(axis=1)])
-        checked = np.take_along_axis(actions, self._promising(values)[..., None], axis=1)
-        worth = score_plans(observation, checked, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
+        count = min(self.checks, values.shape[1])
+        checked = np.take_along_axis(actions, self._promising(values, count)[..., None], axis=1)
+        worth = self._score(observation, checked)
         return np.asarray(checked[rows, worth.argmax(axis=1)])
 
-    def _promising(self, values: Numbers) -> NDArray[np.intp]:
-        """Return indices of the candidates to check, shape (B, checks), for ranking criteria of shape (B, N).
+    def _score(self, observation: Observation, actions: Numbers) -> Numbers:
+        """Return the merit of actions by computed geometry, shape (B, H)."""
+        return score_plans(observation, actions, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
+
+    def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
+        """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
 
         Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
         """
         if self.replanning:  # the action that keeps the plan is always checked
             values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
-        count = min(self.checks, values.shape[1])
         refined = min(count // 2, values.shape[1] - self.candidates)
         spread = min(count - refined, self.candidates)
         first = np.argsort(-values[:, : self.candidates], axis=1)[:, :spread]
@@ -288,8 +311,10 @@ def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
     links = np.asarray(task.arm.links(task.arm.inverse_kinematics(path)))
     first, last = (np.moveaxis(links[..., end, :], (-2, -1), (0, 1)) for end in (0, 1))
     axis = last - first
-    axis = axis / np.sqrt((axis * axis).sum(axis=1, keepdims=True))
-    return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time))
+    length = np.sqrt((axis * axis).sum(axis=1, keepdims=True))
+    axis = axis / length
+    sizes = _tensor(0.5 * length[:, 0, 0, 0, 0]), _tensor(task.arm.link_radii)
+    return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time), *sizes)
 
 
 def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
