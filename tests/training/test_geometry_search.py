@@ -302,7 +302,7 @@ def test_movements_take_the_time_of_the_greatest_reward(duration, component):
 
 def test_a_refinement_is_around_plans_that_are_worth_something():
     actions, merits = np.arange(12.0).reshape(2, 3, 2), np.array([[-np.inf, 1.0, -np.inf], [1.0, 2.0, 3.0]])
-    best, value = geometry_search._best(actions, merits)
+    best, value = geometry_search.best_actions(actions, merits)
     np.testing.assert_array_equal(best[0], np.repeat(actions[0, 1:2], 3, axis=0))
     np.testing.assert_array_equal(best[1], actions[1, ::-1])
     np.testing.assert_array_equal(value[1], [3.0, 2.0, 1.0])

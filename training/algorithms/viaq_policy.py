@@ -26,10 +26,11 @@ from viapoint.training.algorithms.viaq_critic import (
     ViaQCritic,
 )
 from viapoint.training.search.candidates import candidate_actions, normal_steps
-from viapoint.training.search.geometry_search import score_plans
+from viapoint.training.search.geometry_search import best_actions, score_plans
 from viapoint.training.search.plan_checks import (
     CLEARANCE_MARGIN,
     REACH_MARGIN,
+    reward_bounds,
 )
 from viapoint.training.search.planned_movements import (
     Observation,
@@ -46,6 +47,10 @@ N_ELITES = 8
 """Number of candidates around which each round of refinement samples."""
 SPREAD = 0.15
 """Standard deviation of the first round of refinement, in the action space; each round halves it."""
+PROPOSALS = 32
+"""Number of proposals that are checked in replanning tasks before any plans around the best of them."""
+LOCAL_ROUNDS = 4
+"""Rounds of checks around the best checked plans in replanning tasks."""
 CHECKED_INSTANTS = 16
 """Number of instants at which plans are evaluated if the best of them are checked exactly."""
 POSITIONS = 1 << 16
@@ -247,8 +252,18 @@ class ViaQPolicy(BasePolicy):
         if not self.checks:
             return np.asarray(actions[rows, values.argmax(axis=1)])
         count = min(self.checks, values.shape[1])
-        checked = np.take_along_axis(actions, self._promising(values, count)[..., None], axis=1)
+        local = max(count - PROPOSALS, 0) if self.replanning else 0
+        checked = np.take_along_axis(actions, self._promising(values, count - local)[..., None], axis=1)
         worth = self._score(observation, checked)
+        for each in range(LOCAL_ROUNDS):
+            share = (local + each) // LOCAL_ROUNDS
+            if share:
+                near = self._around(best_actions(checked, worth)[0], each)
+                _, bound = reward_bounds(observation, near, self.task, REACH_MARGIN)
+                top = np.argsort(-bound, axis=1)[:, :share]
+                near = np.take_along_axis(near, top[..., None], axis=1)
+                checked = np.concatenate((checked, near), axis=1)
+                worth = np.concatenate((worth, self._score(observation, near)), axis=1)
         return np.asarray(checked[rows, worth.argmax(axis=1)])
 
     def _score(self, observation: Observation, actions: Numbers) -> Numbers:

@@ -116,7 +116,9 @@ class GeometrySearch:
         replanning = is_replanning(observation)
         actions = candidate_actions(self.task, self.n_checks, replanning=replanning)
         candidates = np.broadcast_to(actions, (number, *actions.shape))
-        best, merits = _best(candidates, score_plans(observation, candidates, self.task, self._margins))
+        best, merits = best_actions(
+            candidates, score_plans(observation, candidates, self.task, self._margins)
+        )
         for each in range(self.refinements):
             steps = SPREAD * 0.5**each * self._steps(replanning)
             centres = best[:, np.arange(self.per_round) % best.shape[1]]
@@ -124,7 +126,7 @@ class GeometrySearch:
             merits = np.concatenate(
                 (merits, score_plans(observation, near, self.task, self._margins)), axis=1
             )
-            best, merits = _best(np.concatenate((best, near), axis=1), merits)
+            best, merits = best_actions(np.concatenate((best, near), axis=1), merits)
         return best[:, 0].astype(np.float64)
 
     def predict(
@@ -233,7 +235,7 @@ def registered_task(env_id: str, **kwargs: Any) -> Task:
     return task
 
 
-def _best(actions: Numbers, merits: Float) -> tuple[Single, Float]:
+def best_actions(actions: Numbers, merits: Numbers) -> tuple[Single, Numbers]:
     """Return the N_CENTRES best of H actions in each of B scenes, shape (B, N_CENTRES, m), and their merits.
 
     The best action replaces pruned ones, whose merit is unknown.

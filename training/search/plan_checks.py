@@ -172,13 +172,27 @@ def pruned_merit(
     obstacles = _Obstacles.from_observation(observation, task)
     for rows in _blocks(obstacles.number, max(1, PATH_BLOCK // (actions.shape[1] * NODES))):
         some = take_rows(observation, rows)
-        moves = plan_movements(some, actions[rows], task, FRACTIONS)
-        reach = _least_reach_margin(task.arm, moves.path)
-        bound = _reward(some, moves, np.full_like(reach, MAX_CLEARANCE), reach, task)
-        bound = np.where(reach > margins[1], bound, -np.inf)
+        moves, bound = reward_bounds(some, actions[rows], task, margins[1])
         bound[:, 0] += bonus
         merits[rows] = _branch_and_bound(moves, bound, obstacles.take(rows), task, margins[0], until)
     return merits
+
+
+def reward_bounds(
+    observation: Observation, actions: Numbers, task: Task, reach_margin: float
+) -> tuple[PlannedMovements, Numbers]:
+    """Return the plans of actions and upper bounds of their rewards, the rewards without obstacles, shape (B, H).
+
+    Args:
+        observation: Parts of B observations, shape (B, .) each.
+        actions: Shape (B, H, m), in [-1, 1].
+        task: Task of the environment.
+        reach_margin: Least reach margin, [m]; plans below it have the bound minus infinity.
+    """
+    moves = plan_movements(observation, actions, task, FRACTIONS)
+    reach = _least_reach_margin(task.arm, moves.path)
+    bound = _reward(observation, moves, np.full_like(reach, MAX_CLEARANCE), reach, task)
+    return moves, np.where(reach > reach_margin, bound, -np.inf)
 
 
 def _branch_and_bound(
