@@ -34,9 +34,6 @@ SHORTEST = 1e-50
 _STEPS = 5
 """Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
 
-_TINY = 1e-300
-"""Bound that keeps a divisor from zero where start, via-point and goal are equal."""
-
 _FLOOR = 1e-5
 """Distance of the via-point from an end, relative to the movement's extent, that clips the gradient."""
 
@@ -101,11 +98,11 @@ def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> N
     # The form of the quadratic formula without cancellation, for either sign of a.
     top = f.where(a >= 0, c, total)
     bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
-    t = f.cube_root(top / f.maximum(bottom, _TINY))
+    t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
     t = f.minimum(f.maximum(t, 0.0), 0.5)
     for _ in range(_STEPS):
         value, slope, _ = _residual(t, a, b, c)
-        t = f.minimum(f.maximum(t - value / f.minimum(slope, -_TINY), 0.5 * t), 0.5)
+        t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
     return t
 
 
