@@ -5,14 +5,14 @@ import math
 
 import pytest
 
-from viapoint.training.algorithms.model_io import ALGORITHMS, _argument_names, _encode
+from viapoint.training.algorithms.model_io import ALGORITHMS, _encode, argument_names
 from viapoint.training.algorithms.viaq_policy import ViaQPolicy
 from viapoint.training.config.checks import HYPERPARAMETERS, PARTICULAR, VIA_POLICY, check_hyperparameters
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 
 
 def test_every_hyperparameter_is_in_the_table():
-    names = set().union(*(_argument_names(kind) for kind in ALGORITHMS.values()))
+    names = set().union(*(argument_names(kind) for kind in ALGORITHMS.values()))
     assert set(HYPERPARAMETERS) == names
     assert set(PARTICULAR) <= set(ALGORITHMS)
     assert all(set(table) <= names for table in PARTICULAR.values())

@@ -55,6 +55,10 @@ def results_in(folder):
     return found
 
 
+@pytest.mark.skipif(
+    "PYTEST_XDIST_WORKER" in os.environ,
+    reason="two clusters at once hang: run this file alone, without --numprocesses",
+)
 def test_a_study_has_the_same_results_as_on_this_machine(cluster, tmp_path):
     """One training is killed in the middle, and goes on from the checkpoint that the driver has."""
     agent = {

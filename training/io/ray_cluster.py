@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,6 @@ def import_ray() -> Any:
     """
     for name, value in SILENCE.items():
         os.environ.setdefault(name, value)
-    if _has_token():
-        os.environ.setdefault("RAY_AUTH_MODE", "token")  # a driver sends no token without it
     try:
         import ray
     except ImportError:
@@ -53,8 +52,7 @@ def connect(address: str | None = None, cpus: int | None = None) -> bool:
     Raises:
         ValueError: There is no cluster at this address.
     """
-    ray = import_ray()
-    if address is None and ray.is_initialized():
+    if address is None and "ray" in sys.modules and import_ray().is_initialized():
         return False
     address = address or os.environ.get("RAY_ADDRESS")
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -65,7 +63,13 @@ def connect(address: str | None = None, cpus: int | None = None) -> bool:
     try:
         if address is not None:
             _check_listens(address)
-        ray.init(address=address, **settings)
+            if (
+                _has_token()
+            ):  # without this mode, which Ray reads when it is imported, a driver sends no token
+                os.environ.setdefault("RAY_AUTH_MODE", "token")
+        import_ray().init(address=address or "local", **settings)
+    except ImportError:
+        raise
     except Exception as error:  # Ray has no common class for what may go wrong here
         where = "on this machine" if address is None else f"at {address}"
         text = " ".join(str(error).split())
