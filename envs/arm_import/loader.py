@@ -101,8 +101,9 @@ def load_arm(
         >>> joints = arm.inverse_kinematics(np.array([[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]]))  # m
         >>> joints.shape  # rad
         (2, 6)
-        >>> arm.hand_position(joints).round(6).tolist()
-        [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]]
+        >>> hands = arm.hand_position(joints)  # m
+        >>> np.allclose(hands, [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]], atol=1e-6)
+        True
     """
     file = mjcf_reader.file_path(path)
     corners = None if workspace is None else mjcf_reader.workspace_corners(workspace)
