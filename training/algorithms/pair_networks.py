@@ -254,16 +254,21 @@ class PairMinimum(nn.Module):
         axis = None if poses.axis is None else [poses.axis[:, i, scene, None] for i in dimensions]
         size = radius + 0.5 * torch.sqrt((half * half).sum(dim=1))
         distance = _distance_from_axis(apart, axis, poses) - size
-        nearest = distance.amin(dim=(0, 1, 3))
-        body, row, plan, instant = (distance <= (nearest + NEAR)[:, None]).nonzero(as_tuple=True)
+        nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
+        flat = (distance <= (nearest + NEAR)[:, None]).flatten().nonzero()[:, 0]
+        bodies, rows, _, instants = distance.shape
+        pose = flat % (plans * instants)  # index of plan and instant
+        plan, of_body = pose // instants, flat // (plans * instants)
+        body, row = of_body // rows, of_body % rows
+        along = body * (plans * instants) + pose
         features = pair_features(
-            [each[body, row, plan, instant] for each in apart],
-            None if axis is None else [each[body, 0, plan, instant] for each in axis],
-            [half[row, i, 0, 0] for i in dimensions],
-            radius[row, 0, 0],
+            [each.expand_as(distance).flatten()[flat] for each in apart],
+            None if axis is None else [each.flatten()[along] for each in axis],
+            [half[:, i, 0, 0][row] for i in dimensions],
+            radius[:, 0, 0][row],
         )
         # Pairs are in the order of their bodies.
-        counts = torch.bincount(body, minlength=len(poses.centre)).tolist()
+        counts = torch.bincount(body, minlength=bodies).tolist()
         pieces = zip(*(torch.split(each, counts) for each in features), strict=True)
         values = [self._evaluate([each[None] for each in piece], h)[0] for h, piece in enumerate(pieces)]
         least = torch.full((plans,), torch.inf)
