@@ -40,6 +40,8 @@ def expanded(what: str, given: Any, allowed: Sequence[str]) -> Iterator[tuple[st
                 one = _with(one, name.split("."), value)
             name = _filled(f"{where}: the name", pattern, shown)
             label = _filled(f"{where}.label", str(fields.get("label", pattern)), shown)
+            if "{" in str(one.get("time_of")):
+                one["time_of"] = _filled(f"{where}.time_of", str(one["time_of"]), shown)
             yield where, name, label, one
 
 
