@@ -125,7 +125,7 @@ def is_complete(cell: Cell, root: Path, steps: Sequence[str]) -> bool:
         return "evaluate" not in steps or all(
             stored(root / cell.folder / evaluation_path(name, mode), identity_of(frozen, model, mode))
             for name, frozen in sets_of(cell.env).items()
-            for mode in modes(cell.agent)
+            for mode in modes(cell.agent, cell.env)
         )
     except (ValueError, OSError):
         return False  # running the job reports the error
@@ -175,7 +175,7 @@ def agent_evaluations(root: Path, cell: Cell, name: str, frozen: FrozenScenes) -
     run = Run(root / cell.folder)
     kwargs = dict(cell.training(root).env_kwargs)
     found, model = {}, None
-    for mode in modes(cell.agent):
+    for mode in modes(cell.agent, cell.env):
         path, wanted = run.folder / evaluation_path(name, mode), identity_of(frozen, run.best, mode)
         record = stored(path, wanted)
         if record is None:

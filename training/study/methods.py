@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.planners.baselines import (
     Method,
@@ -49,10 +50,10 @@ class Mode(NamedTuple):
         return row_id(agent.name, self.checks, untrained=self.untrained, unrevised=self.unrevised)
 
 
-def modes(agent: Agent) -> list[Mode]:
-    """Return the decision modes of an agent, the network alone first if it is asked for."""
+def modes(agent: Agent, env: Environment) -> list[Mode]:
+    """Return the decision modes of an agent in an environment, the network alone first if it is asked for."""
     found = [Mode(checks) for checks in agent.checks]
-    found += [Mode(unrevised=True)] if agent.unrevised else []
+    found += [Mode(unrevised=True)] if agent.unrevised and env.id in REPLANNING_TASKS else []
     return found + [Mode(checks, untrained=True) for checks in agent.checks if agent.untrained]
 
 

@@ -85,7 +85,7 @@ class Row:
 def rows_in(study: Study, env: Environment) -> list[Row]:
     """Return the rows of an environment in the order of the study."""
     here = [each for each in study.agents if env.name in each.environments]
-    found = [Row(entry=agent, mode=mode) for agent in here for mode in modes(agent)]
+    found = [Row(entry=agent, mode=mode) for agent in here for mode in modes(agent, env)]
     return found + [Row(entry=each) for each in study.baselines if env.name in each.environments]
 
 

@@ -160,7 +160,7 @@ def _agent_to_time(study: Study, env: Environment, agent: Agent) -> Iterator[Tim
         model = load_model(folder) if model is None else model
         return method_of_mode(mode, model, env, kwargs)
 
-    for mode in modes(agent):
+    for mode in modes(agent, env):
         yield Timed(mode.row(agent), identity_of(frozen, folder, mode), lambda mode=mode: make(mode))
 
 
