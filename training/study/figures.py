@@ -133,7 +133,11 @@ def _series(numbers: Numbers) -> dict[str, list[Numbers]]:
     found: dict[str, list[Numbers]] = {}
     for each in numbers["rows"]:
         made, kind = each["made"], each["kind"]
-        changed = kind == "baseline" and (made["env_kwargs"] or made["time_of"] or made["n_scenes"])
+        changed = (
+            made["training"]
+            if kind == "agent"
+            else made["env_kwargs"] or made["time_of"] or made["n_scenes"]
+        )
         if each["checks"] is None or changed or each.get("untrained") or each.get("unrevised"):
             continue
         name = each["name"] if each["kind"] == "agent" else each["method"]
