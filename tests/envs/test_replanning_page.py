@@ -43,7 +43,7 @@ def test_the_sections_are_in_the_order_of_gymnasium():
 
 
 def test_every_id_is_listed_with_what_it_sets():
-    told = {row[0]: row[2] for row in table("# Plans revised on the way")}
+    told = {row[0]: row[2] for row in table("# Replanning environments")}
     assert told == {
         name: ", ".join(f"{k}={v if k == 'arm' else repr(v)}" for k, v in kwargs.items())
         for name, kwargs in REPLANNING_TASKS.items()
