@@ -24,7 +24,7 @@ IDS = (
     "viapoint/PandaObstacles-v0",
 )
 FORMS = (
-    {"form": "places"},
+    {"form": "poses"},
     {"form": "action", "pooling": "minimum", "heads": 2},
     {"form": "action", "pooling": "sum"},
 )

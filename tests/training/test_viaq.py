@@ -218,7 +218,7 @@ def test_as_many_proposals_are_checked_as_one_says(learned):
 def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
     info = dict(zip(TERMS, (1.0, 0.0, 0.1, 0.0, -0.2, -0.3), strict=True))
     found = Outcomes(*outcome_of(info, 0.6))
-    told = (found.success, found.contact, found.clearance, found.goal_error, found.rest)
+    told = (found.success, found.contact, found.clearance, found.goal_error, found.effort_terms)
     np.testing.assert_allclose(told, (1.0, 0.0, 0.1, 0.0, -0.5))
     assert np.isnan(outcome_of(info, 0.7)).all()
     assert np.isnan(outcome_of({}, 0.6)).all()

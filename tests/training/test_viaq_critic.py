@@ -304,11 +304,11 @@ def test_what_follows_counts_only_where_an_episode_goes_on():
     batch = model.replay_buffer.sample_outcomes(64)
     over = batch._replace(ended=np.ones_like(batch.ended))
     other = over._replace(discount=0.0 * over.discount)
-    assert {n: v.item() for n, v in model._losses(over).items() if n == "rest"} == {
-        n: v.item() for n, v in model._losses(other).items() if n == "rest"
+    assert {n: v.item() for n, v in model._losses(over).items() if n == "effort"} == {
+        n: v.item() for n, v in model._losses(other).items() if n == "effort"
     }
     on = batch._replace(ended=np.zeros_like(batch.ended), discount=np.ones_like(batch.discount))
-    assert model._losses(on)["rest"].item() != model._losses(over)["rest"].item()
+    assert model._losses(on)["effort"].item() != model._losses(over)["effort"].item()
     env.close()
 
 

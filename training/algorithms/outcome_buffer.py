@@ -14,8 +14,6 @@ from viapoint.training.algorithms.smdp_buffers import TimedDictReplayBuffer
 from viapoint.training.config.discount import ELAPSED, TimeDiscount
 from viapoint.training.rollouts.vec_env import TERMS
 
-"""A NumPy array or a torch tensor."""
-
 LOWER = 1e-6
 """Smallest decrease of the clearance term that counts as a decrease."""
 REWARD_TOLERANCE = 1e-4
@@ -35,7 +33,7 @@ class Outcomes(NamedTuple):
     """1 if this decision lowered that sum, so that no earlier decision accounts for it."""
     goal_error: Array
     """Goal-error term of the reward."""
-    rest: Array
+    effort_terms: Array
     """Sum of the terms for smoothness and duration."""
 
 

@@ -199,17 +199,19 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         goes_on = (1.0 - ended) * discount if following is not None else torch.zeros_like(ended)
         known = torch.from_numpy(np.isfinite(batch.outcomes.success))
         outcomes = Outcomes(*(torch.nan_to_num(torch.from_numpy(each)) for each in batch.outcomes))
-        contact, arrives, rest = outcomes.contact, outcomes.success, outcomes.rest
+        contact, arrival, effort = outcomes.contact, outcomes.success, outcomes.effort_terms
         if following is not None:
-            arrives = torch.where(ended > 0.5, arrives, discount * torch.sigmoid(following.arrives))
-            rest = rest + goes_on * following.rest
+            arrival = torch.where(ended > 0.5, arrival, discount * torch.sigmoid(following.arrival))
+            effort = effort + goes_on * following.effort_terms
         carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
         losses = {
             "clearance": self._clearance_loss(values.clearance, outcomes, known),
-            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.clear, 1.0 - contact), carried_out),
-            "arrival": _mean(_cross_entropy(values.arrives, arrives), known & (contact < 0.5)),
-            "rest": 10.0
-            * _mean(functional.smooth_l1_loss(values.rest, rest, beta=0.1, reduction="none"), known),
+            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
+            "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
+            "effort": 10.0
+            * _mean(
+                functional.smooth_l1_loss(values.effort_terms, effort, beta=0.1, reduction="none"), known
+            ),
         }
         if not bool(known.all()):
             target = torch.from_numpy(batch.reward)

@@ -13,7 +13,7 @@ from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
 
-Form = Literal["places", "action"]
+Form = Literal["poses", "action"]
 Pooling = Literal["minimum", "sum"]
 
 EFFORT = 4
@@ -29,13 +29,13 @@ class Values(NamedTuple):
 
     margin: Tensor
     """Predicted clearance, [m]."""
-    clear: Tensor
+    no_contact: Tensor
     """Logit of the probability of no contact."""
-    arrives: Tensor
+    arrival: Tensor
     """Logit of the probability of success given no contact."""
     clearance: Tensor
     """Predicted clearance term of the reward."""
-    rest: Tensor
+    effort_terms: Tensor
     """Predicted sum of the terms for smoothness and duration."""
 
 
@@ -96,7 +96,7 @@ class ViaQCritic(nn.Module):
     Args:
         task: Task of the environment.
         replanning: True if an episode consists of several decisions.
-        form: Input of the pair networks: `places`, the planned poses of the arm, or `action`.
+        form: Input of the pair networks: `poses`, the planned poses of the arm, or `action`.
         pooling: `minimum` over obstacles, or `sum` of their features (Deep Sets).
         heads: Number of outputs for the form `action`, of which the minimum is taken.
         width: Width of the hidden layers of the pair networks.
@@ -111,7 +111,7 @@ class ViaQCritic(nn.Module):
         row = (3 * d + 1) if replanning else (2 * d + 1)
         self.form, self.pooling, self.replanning = form, pooling, replanning
         self.pairs: Any = None
-        if form == "places":
+        if form == "poses":
             self.pairs = PairMinimum(d, bodies_of(task), width)
         else:
             outputs = heads if pooling == "minimum" else width
@@ -141,9 +141,9 @@ class ViaQCritic(nn.Module):
         """
         ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         plan = torch.cat((ends, inputs.actions), dim=-1)
-        if self.form == "places" and near:
+        if self.form == "poses" and near:
             margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts)
-        elif self.form == "places":
+        elif self.form == "poses":
             margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
         else:
             margin = self._of_actions(plan, inputs.scene)
@@ -163,11 +163,11 @@ class ViaQCritic(nn.Module):
 
     def value(self, values: Values) -> Tensor:
         """Return Q, shape (B, H)."""
-        clear = torch.sigmoid(values.clear)
-        success = clear * torch.sigmoid(values.arrives)
+        clear = torch.sigmoid(values.no_contact)
+        success = clear * torch.sigmoid(values.arrival)
         won, lost, missed, _ = self.scales
         total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
-        return total + values.clearance + values.rest
+        return total + values.clearance + values.effort_terms
 
     def merit(self, values: Values) -> Tensor:
         """Return the ranking criterion, shape (B, H): Q if success is more likely than not, otherwise a lower number.
@@ -175,7 +175,7 @@ class ViaQCritic(nn.Module):
         If no plan is likely to succeed, Q prefers plans out of reach, which are not executed and so touch nothing. The
         probability of success ranks such plans instead.
         """
-        success = torch.sigmoid(values.clear) * torch.sigmoid(values.arrives)
+        success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
         merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
         return merit
 

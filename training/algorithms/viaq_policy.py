@@ -65,7 +65,7 @@ class ViaQPolicy(BasePolicy):
         action_space: Action space of the environment.
         lr_schedule: Learning rate as a function of the remaining progress.
         task: Task of the environment as plain values, see :meth:`viapoint.envs.mdp.task.Task.as_dict`.
-        form: Input of the pair networks: `places`, the planned poses of the arm, or `action`.
+        form: Input of the pair networks: `poses`, the planned poses of the arm, or `action`.
         pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
         heads: Number of outputs for the form `action`, of which the minimum is taken.
         width: Width of the hidden layers of the pair networks. The default is 32 if every link must clear obstacles,
@@ -85,7 +85,7 @@ class ViaQPolicy(BasePolicy):
         lr_schedule: Any,
         *,
         task: Mapping[str, Any],
-        form: Form = "places",
+        form: Form = "poses",
         pooling: Pooling = "minimum",
         heads: int = 1,
         width: int | None = None,
@@ -145,7 +145,7 @@ class ViaQPolicy(BasePolicy):
         """Return the inputs of the critic that depend on B scenes only."""
         ends, rows, present = seen_from_line(observation, self.task)
         parts = None
-        if self.settings["form"] == "places" and "obstacles" in observation:
+        if self.settings["form"] == "poses" and "obstacles" in observation:
             obstacles = self.task.observation.obstacles(observation["obstacles"])
             whole = np.concatenate(
                 (obstacles.centre, obstacles.half_axis, obstacles.radius[..., None]), axis=-1
@@ -153,7 +153,7 @@ class ViaQPolicy(BasePolicy):
             velocity = observation.get("obstacle_velocities")
             moving = None if velocity is None else velocity.reshape(obstacles.centre.shape)
             parts = cut_obstacles(whole, obstacles.present > 0.5, moving)
-        elif self.settings["form"] == "places":
+        elif self.settings["form"] == "poses":
             none = np.zeros((len(ends), 1, 2 * self.task.arm.dimension + 1))
             parts = cut_obstacles(none, np.zeros((len(ends), 1), dtype=bool))
         return SceneInputs(_tensor(ends), _tensor(rows), torch.from_numpy(present), parts)
@@ -182,7 +182,7 @@ class ViaQPolicy(BasePolicy):
         effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
         reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
         poses = None
-        if self.settings["form"] == "places":
+        if self.settings["form"] == "poses":
             poses = planned_poses(self.task, moves.path, moves.duration[..., None] * shares)
         scene = scene or self.scene(observation)
         return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
