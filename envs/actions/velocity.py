@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from viapoint.envs.actions.via_points import Motion, frame
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import is_number
 
 AXES = ("along", "across", "above")
 STEP_TOLERANCE = 1e-6
@@ -47,8 +47,7 @@ class Steering:
     def __post_init__(self) -> None:
         """Check that the control step is a multiple of the physics step."""
         given: Any = self.control_step
-        number = isinstance(given, Real) and not isinstance(given, bool)
-        value = float(given) if number else 0.0
+        value = float(given) if is_number(given) else 0.0
         steps = value / self.timestep
         if not (
             1.0 - STEP_TOLERANCE <= steps <= 500.0 * (1.0 + STEP_TOLERANCE)

@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import check_increasing_pair
+from viapoint.envs.common.validation import check_increasing_pair, whole_number
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 Timing = Literal["optimal", "learned"]
@@ -95,9 +95,7 @@ class ActionLayout:
         """Check all fields."""
         if self.dimension not in (2, 3):
             raise ValueError(f"dimension must be 2 or 3, got {self.dimension!r}")
-        whole = isinstance(self.n_via, int | np.integer) and not isinstance(self.n_via, bool)
-        if not (whole and 0 <= self.n_via <= MOST_VIAS):
-            raise ValueError(f"n_via must be a whole number, 0 to {MOST_VIAS}, got {self.n_via!r}")
+        whole_number("n_via", self.n_via, 0, MOST_VIAS)
         if self.timing not in get_args(Timing):
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
         check_increasing_pair("duration_range", self.duration_range)

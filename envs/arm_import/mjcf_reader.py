@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.mjcf import quaternion_of
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_real_array
+from viapoint.envs.common.validation import as_real_array, is_number
 
 MIN_WORKSPACE_WIDTH = 1e-3
 """Least width of a workspace along each axis, [m]."""
@@ -105,8 +104,7 @@ def workspace_corners(values: Any) -> Float:
 
 def positive_radius(value: Any) -> float:
     """Return the radius of the hand, [m]."""
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (number and 0.0 < float(value) < MAX_COORDINATE):
+    if not (is_number(value) and 0.0 < float(value) < MAX_COORDINATE):
         raise ValueError(
             f"hand_radius must be a positive number of m, less than {MAX_COORDINATE}, got {value!r}"
         )

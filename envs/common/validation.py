@@ -16,10 +16,21 @@ MIN_GOAL_DISTANCE = 0.02
 """Least distance between start and goal, [m]."""
 
 
-def whole_number(name: str, value: Any, least: int) -> int:
-    """Return a whole number that is at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
+def is_whole(value: Any) -> bool:
+    """Return True for a whole number, also NumPy's; a bool is none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a real number, also NumPy's; a bool is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def whole_number(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """Return a whole number from `least` to `most`; None for no upper limit."""
+    if not is_whole(value) or value < least or (most is not None and value > most):
+        allowed = f"{least} or more" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
     return int(value)
 
 
@@ -29,7 +40,7 @@ def check_increasing_pair(name: str, pair: Any) -> None:
         low, high = pair
     except (TypeError, ValueError):
         low = high = None
-    if not all(isinstance(value, Real) and not isinstance(value, bool) for value in (low, high)):
+    if not (is_number(low) and is_number(high)):
         raise ValueError(f"{name} must be two numbers, got {pair!r}")
     if not (0.0 < low < high < float("inf")):
         raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
@@ -55,7 +66,7 @@ def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
 
 def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> float:
     """Return a finite real number that is at least `least`; `why` explains the bound in the error."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < np.inf:
+    if not is_number(value) or not least <= float(value) < np.inf:
         raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
     return float(value)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
@@ -45,11 +45,7 @@ class RewardWeights:
     def __post_init__(self) -> None:
         """Check that no weight is negative."""
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 <= float(value) < np.inf:
-                raise ValueError(
-                    f"reward weight {field.name} must be a finite number, 0 or more, got {value!r}"
-                )
+            number_of_at_least(f"reward weight {field.name}", getattr(self, field.name), 0.0)
 
     @classmethod
     def of(cls, weights: RewardWeights | Mapping[str, float] | None) -> RewardWeights:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import ClassVar
 
-from viapoint.envs.common.validation import check_increasing_pair
+from viapoint.envs.common.validation import check_increasing_pair, is_number
 from viapoint.envs.scenes.families import MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
 
@@ -128,6 +127,5 @@ def check_share(share: float, name: str) -> None:
     Raises:
         ValueError: The value is no number from 0 to 1.
     """
-    number = isinstance(share, Real) and not isinstance(share, bool)
-    if not number or not 0.0 <= share <= 1.0:
+    if not is_number(share) or not 0.0 <= share <= 1.0:
         raise ValueError(f"{name} must be a number from 0 to 1, got {share!r}")

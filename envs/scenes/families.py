@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.scenes.draws import FeasiblePath, Site, Uniforms, unit
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS, PLANAR_BUILDERS
 from viapoint.envs.scenes.spatial_families import (
@@ -121,8 +122,7 @@ def register_scene_family(
     if dimension not in _FAMILIES:
         raise ValueError(f"dimension must be one of {', '.join(map(str, _FAMILIES))}, got {dimension!r}")
     most = FAMILY_ROWS if dimension == 2 else MOST_OBSTACLES
-    if isinstance(n_obstacles, bool) or n_obstacles not in range(1, most + 1):
-        raise ValueError(f"n_obstacles must be a whole number from 1 to {most}, got {n_obstacles!r}")
+    whole_number("n_obstacles", n_obstacles, 1, most)
     families = _FAMILIES[dimension]
     if not name or name in families:
         raise ValueError(f"name must not be empty or one of {', '.join(families)}, got {name!r}")

@@ -93,8 +93,8 @@ def test_bigger_duration_component_means_longer_between_the_stated_bounds():
     [
         ({"n_via": -1}, "n_via"),
         ({"n_via": 1.5}, "n_via"),
-        ({"n_via": 17}, "n_via must be a whole number, 0 to 16, got 17"),
-        ({"n_via": 10**9}, "n_via must be a whole number, 0 to 16, got 1000000000"),
+        ({"n_via": 17}, "n_via must be a whole number, from 0 to 16, got 17"),
+        ({"n_via": 10**9}, "n_via must be a whole number, from 0 to 16, got 1000000000"),
         ({"via_scale": (np.inf, 0.1)}, r"via_scale must be 2 positive finite numbers, got \(inf, 0.1\)"),
         ({"via_scale": (np.nan, 0.1)}, "via_scale"),
         ({"via_scale": (0.1,)}, "via_scale"),

@@ -277,7 +277,7 @@ def test_a_family_that_cannot_be_registered_is_refused(arguments, error, message
     ("changes", "message"),
     [
         ({"dimension": 4}, "dimension must be one of 2, 3, got 4"),
-        ({"n_obstacles": 0}, "n_obstacles must be a whole number from 1 to 5, got 0"),
+        ({"n_obstacles": 0}, "n_obstacles must be a whole number, from 1 to 5, got 0"),
         ({"n_obstacles": 9, "dimension": 3}, "from 1 to 8, got 9"),
         ({"n_obstacles": 1.5}, "got 1.5"),
     ],

@@ -73,7 +73,7 @@ def test_an_unknown_option_is_answered_with_those_that_there_are(env_id):
 
 
 def test_via_points_are_bounded_before_anything_is_made():
-    with pytest.raises(ValueError, match="n_via must be a whole number, 0 to 16, got 1000000000"):
+    with pytest.raises(ValueError, match="n_via must be a whole number, from 0 to 16, got 1000000000"):
         gym.make(PLANAR[0], n_via=10**9)
     env = gym.make(PLANAR[0], n_via=16).unwrapped
     env.reset(seed=0)

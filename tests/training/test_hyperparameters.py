@@ -76,7 +76,7 @@ def test_ranges_and_types(algo, name, value):
         ("width", True),
         ("form", "features"),
         ("pooling", "mean"),
-        ("pooling", "sum"),  # with the form "places"
+        ("pooling", "sum"),  # with the form "poses"
         ("heads", 0),
         ("heads", None),
         ("instants", 1),

@@ -278,7 +278,7 @@ def test_bad_input_is_said_in_one_line(capsys, tmp_path):
         port = str(taken.getsockname()[1])
         assert f"127.0.0.1:{port}" in failure(capsys, "--port", port)
     assert "no such folder" in failure(capsys, str(tmp_path / "none"))
-    assert "0 to 65535" in failure(capsys, "--port", "70000")
+    assert "from 0 to 65535" in failure(capsys, "--port", "70000")
     assert "cannot listen on 203.0.113.7" in failure(capsys, "--host", "203.0.113.7", "--port", "0")
     with pytest.raises(ValueError, match="decides in"):
         LivePage(PLANAR, env=PANDA, port=0)

@@ -27,6 +27,7 @@ from stable_baselines3.sac.policies import MultiInputPolicy as SACPolicy
 from stable_baselines3.td3.policies import MultiInputPolicy as TD3Policy
 from torch import Tensor, nn
 
+from viapoint.envs.common.validation import whole_number
 from viapoint.training.algorithms.extractors import SceneExtractor
 from viapoint.training.algorithms.pair_networks import dense
 
@@ -105,9 +106,7 @@ class _MinimumCritic(BasePolicy):
     """
 
     def __init__(self, *args: Any, heads: int = 1, critic_width: int = 128, **kwargs: Any) -> None:
-        for name, value in (("heads", heads), ("critic_width", critic_width)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
+        heads, critic_width = whole_number("heads", heads, 1), whole_number("critic_width", critic_width, 1)
         if kwargs.get("share_features_extractor"):
             raise ValueError(
                 "share_features_extractor must be False: a minimum critic has its own features extractor"

@@ -29,7 +29,7 @@ class Config:
             if isinstance(value, str) and "Path" in str(each.type):
                 object.__setattr__(self, each.name, Path(value))
             if each.name in self.least and not (value is None and each.default is None):
-                check_whole(each.name, value, self.least[each.name])
+                object.__setattr__(self, each.name, check_whole(each.name, value, self.least[each.name]))
         self._check()
 
     def _check(self) -> None:

@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -37,8 +38,8 @@ ELSEWHERE = {
     "on": "--on names the place of rollout workers",
 }
 """Arguments that a training's environment does not take, and what to use instead."""
-GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16}
-"""Greatest values: seeds of NumPy's legacy generator, and environments that fit into memory."""
+GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16, "port": 65535}
+"""Greatest values: seeds of NumPy's legacy generator, environments that fit into memory, and ports."""
 
 
 def check_env(env: str) -> None:
@@ -81,13 +82,9 @@ def check_has_scenes(env: str) -> None:
         raise ValueError(f"env must be one with frozen scenes, {OWN_ARM_TASKS[env]} for one, got {env!r}")
 
 
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Check that a value is a whole number from `least` to its greatest value."""
-    most = GREATEST.get(name)
-    known = isinstance(value, int) and not isinstance(value, bool)
-    if not known or value < least or (most is not None and value > most):
-        allowed = f"{least} or more" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name} must be a whole number, {allowed}, got {value!r}")
+def check_whole(name: str, value: Any, least: int) -> int:
+    """Return a whole number from `least` to its greatest value."""
+    return whole_number(name, value, least, GREATEST.get(name))
 
 
 def check_observed(number: int, algo: str, env: str) -> None:
@@ -172,7 +169,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_whole(value: Any, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+    return type(value) is int and value >= least
 
 
 def _whole(least: int) -> Allowed:
@@ -286,7 +283,7 @@ PARTICULAR: dict[str, dict[str, Allowed]] = {
 """Allowed values that are narrower for one algorithm."""
 
 VIA_POLICY: dict[str, Allowed] = {
-    "form": Allowed("places or action", lambda value: value in ("places", "action")),
+    "form": Allowed("poses or action", lambda value: value in ("poses", "action")),
     "pooling": Allowed("minimum or sum", lambda value: value in ("minimum", "sum")),
     "heads": _whole(1),
     "width": _or(_whole(1), NONE),
@@ -327,9 +324,9 @@ def check_via_policy(values: Mapping[str, Any]) -> None:
         ValueError: A value is not allowed.
     """
     _check("in policy_kwargs of viaq", VIA_POLICY, values)
-    if values.get("form", "places") == "places" and values.get("pooling", "minimum") != "minimum":
+    if values.get("form", "poses") == "poses" and values.get("pooling", "minimum") != "minimum":
         raise ValueError(
-            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is places, got "
+            "hyperparameter pooling in policy_kwargs of viaq must be minimum where the form is poses, got "
             f"{values['pooling']!r}"
         )
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import REPLANNING_TASKS
 
 ELAPSED = "elapsed"
@@ -68,6 +69,5 @@ def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
 
 
 def _check_unit(name: str, unit: float) -> None:
-    number = isinstance(unit, int | float) and not isinstance(unit, bool)
-    if not (number and 0.0 < unit < math.inf):
+    if not (is_number(unit) and 0.0 < unit < math.inf):
         raise ValueError(f"{name} must be a positive number of seconds, got {unit!r}")

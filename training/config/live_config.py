@@ -38,5 +38,3 @@ class LiveConfig(Config):
         take_pretrained(self)
         if self.env is not None:
             check_env(self.env)
-        if self.port > 65535:
-            raise ValueError(f"port must be a whole number, 0 to 65535, got {self.port}")

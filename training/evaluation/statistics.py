@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import whole_number
 
 
 class Interval(NamedTuple):
@@ -226,8 +227,7 @@ def _scores(values: ArrayLike) -> Float:
 
 def _check_draws(confidence: float, samples: int) -> None:
     _check_confidence(confidence)
-    if samples % 1 or samples < 1:
-        raise ValueError(f"samples must be a whole number, 1 or more, got {samples!r}")
+    whole_number("samples", samples, 1)
 
 
 def _check_confidence(confidence: float) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Numbers, Single
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.geometry.shapes import obstacle_rows
 from viapoint.envs.mdp.observation import is_replanning
@@ -84,15 +85,10 @@ class GeometrySearch:
         reach_margin: float = REACH_MARGIN,
         **kwargs: Any,
     ) -> None:
-        for name, value, least in (
-            ("n_checks", n_checks, 1),
-            ("refinements", refinements, 0),
-            ("per_round", per_round, 1),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
         self.task = registered_task(task, **kwargs) if isinstance(task, str) else task
-        self.n_checks, self.refinements, self.per_round = int(n_checks), int(refinements), int(per_round)
+        self.n_checks = whole_number("n_checks", n_checks, 1)
+        self.refinements = whole_number("refinements", refinements, 0)
+        self.per_round = whole_number("per_round", per_round, 1)
         self._margins = float(clearance_margin), float(reach_margin)
 
     @property
