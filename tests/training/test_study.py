@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,35 @@ def test_what_is_lost_or_of_something_else_is_measured_again(done):
         assert rows(gather(study_of(folder)))["viaq/4"]["seeds"] == [0]
         assert run_study(study_of(folder), workers=0, only=["evaluate"]) == record
         assert lost.read_bytes() == before
+
+
+def test_rows_are_measured_again_on_demand(done, tmp_path):
+    """Only those that the patterns name, by the steps that run; a mark in each file shows which are made again."""
+    folder, record = Path(shutil.copytree(done[0], tmp_path / "study")), done[1]
+    measured = sorted((folder / "PlanarObstacles-v0").glob("**/test*.json"))
+    for path in measured:
+        path.write_text(json.dumps({**read_json(path), "mark": True}))
+    lines = []
+    again = run_study(
+        study_of(folder),
+        workers=0,
+        only=["evaluate", "page"],
+        redo=["viaq/untrained*", "PlanarObstacles-v0/viaq/4", "search16"],
+        report=lines.append,
+    )
+    assert again == record
+    assert [line for line in lines if "removed" in line] == [
+        "PlanarObstacles-v0 viaq/4: 4 measurements removed",
+        "PlanarObstacles-v0 viaq/untrained: 4 measurements removed",
+        "PlanarObstacles-v0 viaq/untrained/4: 4 measurements removed",
+        "PlanarObstacles-v0 search16: 0 measurements removed",
+    ]
+    made = {path.name for path in measured if "mark" not in read_json(path)}
+    assert made == {"test.4.json", "test.untrained.json", "test.untrained-4.json"}
+    run_study(study_of(folder), workers=0, only=["baselines", "time"], redo=["search16"], report=lines.append)
+    assert "PlanarObstacles-v0 search16: 3 measurements removed" in lines  # two sets and a time
+    with pytest.raises(ValueError, match=r"redo must match rows; .* viaq, viaq/4, .*; got 'viaqs'"):
+        run_study(study_of(folder), workers=0, redo=["viaq", "viaqs"])
 
 
 def test_rows_outlive_their_files_until_as_much_is_measured(done, tmp_path):

@@ -13,6 +13,8 @@ from viapoint.training import Study, run_study
 from viapoint.training.io.ray_cluster import LOOPBACK, check_versions, import_ray
 from viapoint.training.study.jobs import baseline_jobs, pairs, training_jobs
 from viapoint.training.study.runner import Job, make_runner
+from viapoint.training.study.search_space import SearchSpace
+from viapoint.training.study.tuning import Tuning
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +98,31 @@ def test_a_study_has_the_same_results_as_on_this_machine(cluster, tmp_path):
     assert results_in(there.out) == results_in(here.out)
     assert len(results_in(here.out)) == 6
     assert list(training_jobs(there, steps)) == []
+
+
+def test_a_search_has_the_same_trials_as_on_this_machine(cluster, tmp_path):
+    search = SearchSpace(
+        env="viapoint/PlanarReach-v0",
+        algo="sac",
+        n_timesteps=96,
+        n_envs=32,
+        eval_every=48,
+        eval_scenes=8,
+        trials=3,
+        hyperparameters={"learning_starts": 32, "gradient_steps": 1},
+        parameters={"learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True}},
+        sampler={"name": "tpe", "seed": 0},
+    )
+    found = []
+    for on in ("local", "ray"):
+        tuning = Tuning.create(tmp_path / on, search)
+        tuning.work(on=on, workers=0 if on == "local" else None)
+        trials = {
+            each.params["learning_rate"]: (each.value, each.intermediate_values) for each in tuning.trials
+        }
+        found.append((trials, results_in(tmp_path / on)))
+    assert len(found[0][1]) == 9  # three trials with two models and a curve
+    assert found[0] == found[1]
 
 
 def test_nodes_with_other_versions_are_refused_by_name():

@@ -1,11 +1,14 @@
 """Runners: each job has one answer, whatever happens to its process."""
 
+import dataclasses
 import os
+import sys
 import time
 
 import pytest
 import runner_jobs
 
+from viapoint.training import Study, run_study
 from viapoint.training.study.runner import Job, LocalRunner, make_runner
 
 
@@ -67,6 +70,23 @@ def test_what_is_interrupted_saves_itself(tmp_path, capsys):
         answers.close()
     assert (tmp_path / "one" / "state").read_text() == "saved"
     assert "saving 1 running jobs" in capsys.readouterr().err
+
+
+def test_studies_on_this_machine_need_no_ray(tmp_path, monkeypatch):
+    """Neither here nor in workers; on Ray, the error names the extra."""
+    (tmp_path / "without" / "ray").mkdir(parents=True)
+    (tmp_path / "without" / "ray" / "__init__.py").write_text("raise ImportError('no module named ray')")
+    path = [str(tmp_path / "without"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    monkeypatch.setitem(sys.modules, "ray", None)
+    environment = {"viapoint/PlanarReach-v0": {"n_scenes": 4, "scenes": ["test"]}}
+    study = Study.from_dict(
+        {"out": str(tmp_path / "out"), "environments": environment, "baselines": ["straight"]}
+    )
+    record = run_study(study, workers=1, only=["baselines", "page"])
+    assert len(record["environments"]["viapoint/PlanarReach-v0"]["rows"]) == 1
+    with pytest.raises(ImportError, match=r"Ray is not installed: pip install 'viapoint\[cluster\]'"):
+        run_study(dataclasses.replace(study, out=tmp_path / "other"), on="ray", only=["baselines"])
 
 
 def test_an_unknown_runner_is_refused(tmp_path):

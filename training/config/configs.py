@@ -470,5 +470,7 @@ class StudyConfig(Config):
         "train", "evaluate", "baselines", "time", "page",
     )  # fmt: skip
     """Steps to run."""
+    redo: tuple[str, ...] = ()
+    """Patterns of rows whose measurements by these steps are made again, such as 'viaq/*' or 'PandaReach-v0/*'."""
 
     least: ClassVar = {"workers": 0}

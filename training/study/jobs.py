@@ -282,6 +282,19 @@ def path_of(baseline: Baseline, env: Environment, name: str) -> str:
     return f"{env.folder}/baselines/{baseline.name}/{name}.json"
 
 
+def measured_files(
+    study: Study, env: Environment, entry: Agent | Baseline, mode: Mode | None
+) -> Iterator[Path]:
+    """Yield the files that hold the measurements of a row, whether they exist or not."""
+    for name in sets_of(env, entry if isinstance(entry, Baseline) else None):
+        if isinstance(entry, Baseline):
+            yield study.out / path_of(entry, env, name)
+        else:
+            for seed in entry.seeds:
+                folder = Cell(env=env, agent=entry, seed=seed).folder
+                yield study.out / folder / evaluation_path(name, mode or Mode())
+
+
 def cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

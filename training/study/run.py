@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -9,13 +10,13 @@ from typing import Any, Literal, get_args
 
 from viapoint.training.config.configs import StudyConfig
 from viapoint.training.io.files import read_json, write_json
-from viapoint.training.study.config import Study
+from viapoint.training.study.config import Environment, Study
 from viapoint.training.study.figures import draw_figures
-from viapoint.training.study.jobs import baseline_jobs, pairs, training_jobs
+from viapoint.training.study.jobs import baseline_jobs, measured_files, pairs, training_jobs
 from viapoint.training.study.page import write_pages
-from viapoint.training.study.results import gather
+from viapoint.training.study.results import Row, gather, rows_in
 from viapoint.training.study.runner import Job, Runner, make_runner
-from viapoint.training.study.timing import equal_time_pairs, time_decisions
+from viapoint.training.study.timing import equal_time_pairs, remove_times, time_decisions
 
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
 Report = Callable[[str], object]
@@ -36,7 +37,14 @@ def run(config: StudyConfig) -> None:
         ValueError: The file describes no study, or names something unknown.
         StudyFailedError: A job failed.
     """
-    run_study(config.file, on=config.on, workers=config.workers, only=config.only, report=_print)
+    run_study(
+        config.file,
+        on=config.on,
+        workers=config.workers,
+        only=config.only,
+        redo=config.redo,
+        report=_print,
+    )
 
 
 def run_study(
@@ -45,6 +53,7 @@ def run_study(
     on: str = "local",
     workers: int | None = None,
     only: Sequence[str] = STEPS,
+    redo: Sequence[str] = (),
     report: Report | None = None,
 ) -> dict[str, Any]:
     """Run what is missing of a study, and write its record, figures and pages.
@@ -58,13 +67,15 @@ def run_study(
             machine; or `ray://HOST:PORT`.
         workers: Number of parallel jobs. Locally 1 by default, and 0 for this process. On Ray all that fit by default.
         only: Steps to run: `train`, `evaluate`, `baselines`, `time` and `page`.
+        redo: Patterns of rows, such as `viaq/*`, or of environments and rows, such as `PandaReach-v0/*`, whose
+            measurements by these steps are removed first and made again. Trainings are kept.
         report: Function that takes a line about each finished job, timing and file, such as `print`.
 
     Returns:
         The record, which is in the study's JSON file as well.
 
     Raises:
-        ValueError: The study, a step or the cluster is not allowed; the message lists what is.
+        ValueError: The study, a step, a pattern or the cluster is not allowed; the message lists what is.
         StudyFailedError: Jobs failed; the others are done.
 
     Example:
@@ -83,6 +94,8 @@ def run_study(
     report = report or _ignore
     steps = set(only)
     before = read_json(study.page.record) if study.page.record.is_file() else None
+    if redo:
+        _remove_measurements(study, redo, steps, report)
     jobs = list(training_jobs(study, only)) if steps & {"train", "evaluate"} else []
     jobs += baseline_jobs(study, pairs(study)) if "baselines" in steps else []
     failed = []
@@ -100,6 +113,33 @@ def run_study(
     if failed:
         raise StudyFailedError(f"{len(failed)} jobs failed: {'; '.join(failed)}")
     return record
+
+
+def _remove_measurements(study: Study, patterns: Sequence[str], steps: set[str], report: Report) -> None:
+    """Remove the measurements and decision times of rows, so that the steps make them again.
+
+    Raises:
+        ValueError: A pattern matches no row.
+    """
+    rows = [(env, row) for env in study.environments for row in rows_in(study, env)]
+    for pattern in patterns:
+        if not any(_matches(row, env, pattern) for env, row in rows):
+            allowed = ", ".join(dict.fromkeys(row.id for _, row in rows))
+            raise ValueError(f"redo must match rows; those of the study are {allowed}; got {pattern!r}")
+    for env, row in rows:
+        if any(_matches(row, env, pattern) for pattern in patterns):
+            removed = 0
+            if ("baselines" if row.mode is None else "evaluate") in steps:
+                for path in measured_files(study, env, row.entry, row.mode):
+                    removed += path.is_file()
+                    path.unlink(missing_ok=True)
+            if "time" in steps:
+                removed += remove_times(study, env, row.id)
+            report(f"{env.folder} {row.id}: {removed} measurements removed")
+
+
+def _matches(row: Row, env: Environment, pattern: str) -> bool:
+    return any(fnmatch.fnmatchcase(name, pattern) for name in (row.id, f"{env.folder}/{row.id}"))
 
 
 def _measure(

@@ -72,6 +72,15 @@ def time_decisions(study: Study) -> Iterator[str]:
             yield f"{env.folder} {baseline.name}: {checks} checks in {1e3 * seconds:.2f} ms"
 
 
+def remove_times(study: Study, env: Environment, row: str) -> bool:
+    """Remove the stored time of a row, and return whether there was one."""
+    times = times_of(study, env)
+    if times.pop(row, None) is None:
+        return False
+    _write(study, env, times)
+    return True
+
+
 def equal_time_pairs(study: Study) -> list[tuple[Baseline, Environment]]:
     """Return the searches of equal time with the numbers of checks that were timed, and their environments."""
     found = []

@@ -73,7 +73,7 @@ class RayRunner:
         self._ray = import_ray()
         self._root, self._workers = root, workers
         self._connected = connect(address, workers)
-        self._full: set[str] = set()
+        self._excluded: set[str] = set()
         try:
             check_nodes(ONE_THREAD)
             from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -108,7 +108,7 @@ class RayRunner:
                 self._collect(running)
                 for reference in ready:
                     task = running.pop(reference)
-                    found, lost = self._answer(reference)
+                    found, lost = self._answer(reference, task.job)
                     if lost and task.attempt < task.job.retries:
                         again.append(_Task(task.job, task.attempt + 1))
                     else:
@@ -129,26 +129,39 @@ class RayRunner:
         if "GPU" in job.resources:
             needs["num_gpus"] = job.resources["GPU"]
         needs["resources"] = {name: value for name, value in job.resources.items() if name != "GPU"}
-        if self._full:
-            needs["label_selector"] = {NODE_ID: f"!in({','.join(sorted(self._full))})"}
+        if self._excluded:
+            needs["label_selector"] = {NODE_ID: f"!in({','.join(sorted(self._excluded))})"}
+        if not self._nodes_for(job):
+            wanted = ", ".join(f"{least:g} {name}" for name, least in _wanted(job).items())
+            _warn(f"{job.label} waits for a node with {wanted}; the cluster has none that gets jobs")
         return self._function.options(**needs, **ONE_THREAD).remote(
             job, task.attempt, files, self._collector, installed()
         )
 
-    def _answer(self, reference: Any) -> tuple[Answer, bool]:
+    def _nodes_for(self, job: Job) -> set[str]:
+        """Return the ids of the nodes that have what a job needs and may get jobs."""
+        return {
+            node["NodeID"]
+            for node in self._ray.nodes()
+            if node["Alive"]
+            and node["NodeID"] not in self._excluded
+            and all(node["Resources"].get(name, 0) >= least for name, least in _wanted(job).items())
+        }
+
+    def _answer(self, reference: Any, job: Job) -> tuple[Answer, bool]:
         """Return the answer of a job that has ended, and whether it may run again."""
         try:
-            found, full = self._ray.get(reference)
+            found, unusable = self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
             return Answer(error=" ".join(str(error.cause).split())), False
         except self._ray.exceptions.RayError as error:
             return Answer(error=" ".join(f"{type(error).__name__}: {error}".split())), True
-        if not full:
+        if not unusable or not self._nodes_for(job) - {unusable}:
             return found, False
-        self._full.add(full)
-        print(f"{found.place} has no room left on its disk, and gets no further jobs", file=sys.stderr)
-        others = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]} - self._full
-        return found, bool(others)
+        if unusable not in self._excluded:
+            self._excluded.add(unusable)
+            _warn(f"{found.place} gets no further jobs: {found.error}")
+        return found, True
 
     def _collect(self, running: dict[Any, _Task]) -> None:
         """Write the files that have come from nodes."""
@@ -161,13 +174,22 @@ class RayRunner:
         """Interrupt jobs, and take the files that they save; a second Ctrl-C leaves at once."""
         if not running:
             return
-        print(f"saving {len(running)} jobs; Ctrl-C again leaves at once", file=sys.stderr, flush=True)
+        _warn(f"saving {len(running)} jobs; Ctrl-C again leaves at once")
         for reference in running:
             self._ray.cancel(reference)
         waiting = list(running)
         while waiting:
             _, waiting = self._ray.wait(waiting, timeout=POLL)
             self._collect(running)
+
+
+def _wanted(job: Job) -> dict[str, float]:
+    """Return the resources that a node must have for a job."""
+    return {"CPU": job.cpus, **job.resources}
+
+
+def _warn(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _next_task(again: list[_Task], queue: Iterator[Job]) -> _Task | None:
@@ -181,7 +203,7 @@ def _next_task(again: list[_Task], queue: Iterator[Job]) -> _Task | None:
 def _run_on_node(
     job: Job, attempt: int, files: Changes, collector: Any, wanted: dict[str, str]
 ) -> tuple[Answer, str]:
-    """Run a job in a temporary folder, and return its answer, with the node's id if its disk is full."""
+    """Run a job in a temporary folder, and return its answer, with the node's id if the node cannot run jobs."""
     import ray
 
     node = ray.get_runtime_context().get_node_id()
@@ -192,6 +214,9 @@ def _run_on_node(
 
     try:
         check_versions(installed(), wanted, place)
+    except ValueError as error:  # a node that has joined since the start
+        return Answer(error=str(error), place=place), node
+    try:
         with tempfile.TemporaryDirectory(prefix="viapoint-") as scratch, _own_cores(job.cpus):
             root = Path(scratch) / "node"
             root.mkdir()
@@ -200,7 +225,7 @@ def _run_on_node(
             unpack(files, root / job.folder)
             with Sender(root / job.folder, send):
                 found = answer(job, root)
-    except (OSError, ValueError) as error:
+    except OSError as error:
         found = Answer(error=str(error))
     full = os.strerror(errno.ENOSPC) in found.error
     return found._replace(place=place), node if full else ""
