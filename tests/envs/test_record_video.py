@@ -37,7 +37,13 @@ def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(nam
     pytest.importorskip("moviepy")
     from viapoint.envs.record_video import RecordMovements
 
-    made = gym.make(f"viapoint.envs:viapoint/{name}-v0", render_mode="rgb_array_list", width=64, height=64)
+    made = gym.make(
+        f"viapoint.envs:viapoint/{name}-v0",
+        render_mode="rgb_array_list",
+        width=64,
+        height=64,
+        duration_range=(0.4, 0.6),  # a short film
+    )
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
     steps, over = 0, False

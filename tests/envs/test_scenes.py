@@ -67,6 +67,8 @@ def test_the_straight_movement_fails_and_random_ones_solve_most_scenes(env_id, s
         env.reset(options=scenes.as_options())
         *_, info = env.step(rng.uniform(-1.0, 1.0, (100, 3)))
         solved |= info["is_success"]
+        if solved.mean() > share:
+            break
     assert solved.mean() > share
 
 

@@ -66,8 +66,8 @@ def test_single_precision_holds_any_duration_and_so_do_gradients(seconds, order)
 
 @pytest.mark.parametrize("vias", [1, 2, 3])
 def test_gradients_of_passage_times_equal_finite_differences(vias):
-    waypoints, velocity, acceleration = tensor(3, vias + 2, 2), tensor(3, 2, scale=0.3), tensor(3, 2)
-    duration = torch.tensor(RNG.uniform(0.5, 2, 3), requires_grad=True)
+    waypoints, velocity, acceleration = tensor(2, vias + 2, 2), tensor(2, 2, scale=0.3), tensor(2, 2)
+    duration = torch.tensor(RNG.uniform(0.5, 2, 2), requires_grad=True)
     assert torch.autograd.gradcheck(passage_durations, (waypoints, duration), atol=1e-5)
     assert torch.autograd.gradcheck(
         lambda w, d, v, a: passage_durations(w, d, start_velocity=v, goal_velocity=FREE, goal_acceleration=a),

@@ -178,18 +178,17 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
 
 
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path):
-    few = load("test", ENV).take(slice(3, 6))
-    few.save(tmp_path / "test.npz")
-    run("evaluate", trained, "--baselines", "straight", "--scenes", "test")
-    for words in (("--n-scenes", 4), ("--scenes", tmp_path / "test.npz"), ("--n-scenes", 1000)):
-        run("evaluate", trained, "--baselines", "straight", *words)
+    few, file = load("validation", ENV).take(slice(3, 6)), tmp_path / "validation.npz"
+    few.save(file)
+    for words in (("validation",), ("validation", "--n-scenes", 4), (file,), ("validation", "--n-scenes", 500)):
+        run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = {
         path.name: json.loads(path.read_text())["methods"]["straight line"]["scenes"]
-        for path in (trained / "evaluations").glob("test*.json")
+        for path in (trained / "evaluations").glob("validation*.json")
     }
-    assert kept["test.json"] == 1000
-    assert kept["test.first-4.json"] == 4
-    assert kept[f"test.{few.sha256[:8]}.json"] == 3
+    assert kept["validation.json"] == 500
+    assert kept["validation.first-4.json"] == 4
+    assert kept[f"validation.{few.sha256[:8]}.json"] == 3
 
 
 def test_the_environment_is_that_of_the_run_or_of_the_pretrained_agent(trained, shipped, capsys):

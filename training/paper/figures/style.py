@@ -67,6 +67,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
     FigureCanvasAgg(figure)
     figure.savefig(paths[0], dpi=DOTS_PER_INCH, metadata={"Software": None})
+    figure.set_layout_engine("none")  # the same layout for both files, computed once
     figure.savefig(paths[1], metadata={"Date": None, "Creator": None})
     return paths
 
