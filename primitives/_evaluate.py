@@ -111,9 +111,14 @@ def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
 
 
 def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array:
-    """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time."""
+    """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time.
+
+    Beyond the degree it is the constant zero, (..., 1, S, D).
+    """
     if nu == 0:
         return coefficients
+    if nu >= coefficients.shape[-3]:
+        return 0.0 * coefficients[..., :1, :, :]
     table = derivative_factors(coefficients.shape[-3] // 2, nu)
     scale: Array = math.prod([rates] * (nu - 1), start=rates)
     factors = constant(table, coefficients.dtype, coefficients.device) * scale[..., None, :]

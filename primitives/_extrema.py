@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ._evaluate import derivative_coefficients
 from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
 from .array_api import Array, Floats, Namespace, largest_exponent, like, ordered_sum, to_numpy
 
@@ -53,13 +52,6 @@ class Pieces:
         """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
         numbers, exponent = unit_size(to_numpy(self.coefficients).astype(np.float64), (-3, -2, -1))
         return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
-
-
-def pieces_of(coefficients: Array, starts: Array, rates: Array, end: Array, nu: int, xp: Namespace) -> Pieces:
-    """Return the nu-th derivative; beyond the degree it is the constant zero."""
-    if nu >= coefficients.shape[-3]:
-        return Pieces(0.0 * coefficients[..., :1, :, :], starts, rates, end, xp)
-    return Pieces(derivative_coefficients(coefficients, rates, nu), starts, rates, end, xp)
 
 
 def axis_extrema(pieces: Pieces) -> Extrema:

@@ -35,7 +35,6 @@ from .array_api import (
     to_numpy,
     unit_factors,
 )
-from .trajectory import Trajectory
 
 Entry: TypeAlias = Any
 """An array or a Python float."""
@@ -152,22 +151,21 @@ def _assemble(
     return upper, right
 
 
-def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
-    """Return the least-cost trajectory through all waypoints at fixed times.
+def coefficients_through(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, *, some_empty: bool
+) -> Array:
+    """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
 
     Args:
         xp: namespace.
         order: m.
         waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
+        durations: (..., S), positive; may be shared by the batch [s].
         states: per knot, its derivatives (see States).
+        some_empty: durations, then with the full batch shape, are 0 between equal waypoints.
     """
-    durations = 1.0 * durations  # a copy of its own
-    if (durations <= 0).any():
-        return _connect_with_empty(xp, order, waypoints, durations, states)
-    return Trajectory.from_segments(
-        _scaled_coefficients(xp, order, waypoints, durations, states), durations, xp
-    )
+    solve = _coefficients_with_empty if some_empty else _scaled_coefficients
+    return solve(xp, order, waypoints, durations, states)
 
 
 def _scaled_coefficients(
@@ -220,16 +218,14 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def _connect_with_empty(
+def _coefficients_with_empty(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
-) -> Trajectory:
-    """Connect waypoints where some durations are 0: drop those via-points, movement by movement."""
+) -> Array:
+    """Return the coefficients where some durations are 0: drop those via-points, movement by movement."""
     *batch, knots, dimension = waypoints.shape
     count = int(np.prod(batch, dtype=int))
-    durations = broadcast_to(xp, durations, (*batch, knots - 1))
     if not count:
-        nothing = like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
-        return Trajectory.from_segments(nothing, durations, xp, some_empty=True)
+        return like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
     flat_points = xp.reshape(waypoints, (count, knots, dimension))
     flat_durations = xp.reshape(durations, (count, knots - 1))
     flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
@@ -246,8 +242,7 @@ def _connect_with_empty(
         parts.append(_connect_pattern(xp, order, flat_points[rows], flat_durations[rows], chosen, pattern))
         members.append(where)
     joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
-    joined = xp.reshape(joined, (*batch, *joined.shape[1:]))
-    return Trajectory.from_segments(joined, durations, xp, some_empty=True)
+    return xp.reshape(joined, (*batch, *joined.shape[1:]))
 
 
 def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from functools import cache
 from math import comb
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .array_api import Floats
+if TYPE_CHECKING:
+    from .array_api import Floats
 
 _SHIFT = 0.6180339887498949
 """s of w = 1 / (u + s), irrational so that -s is no root of a polynomial with simple coefficients."""

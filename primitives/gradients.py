@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import factorial, perm, prod
+from math import perm, prod
 from typing import Any
 
+from ._passage.cost import duration_gradient
 from .array_api import Array
 from .trajectory import Trajectory, require_trajectory
 
@@ -76,28 +77,6 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
         ends.append(sign * _segment_derivative(trajectory, 2 * m - 1 - i, at_end=True)[..., -1, :])
     durations = duration_gradient(trajectory.coefficients, trajectory.rates)
     return CostGradient(xp.concat(rows, axis=-2), durations, *ends)
-
-
-def duration_gradient(coefficients: Array, rates: Array) -> Array:
-    """Return dJ/dh of each segment, which is minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
-
-    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment;
-    for jerk it is -|jerk|^2/2 + snap . acceleration - crackle . velocity.
-
-    Args:
-        coefficients: (..., 2m, S, D) in unit time.
-        rates: (..., S) 1 / h.
-
-    Returns:
-        (..., S) [cost / s].
-    """
-    order = coefficients.shape[-3] // 2
-    total: Any = 0.0
-    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
-        weight = (0.5 if i == 0 else (-1.0) ** i) * factorial(order + i) * factorial(order - i)
-        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
-        total = total + weight * product.sum(-1)
-    return -total * prod([rates * rates] * order)
 
 
 def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Array:

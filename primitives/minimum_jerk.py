@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 from ._boundary import END_NAMES, check_end_shapes, check_order, check_waypoints, knot_states, read_arguments
-from ._knot_solver import connect
 from .array_api import (
     Array,
     Boundary,
@@ -17,7 +16,7 @@ from .array_api import (
     require,
     require_vectors,
 )
-from .trajectory import Trajectory
+from .trajectory import Trajectory, connect
 
 
 def point_to_point(

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ._evaluate import evaluate
-from ._extrema import Extrema, Pieces, axis_extrema, largest_norm, pieces_of
+from ._evaluate import derivative_coefficients, evaluate
+from ._extrema import Extrema, Pieces, axis_extrema, largest_norm
 from ._hermite_tables import energy_table
+from ._knot_solver import States, coefficients_through
 from .array_api import (
     Array,
     Namespace,
@@ -282,15 +283,15 @@ class Trajectory:
         """Return the nu-th derivative, or raise ValueError if it overflows."""
         xp, nu = self.namespace, whole_order(nu)
         with error_state(xp):
-            pieces = pieces_of(self.coefficients, self.starts, self.rates, self.end, nu, xp)
-        if not xp.isfinite(pieces.coefficients).all():
+            coefficients = derivative_coefficients(self.coefficients, self.rates, nu)
+        if not xp.isfinite(coefficients).all():
             durations = to_numpy(self.durations)
             shortest = durations[durations > 0].min()
             raise ValueError(
                 f"derivative {nu} of the trajectory overflows {self.coefficients.dtype}: its shortest segment "
                 f"lasts {shortest:g} s"
             )
-        return pieces
+        return Pieces(coefficients, self.starts, self.rates, self.end, xp)
 
     def stretched(self, duration: Array) -> Trajectory:
         """Return the movement along the same path with time scaled to a new total duration (...,) [s].
@@ -351,3 +352,21 @@ def require_trajectory(value: object) -> None:
     """Raise ValueError unless the value is a Trajectory."""
     if not isinstance(value, Trajectory):
         raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")
+
+
+def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
+    """Return the least-cost trajectory through all waypoints at fixed times.
+
+    Args:
+        xp: namespace.
+        order: m.
+        waypoints: (..., S + 1, D) with the full batch shape [m].
+        durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
+        states: per knot, its derivatives (see States).
+    """
+    durations = 1.0 * durations  # a copy of its own
+    some_empty = bool((durations <= 0).any())
+    if some_empty:
+        durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
+    coefficients = coefficients_through(xp, order, waypoints, durations, states, some_empty=some_empty)
+    return Trajectory.from_segments(coefficients, durations, xp, some_empty=some_empty)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from .._knot_solver import Nodes, States, solve_states
-from ..array_api import FREE, Floats, ordered_sum
+from ..array_api import FREE, Array, Floats, ordered_sum
 
 _MODES: tuple[dict[int, float], ...] = (
     {2: -1.0, 4: 1.0},
@@ -179,3 +179,25 @@ def _product(p: list[Floats], q: list[Floats]) -> Floats:
     terms = [w * ordered_sum(x * y, -2) for w, x, y in zip(_WEIGHTS, p, q, strict=True)]
     total: Floats = ordered_sum(terms)
     return total
+
+
+def duration_gradient(coefficients: Array, rates: Array) -> Array:
+    """Return dJ/dh of each segment, which is minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
+
+    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment;
+    for jerk it is -|jerk|^2/2 + snap . acceleration - crackle . velocity.
+
+    Args:
+        coefficients: (..., 2m, S, D) in unit time.
+        rates: (..., S) 1 / h.
+
+    Returns:
+        (..., S) [cost / s].
+    """
+    order = coefficients.shape[-3] // 2
+    total: Any = 0.0
+    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
+        weight = (0.5 if i == 0 else (-1.0) ** i) * math.factorial(order + i) * math.factorial(order - i)
+        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
+        total = total + weight * product.sum(-1)
+    return -total * math.prod([rates * rates] * order)

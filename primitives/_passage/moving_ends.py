@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from .._boundary import chosen_items
-from .._knot_solver import connect
 from .._polynomial import add, differentiate, evaluate, multiply, root_candidates
 from ..array_api import FREE, Floats, ordered_sum
+from ..trajectory import connect
 from .rest_to_rest import SHORTEST
 
 _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {

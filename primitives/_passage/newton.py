@@ -23,10 +23,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._knot_solver import connect
 from ..array_api import FREE, Array, Floats, Namespace, is_given, like, ordered_sum, to_numpy
-from ..gradients import duration_gradient
-from .cost import PassageCost
+from ..trajectory import connect
+from .cost import PassageCost, duration_gradient
 from .rest_to_rest import attach_root_gradient
 
 Evaluate: TypeAlias = Callable[[Floats, Any], tuple[Floats, Floats, Floats]]

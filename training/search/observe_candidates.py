@@ -22,6 +22,10 @@ from viapoint.training.search.planned_movements import take_rows
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
 
+    VectorWrapper = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    VectorWrapper = gym.vector.VectorWrapper  # not generic before Gymnasium 1.4
+
 MOST_OBSERVED = 4096
 """Greatest number of observed candidates."""
 BOUND = 0.05
@@ -114,7 +118,7 @@ class ObserveCandidates(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         )
 
 
-class VectorObserveCandidates(gym.vector.VectorWrapper[Any, Any, Any, Any, Any], RecordConstructorArgs):
+class VectorObserveCandidates(VectorWrapper, RecordConstructorArgs):
     """Wrapper like :class:`ObserveCandidates` for vector environments, which computes all candidates in one batch.
 
     Args:
