@@ -151,10 +151,12 @@ def _assemble(
     return upper, right
 
 
-def coefficients_through(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, *, some_empty: bool
+def least_cost_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
+
+    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
 
     Args:
         xp: namespace.
@@ -162,18 +164,6 @@ def coefficients_through(
         waypoints: (..., S + 1, D) with the full batch shape [m].
         durations: (..., S), positive; may be shared by the batch [s].
         states: per knot, its derivatives (see States).
-        some_empty: durations, then with the full batch shape, are 0 between equal waypoints.
-    """
-    solve = _coefficients_with_empty if some_empty else _scaled_coefficients
-    return solve(xp, order, waypoints, durations, states)
-
-
-def _scaled_coefficients(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
-) -> Array:
-    """Return the coefficients (..., 2m, S, D), with time scaled where powers of it would over- or underflow.
-
-    The scale is a power of two: x^(i) / scale^i is exact.
     """
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
         scale = unit_factors(xp, durations)
@@ -218,10 +208,13 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def _coefficients_with_empty(
+def coefficients_with_empty(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Array:
-    """Return the coefficients where some durations are 0: drop those via-points, movement by movement."""
+    """Return least-cost coefficients where durations, with the full batch shape, may be 0 between equal waypoints.
+
+    The via-points after empty segments are dropped, movement by movement.
+    """
     *batch, knots, dimension = waypoints.shape
     count = int(np.prod(batch, dtype=int))
     if not count:
@@ -262,7 +255,7 @@ def _connect_pattern(
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
-    solved = _scaled_coefficients(xp, order, points, lengths, chosen)
+    solved = least_cost_coefficients(xp, order, points, lengths, chosen)
     zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
     columns = []
     for s, is_empty in enumerate(empty):

@@ -157,7 +157,7 @@ class ActionLayout:
         """
         action, start, goal = _arrays(action, start, goal)
         self._check_shapes(action.shape, start.shape, goal.shape)
-        xp = namespace_of(action)
+        xp = np if isinstance(action, np.ndarray) else namespace_of(action)  # mostly NumPy: without a call
         line = goal - start
         axes = frame(line, xp)
         ends = self.n_via * self.dimension

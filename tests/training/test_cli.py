@@ -180,7 +180,12 @@ def test_train_then_evaluate(trained, shipped, tmp_path, capsys):
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, tmp_path):
     few, file = load("validation", ENV).take(slice(3, 6)), tmp_path / "validation.npz"
     few.save(file)
-    for words in (("validation",), ("validation", "--n-scenes", 4), (file,), ("validation", "--n-scenes", 500)):
+    for words in (
+        ("validation",),
+        ("validation", "--n-scenes", 4),
+        (file,),
+        ("validation", "--n-scenes", 500),
+    ):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = {
         path.name: json.loads(path.read_text())["methods"]["straight line"]["scenes"]
