@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from viapoint.envs.geometry.half_space import HalfSpace
     from viapoint.envs.geometry.point_cloud import PointCloud
     from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+    from viapoint.envs.geometry.rows import observation_rows, obstacle_rows, obstacles_from_rows
     from viapoint.envs.geometry.shape import Shape
     from viapoint.envs.geometry.shapes import (
         SHAPES,
@@ -27,10 +28,7 @@ if TYPE_CHECKING:
         as_obstacle,
         as_obstacles,
         nearest_distance,
-        observation_rows,
-        obstacle_rows,
         obstacles_from_json,
-        obstacles_from_rows,
         obstacles_to_json,
         signed_distances,
     )
@@ -69,10 +67,10 @@ else:
         "family_sampler": "viapoint.envs.mdp.task",
         "load_arm": "viapoint.envs.arm_import.loader",
         "nearest_distance": "viapoint.envs.geometry.shapes",
-        "observation_rows": "viapoint.envs.geometry.shapes",
-        "obstacle_rows": "viapoint.envs.geometry.shapes",
+        "observation_rows": "viapoint.envs.geometry.rows",
+        "obstacle_rows": "viapoint.envs.geometry.rows",
         "obstacles_from_json": "viapoint.envs.geometry.shapes",
-        "obstacles_from_rows": "viapoint.envs.geometry.shapes",
+        "obstacles_from_rows": "viapoint.envs.geometry.rows",
         "obstacles_to_json": "viapoint.envs.geometry.shapes",
         "register_arm": "viapoint.envs.arms",
         "register_scene_family": "viapoint.envs.scenes.families",

@@ -13,6 +13,7 @@ import numpy as np
 from viapoint.envs.actions.via_points import ActionLayout, Timing
 from viapoint.envs.arms import ADULT, Arm, arm_of
 from viapoint.envs.common.validation import fewest_and_most, refuse_unknown
+from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.mdp.rewards import ReplanningRewardWeights, RewardWeights, StepRewardWeights
 from viapoint.envs.mdp.task import Task, distribution_of
 from viapoint.envs.sim.replan_triggers import TRIGGERS, Trigger
@@ -35,6 +36,8 @@ class EnvConfig:
     """True if the links must clear the obstacles, too; False for the hand alone."""
     n_obstacles: int | tuple[int, int] = (1, 5)
     """Number of obstacles, or the fewest and the most."""
+    shapes: str | Sequence[str] = CAPSULES
+    """Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length."""
     uniform_share: float = 0.0
     """Share of episodes whose ends and obstacles are uniform in the workspace."""
     duration_range: tuple[float, float] = (0.6, 1.2)
@@ -87,7 +90,9 @@ class EnvConfig:
             action=self._action_layout(arm.dimension),
             weights=self.weights_kind.of(self.reward_weights),
             scenes=distribution_of(arm)(
-                n_obstacles=fewest_and_most(self.n_obstacles), uniform_share=self.uniform_share
+                n_obstacles=fewest_and_most(self.n_obstacles),
+                shapes=check_shapes(self.shapes),
+                uniform_share=self.uniform_share,
             ),
             replanning=self.replanning,
             stepwise=self.stepwise,

@@ -25,6 +25,7 @@ from viapoint.envs.common.validation import (
     whole_number,
 )
 from viapoint.envs.config import EnvConfig, ViaPointConfig
+from viapoint.envs.geometry.rows import row_size
 from viapoint.envs.mdp.rewards import reward_terms
 from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
 from viapoint.envs.scenes.options import draw_given, given_scenes
@@ -159,6 +160,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             n_obstacles=self.observation_layout.n_rows,
             num_envs=self.num_envs,
             threads=threads,
+            shapes=self.task.scenes.shapes,
         )
         self._scheduler = Scheduler(threaded=threads != 1)
         self._executor = Executor(self._simulator)
@@ -257,8 +259,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             ValueError: An option is unknown, or has another shape or type.
         """
         d, n = self.arm.dimension, self.task.observation.n_rows
-        empty = Scenes(np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, n, 2 * d + 1)))
-        given = given_scenes(options, empty, self.arm)._asdict()
+        shapes = self.task.scenes.shapes
+        empty = Scenes(
+            np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, n, row_size(d, shapes)))
+        )
+        given = given_scenes(options, empty, self.arm, shapes)._asdict()
         return {name: given[name] for name in options}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:

@@ -129,8 +129,8 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         speed, acceleration = self.steering.greatest
         twin = self.task.observation
         self.observation_layout = StepObservationLayout(
-            dimension=twin.dimension, joint_range=twin.joint_range, n_rows=twin.n_rows, speed=speed,
-            acceleration=acceleration, time_limit=self.control_steps * self.steering.control_step,
+            dimension=twin.dimension, joint_range=twin.joint_range, n_rows=twin.n_rows, shapes=twin.shapes,
+            speed=speed, acceleration=acceleration, time_limit=self.control_steps * self.steering.control_step,
         )  # fmt: skip
         self.action_names = self.steering.names
         self._motion = Motion.at_rest(np.zeros((self.num_envs, arm.dimension)))

@@ -129,7 +129,8 @@ class Arm(Protocol):
 class CollisionModel:
     """Bodies of an arm that must not touch obstacles: the hand alone, or every link as well.
 
-    Obstacles are rows (centre D, half-axis D, radius), [m]. Every clearance is in [m], negative for penetration and at
+    Obstacles are rows (centre D, half-axis D, radius), [m], or rows with shapes, see
+    :mod:`viapoint.envs.geometry.rows`. Every clearance is in [m], negative for penetration and at
     most :data:`~viapoint.envs.geometry.distance.MAX_CLEARANCE`.
     """
 

@@ -46,7 +46,7 @@ def ball_bounds(points: Single, radii: Single, obstacles: NDArray[np.floating]) 
     apart = np.stack((*(-2.0 * centre), one, np.add.reduce(centre * centre) - rounding), axis=-1)
     along = np.stack((*share, zero, -np.add.reduce(centre * share)), axis=-1)
     around = np.broadcast_to(radii, (number, places))[:, None]
-    square, least = square[..., None], np.where(parts[6] > 0.0, parts[6], np.float32(-np.inf))[..., None]
+    square, least = square[..., None], np.where(parts[-1] > 0.0, parts[-1], np.float32(-np.inf))[..., None]
     bounds = np.empty((number, rows, places), np.float32)
     several = max(CACHED // max(rows * places, 1), 1)
     for some in (slice(first, first + several) for first in range(0, number, several)):

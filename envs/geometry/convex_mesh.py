@@ -12,7 +12,7 @@ import numpy as np
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Index
 from viapoint.envs.common.validation import as_real_array
-from viapoint.envs.geometry.distance import nearest_on_segments
+from viapoint.envs.geometry.segments import nearest_on_segments
 from viapoint.envs.geometry.shape import (
     Components,
     Geom,
@@ -62,6 +62,7 @@ class ConvexMesh(Shape):
     """
 
     kind: ClassVar[str] = "convex_mesh"
+    in_scenes: ClassVar[bool] = False
 
     vertices: Array
     """Shape (V, 3), [m]."""

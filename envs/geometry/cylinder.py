@@ -39,6 +39,7 @@ class Cylinder(Shape):
 
     kind: ClassVar[str] = "cylinder"
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
+    round: ClassVar[bool] = True
 
     radius: Array
     """Shape (...,), [m]."""
@@ -54,6 +55,15 @@ class Cylinder(Shape):
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo cylinder."""
         return self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, self.radius, self.half_length)
+
+    @classmethod
+    def bound(cls, half: Float) -> tuple[Float, Float]:
+        """Return the capsule around the cylinder's axis; see :meth:`Shape.bound`."""
+        return np.array([0.0, 0.0, 1.0]) * half[..., 2:], half[..., 0]
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        return {"radius": half[..., 0], "half_length": half[..., 2]}
 
     def _signed(self, points: Components) -> Array:
         return _signed(points, self.radius, self.half_length)

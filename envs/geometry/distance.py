@@ -1,8 +1,9 @@
 """Exact distances between the arm and the obstacles.
 
-All bodies are capsules: an obstacle is a row (centre D, half-axis vector D, radius 1) in [m], a link a segment with a
-radius, and the hand a point with one. The clearance of two capsules is the distance of their axes less both radii. The
-functions are batched over leading dimensions and accept NumPy arrays and torch tensors. They share these arguments:
+An obstacle is a row (centre D, half-axis vector D, radius 1) of a capsule in [m], a link a segment with a radius, and
+the hand a point with one. The clearance of two capsules is the distance of their axes less both radii. The functions
+are batched over leading dimensions and accept NumPy arrays and torch tensors; those that return clearance accept rows
+with other shapes, too (:mod:`viapoint.envs.geometry.rows`), as NumPy arrays. They share these arguments:
 
     obstacles   rows of n obstacles, shape (..., n, 2 D + 1), [m]
     present     True for rows that are obstacles, shape (..., n)
@@ -15,15 +16,18 @@ Clearance is negative for penetration and at most MAX_CLEARANCE.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from typing import Any
 
-from viapoint.envs.common.arrays import clamp, dot
+import numpy as np
+
+from viapoint.envs.common.arrays import in_space
+from viapoint.envs.common.types import Bool, Float, Index
+from viapoint.envs.geometry.rows import has_shapes, pair_distance
+from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 MAX_CLEARANCE = 1.0
 """Greatest clearance that is reported, also without obstacles, [m]."""
-TINY = 1e-12
-"""Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
 
 
 def hand_clearance(points: Array, radius: float, obstacles: Array, present: Array) -> Array:
@@ -35,6 +39,8 @@ def hand_clearance(points: Array, radius: float, obstacles: Array, present: Arra
         obstacles: See the module.
         present: See the module.
     """
+    if has_shapes(obstacles):
+        return _shape_clearance(points, None, radius, obstacles, present)
     xp = namespace_of(points)
     nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
     return _clearance(xp, nearest, obstacles[..., -1] + radius, present)
@@ -49,6 +55,10 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
         obstacles: See the module.
         present: See the module.
     """
+    if has_shapes(obstacles):
+        ends = np.reshape(links, (*links.shape[:-4], -1, 2, links.shape[-1]))
+        every = np.tile(radii, links.shape[-4])
+        return _shape_clearance(ends[..., 0, :], ends[..., 1, :], every, obstacles, present)
     xp, each = namespace_of(links), []
     for i, radius in enumerate(radii):
         # Only the least squared distance needs its root: 6 to 10 % faster than all clearances first.
@@ -91,55 +101,66 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array, drif
     return segment_axis_squared(gap, link, axis)
 
 
-def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
-    """Return the squared distance of points p from segments c + t a, -1 <= t <= 1, [m^2].
-
-    The nearest point of the segment is at t = (p - c) . a / |a|^2, clamped.
-
-    Args:
-        offset: Components of p - c, [m].
-        axis: Components of a, [m].
-    """
-    square = dot(axis, axis)
-    along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)
-    rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
-    return dot(rest, rest)
-
-
-def segment_axis_squared(gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]) -> Array:
-    """Return the squared distance of segments p + s u from segments q + t v, 0 <= s, t <= 1, [m^2].
-
-    The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
-    Detection, 2005, section 5.1.9, in its notation): the point of the link nearest to the obstacle's line, the point of
-    the obstacle's axis nearest to that, and the point of the link nearest to that.
-
-    Args:
-        gap: Components of p - q, [m].
-        link: Components of u, [m].
-        axis: Components of v, [m].
-    """
-    on_link, on_axis = nearest_on_segments(gap, link, axis)
-    rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
-    return dot(rest, rest)
-
-
-def nearest_on_segments(
-    gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Return s and t of the nearest points of two segments; see :func:`segment_axis_squared`."""
-    xp = namespace_of(gap[0])
-    a, e, b = dot(link, link), dot(axis, axis), dot(link, axis)
-    c, f = dot(link, gap), dot(axis, gap)
-    a, e = xp.maximum(a, TINY), xp.maximum(e, TINY)
-    determinant = a * e - b * b
-    crosses = determinant > TINY * a * e  # else parallel: any point of the link will do to begin with
-    crossing = (b * f - c * e) / xp.where(crosses, determinant, 1.0)
-    on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
-    on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
-    return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis
-
-
 def _clearance(xp: Namespace, squared: Array, radii: Array, present: Array) -> Array:
     """Return clearance from squared distances of axes; the small summand keeps gradients at distance 0 finite."""
     distance = xp.sqrt(squared + 1e-24) - radii
     return xp.where(present, xp.minimum(distance, MAX_CLEARANCE), xp.full_like(distance, MAX_CLEARANCE))
+
+
+def pair_clearance(first: Float, second: Float, rows: Float, radii: Float) -> Float:
+    """Return the clearance of M links at T times, each from one obstacle, shape (M, T), [m].
+
+    Args:
+        first: One end of the links' axes, shape (M, T, 3), [m].
+        second: Other end, shape (M, T, 3), [m].
+        rows: Obstacles of either kind, shape (M, .), [m].
+        radii: Radii of the links, shape (M,), [m].
+    """
+    if not has_shapes(rows):
+        squared = segment_distance_squared(first, second, rows[:, None])[:, 0]
+        return np.asarray(np.sqrt(squared) - (rows[:, -1] + radii)[:, None])
+    number, times, _ = first.shape
+    each = np.repeat(rows, times, axis=0)
+    distance = pair_distance(each, first.reshape(-1, 3), second.reshape(-1, 3))
+    return np.asarray(distance.reshape(number, times) - radii[:, None])
+
+
+def _shape_clearance(
+    first: Float, second: Float | None, radius: Any, obstacles: Float, present: Bool
+) -> Float:
+    """Return the least clearance of points or segments, shape (..., T, D), from shapes, shape (..., n), [m].
+
+    The distance from the capsule around a shape is a lower bound. The exact distance is computed where this bound is
+    least, and then where the bound is below that.
+
+    Args:
+        first: Points, or one end of segments, shape (..., T, D), [m].
+        second: Other end; None for points.
+        radius: Radii of the points or segments, shape (T,) or one for all, [m].
+        obstacles: Rows with shapes, shape (..., n, .), [m].
+        present: See the module.
+    """
+    if second is None:
+        squared = point_distance_squared(first, obstacles)
+    else:
+        squared = segment_distance_squared(first, second, obstacles)
+    bound = np.sqrt(squared) - obstacles[..., -1:] - radius
+    shape = (*bound.shape, 3)
+    ends = [
+        np.broadcast_to(in_space(end)[..., None, :, :], shape).reshape(-1, *shape[-2:])
+        for end in (first, second)
+        if end is not None
+    ]
+    rows, bound = obstacles.reshape(-1, obstacles.shape[-1]), bound.reshape(-1, shape[-2])
+    radii = np.broadcast_to(radius, shape[-2:-1])
+
+    def exact(row: Index, which: Index) -> Float:
+        distance = pair_distance(rows[row], *(end[row, which] for end in ends))
+        return np.asarray(distance - radii[which])
+
+    each, nearest = np.arange(len(rows)), bound.argmin(axis=-1)
+    least = exact(each, nearest)
+    each, which = np.nonzero(bound < least[:, None])
+    np.minimum.at(least, each, exact(each, which))
+    clearance = np.minimum(least.reshape(shape[:-2]), MAX_CLEARANCE)
+    return np.where(present, clearance, MAX_CLEARANCE)

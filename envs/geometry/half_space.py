@@ -9,8 +9,13 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.shape import Components, Geom, Shape, quaternion_to
+from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape, quaternion_to
 from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+
+EXTENT = 1.0
+"""Half length of the cube that stands for a half-space in rows of numbers, [m]."""
+REACH = 5.0
+"""Radius of a sphere about that cube, beyond which no arm reaches, [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +32,7 @@ class HalfSpace(Shape):
     """
 
     kind: ClassVar[str] = "half_space"
+    round: ClassVar[bool] = True
 
     @classmethod
     def facing(cls, normal: Any, position: Any = (0.0, 0.0, 0.0), name: str = "") -> Self:
@@ -59,8 +65,36 @@ class HalfSpace(Shape):
         return [np.array(outline)] if outline else []
 
     def box(self) -> tuple[Float, Float]:
-        """Return the position and zeros: no box contains a half-space."""
-        return to_numpy(self.position), np.zeros(3)
+        """Return the cube of half length EXTENT below the point of the surface that is nearest to the origin."""
+        normal = self.rotation[:, 2]
+        return (to_numpy(self.position) @ normal - EXTENT) * normal, np.full(3, EXTENT)
+
+    @classmethod
+    def from_box(cls, centre: Array, quaternion: Array, half: Array) -> Self:
+        """Return half-spaces from the cubes of :meth:`box`; see :meth:`Shape.from_box`."""
+        own = super().from_box(centre, quaternion, half)
+        depth = half[..., 2]
+        position = [centre[..., i] + depth * axis for i, axis in enumerate(own._axes[2])]
+        object.__setattr__(own, "position", namespace_of(centre).stack(position, -1))
+        return own
+
+    @classmethod
+    def bound(cls, half: Float) -> tuple[Float, Float]:
+        """Return a sphere that contains all of the half-space that an arm can reach; see :meth:`Shape.bound`."""
+        return np.zeros_like(half), np.full_like(half[..., 0], REACH)
+
+    def in_plane(self) -> tuple[Float, Float]:
+        """Return the box of a half-space that is bounded by a line in the plane; see :meth:`Shape.in_plane`."""
+        if abs(self.rotation[2, 2]) > FLAT:
+            raise ValueError(
+                f"half_space must have a horizontal normal in the plane, got {self.rotation[:, 2].tolist()}"
+            )
+        return self.box()
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        del half
+        return {}
 
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo plane."""

@@ -15,7 +15,7 @@ import numpy as np
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Index, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
-from viapoint.envs.geometry.distance import MAX_CLEARANCE, segment_distance_squared
+from viapoint.envs.geometry.distance import MAX_CLEARANCE, pair_clearance
 
 STRETCH = 8
 """Times per stretch."""
@@ -53,7 +53,7 @@ def nearest_approach(
     Args:
         traced: Positions of the links.
         radii: Radii of the L links, [m].
-        obstacles: Rows of obstacles, shape (N, n, 7), [m].
+        obstacles: Rows of obstacles of either kind, shape (N, n, .), [m].
         present: True for rows that are obstacles, shape (N, n).
         last: Index of each movement's last time, shape (N,); by default all times count.
     """
@@ -77,8 +77,7 @@ def nearest_approach(
     def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:
         """Return the clearance of M links, each from one obstacle at some times, shape (M, .), [m]."""
         first, second = (_take(places, each[:, None], times, links[link, end, None]) for end in (0, 1))
-        squared = segment_distance_squared(first, second, obstacles[each, row][:, None])[:, 0]
-        return np.asarray(np.sqrt(squared) - (obstacles[each, row, -1] + size[link])[:, None])
+        return pair_clearance(first, second, obstacles[each, row], size[link])
 
     def at_middle(each: Index, ball: Index) -> Float:
         """Return the clearance of balls from obstacles in the middle of their stretches, shape (M,), [m]."""

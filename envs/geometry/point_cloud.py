@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array
-from viapoint.envs.geometry.distance import TINY
+from viapoint.envs.geometry.segments import TINY
 from viapoint.envs.geometry.shape import (
     OUTLINE_POINTS,
     Components,
@@ -39,6 +39,7 @@ class PointCloud(Shape):
     """
 
     kind: ClassVar[str] = "point_cloud"
+    in_scenes: ClassVar[bool] = False
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
 
     points: Array

@@ -10,8 +10,9 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.distance import point_axis_squared, segment_axis_squared
+from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
 from viapoint.envs.geometry.shape import (
+    FLAT,
     GUARD,
     Components,
     Geom,
@@ -36,6 +37,7 @@ class Sphere(Shape):
 
     kind: ClassVar[str] = "sphere"
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
+    round: ClassVar[bool] = True
 
     radius: Array
     """Shape (...,), [m]."""
@@ -48,6 +50,22 @@ class Sphere(Shape):
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo sphere."""
         return self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, self.radius)
+
+    @classmethod
+    def bound(cls, half: Float) -> tuple[Float, Float]:
+        """Return the sphere itself; see :meth:`Shape.bound`."""
+        return np.zeros_like(half), half[..., 0]
+
+    def in_plane(self) -> tuple[Float, Float]:
+        """Return the box of a sphere in the plane; see :meth:`Shape.in_plane`."""
+        centre, half = self.box()
+        if abs(centre[2]) > FLAT:
+            raise ValueError(f"sphere must lie in the plane, with z = 0, got centre {centre.tolist()}")
+        return centre, half
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        return {"radius": half[..., 0]}
 
     def _relative(self, points: Array) -> Components:
         return self._offset(points)
@@ -77,6 +95,7 @@ class Capsule(Shape):
 
     kind: ClassVar[str] = "capsule"
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
+    round: ClassVar[bool] = True
 
     radius: Array
     """Shape (...,), [m]."""
@@ -120,6 +139,25 @@ class Capsule(Shape):
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo capsule."""
         return self._geom(mujoco.mjtGeom.mjGEOM_CAPSULE, self.radius, self.half_length)
+
+    @classmethod
+    def bound(cls, half: Float) -> tuple[Float, Float]:
+        """Return the capsule itself; see :meth:`Shape.bound`."""
+        return np.array([0.0, 0.0, 1.0]) * (half[..., 2:] - half[..., :1]), half[..., 0]
+
+    def in_plane(self) -> tuple[Float, Float]:
+        """Return the box of a capsule in the plane; see :meth:`Shape.in_plane`."""
+        centre, half = self.box()
+        if max(abs(centre[2]), abs(float(self.half_axis[2]))) > FLAT:
+            raise ValueError(
+                f"capsule must lie in the plane, with z = 0 and without a rise, got centre {centre.tolist()} and "
+                f"half-axis {self.half_axis.tolist()}"
+            )
+        return centre, half
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        return {"radius": half[..., 0], "half_length": half[..., 2] - half[..., 0]}
 
     @property
     def _half_axis(self) -> Components:

@@ -8,6 +8,8 @@ kind is a subclass with a few methods that work in the shape's own frame, and an
     _support     farthest point in each direction
     geoms        MuJoCo geoms
     _nearest     optional: point of a segment with the least signed distance; a search by default
+    _of_half     optional: parameters from the half lengths of the bounding box; `size` by default
+    bound        optional: capsule around the shape; around its bounding box by default
 
 The signed distance of a segment is the least of its points'. It is the usual distance of two bodies where they do not
 touch, and negative where they overlap. For a convex shape it is convex along the segment, because the signed distance
@@ -27,7 +29,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import clamp, dot, norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.distance import TINY
+from viapoint.envs.geometry.segments import TINY
 from viapoint.primitives.array_api import (
     Array,
     Namespace,
@@ -50,6 +52,10 @@ SEARCH_STEPS = 40
 """Steps of the golden-section search; its interval is then 5e-9 of the segment."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Share of the interval that remains after a step of the golden-section search."""
+FLAT = 1e-9
+"""Greatest height of obstacles in the plane, [m]; rounding of quaternions."""
+TALL = 1.0
+"""Half height of obstacles of arms in the plane whose height does not matter, [m]."""
 OUTLINE_POINTS = 128
 """Corners of the outline of a round shape."""
 
@@ -91,7 +97,11 @@ class Shape:
     kind: ClassVar[str] = ""
     """Name of the shape in dictionaries and in :data:`~viapoint.envs.geometry.shapes.SHAPES`."""
     sizes: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    """Names of the parameters that must be positive, with the shape of one value."""
+    """Names of the parameters that must be positive, with the shape of one value, in the order of MuJoCo's sizes."""
+    in_scenes: ClassVar[bool] = True
+    """Flag: the bounding box determines the shape, so that scenes can hold it as a row of numbers."""
+    round: ClassVar[bool] = False
+    """Flag: the shape is symmetric under rotations about the z axis of its frame."""
 
     position: Array = (0.0, 0.0, 0.0)
     """Origin of the shape's frame in the world, shape (..., 3), [m]."""
@@ -197,6 +207,60 @@ class Shape:
             fresh = at(low + xp.where(lower, 1.0 - GOLDEN, GOLDEN) * width)
             left, right = xp.where(lower, fresh, right), xp.where(lower, left, fresh)
         return best_of(xp, at, (low + 0.5 * width, xp.zeros_like(low), xp.ones_like(low)))
+
+    # Rows of scenes
+
+    @classmethod
+    def from_box(cls, centre: Array, quaternion: Array, half: Array) -> Self:
+        """Return a batch of shapes from the boxes of :meth:`box`, without checks.
+
+        Args:
+            centre: Shape (..., 3), [m].
+            quaternion: Shape (..., 4).
+            half: Half lengths of the boxes, shape (..., 3), [m].
+        """
+        own = object.__new__(cls)
+        own.__dict__.update(position=centre, quaternion=quaternion, name="", **cls._of_half(half))
+        return own
+
+    @classmethod
+    def geom_size(cls, half: Float) -> Float:
+        """Return the sizes of MuJoCo geoms from the half lengths of the bounding boxes, shape (..., 3) both, [m]."""
+        found, values = np.zeros(half.shape), cls._of_half(half)
+        sizes = [values[name].reshape(*half.shape[:-1], -1) for name in cls.sizes]
+        for i, size in enumerate(np.moveaxis(np.concatenate(sizes, axis=-1), -1, 0) if sizes else ()):
+            found[..., i] = size
+        return found
+
+    @classmethod
+    def bound(cls, half: Float) -> tuple[Float, Float]:
+        """Return half-axis, in the shape's frame, and radius of a capsule that contains the shape, [m].
+
+        Args:
+            half: Half lengths of the bounding box, shape (..., 3), [m].
+        """
+        axis = np.where(np.arange(3) == half.argmax(axis=-1)[..., None], half, 0.0)
+        return axis, norm(half - axis)
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        """Return the parameters of shapes from the half lengths of their bounding boxes."""
+        return {"size": half}
+
+    def in_plane(self) -> tuple[Float, Float]:
+        """Return :meth:`box` of an obstacle of an arm in the plane: as tall as TALL where its height does not matter.
+
+        Raises:
+            ValueError: The cross-section at the height 0 is not that of all heights.
+        """
+        centre, half = self.box()
+        upright = abs(abs(self.rotation[2, 2]) - 1.0) < FLAT
+        if abs(centre[2]) > FLAT or not upright:
+            raise ValueError(
+                f"{self.kind} must lie in the plane, with its centre at z = 0 and its z axis upright, got centre "
+                f"{centre.tolist()} and quaternion {to_numpy(self.quaternion).tolist()}"
+            )
+        return centre, np.array([*half[:2], TALL])
 
     # Descriptions
 

@@ -11,8 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space
-from viapoint.envs.common.types import Float, Single
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.box import Box
 from viapoint.envs.geometry.convex_mesh import ConvexMesh
 from viapoint.envs.geometry.cylinder import Cylinder
@@ -26,10 +25,6 @@ SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 }
 """Shapes by their names in dictionaries."""
-FLAT = 1e-9
-"""Greatest height of obstacles in the plane, [m]; rounding of quaternions."""
-POSE_SIZE = 13
-"""Number of values of one obstacle in :func:`observation_rows` after those of its kind."""
 
 
 def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
@@ -200,110 +195,6 @@ def nearest_distance(
             )[:, 0]
             least[some] = np.minimum(least[some], found)
     return least.reshape(shape)
-
-
-def observation_rows(obstacles: Sequence[Shape], n_rows: int) -> Single:
-    """Return obstacles as rows of numbers for networks, one for each; absent rows are zero.
-
-    A row is (shape one-hot, centre 3, rotation 6, half lengths 3, present): the centre and half lengths are those of
-    the bounding box along the axes of the shape's frame, [m], and the rotation is the first two axes of the frame (Zhou
-    et al., On the continuity of rotation representations in neural networks, 2019).
-
-    Example:
-        >>> from viapoint.envs import Box, observation_rows
-        >>> rows = observation_rows([Box((0.1, 0.2, 0.25), position=(0.5, 0.0, 0.25))], n_rows=2)
-        >>> rows[0, 7:].astype(float).round(3).tolist()  # behind the one-hot
-        [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.2, 0.25, 1.0]
-    """
-    if len(obstacles) > n_rows:
-        raise ValueError(f"there may be at most {n_rows} obstacles, got {len(obstacles)}")
-    kinds = list(SHAPES)
-    rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
-    for row, each in zip(rows, obstacles, strict=False):
-        row[kinds.index(each.kind)] = 1.0
-        centre, half = each.box()
-        row[len(kinds) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
-    return rows
-
-
-def obstacle_rows(obstacles: Any, dimension: int) -> Any:
-    """Return spheres and capsules as the rows of scenes, (centre D, half-axis D, radius), shape (n, 2 D + 1), [m].
-
-    Args:
-        obstacles: Shapes and dictionaries, or one list of them for each of N scenes; anything else is returned as it
-            is, such as rows.
-        dimension: D. In the plane, shapes lie at the height 0 and capsules do not rise.
-
-    Returns:
-        Rows of shape (n, 2 D + 1); for N lists (N, n, 2 D + 1), where rows that a scene lacks are zero.
-
-    Raises:
-        ValueError: A shape is not allowed in scenes, or does not lie in the plane.
-
-    Example:
-        >>> from viapoint.envs import Capsule, obstacle_rows
-        >>> obstacle_rows([Capsule.between((0.0, 0.3), (0.2, 0.3), radius=0.02)], dimension=2).round(3).tolist()
-        [[0.1, 0.3, 0.1, 0.0, 0.02]]
-    """
-    if not isinstance(obstacles, list | tuple):
-        return obstacles
-    if any(isinstance(each, Shape | Mapping) for each in obstacles):
-        return np.array([_row(i, o, dimension) for i, o in enumerate(as_obstacles(obstacles))])
-    inner = [each for each in obstacles if isinstance(each, list | tuple)]
-    if not any(isinstance(each, Shape | Mapping) for scene in inner for each in scene):
-        return obstacles
-    rows = np.zeros((len(obstacles), max(map(len, obstacles)), 2 * dimension + 1))
-    for i, scene in enumerate(obstacles):
-        try:
-            if scene:
-                rows[i, : len(scene)] = obstacle_rows(scene, dimension)
-        except ValueError as error:
-            raise ValueError(f"scene {i}: {error}") from None
-    return rows
-
-
-def obstacles_from_rows(rows: Float) -> list[Shape]:
-    """Return the obstacles of one scene as spheres and capsules; rows without a radius are none.
-
-    Args:
-        rows: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m].
-
-    Example:
-        >>> import numpy as np
-        >>> from viapoint.envs import obstacles_from_rows
-        >>> obstacles_from_rows(np.array([(0.1, 0.3, 0.1, 0.0, 0.02), (0.0, 0.0, 0.0, 0.0, 0.0)]))[0].half_length
-        array(0.1)
-    """
-    dimension, found = (rows.shape[-1] - 1) // 2, list[Shape]()
-    for row in rows[rows[:, -1] > 0.0]:
-        centre, half = in_space(row[:dimension]), in_space(row[dimension:-1])
-        bar = half.any()
-        found.append(
-            Capsule.between(centre - half, centre + half, row[-1])
-            if bar
-            else Sphere(row[-1], position=centre)
-        )
-    return found
-
-
-def _row(index: int, obstacle: Shape, dimension: int) -> Float:
-    """Return a sphere or capsule as a row of a scene."""
-    if not isinstance(obstacle, Sphere | Capsule):
-        raise ValueError(
-            f"obstacle {index}: environments simulate spheres and capsules; {obstacle.kind} is for distances only"
-        )
-    half = np.asarray(obstacle.half_axis) if isinstance(obstacle, Capsule) else np.zeros(3)
-    centre = np.asarray(obstacle.position)
-    if centre.shape != (3,) or half.shape != (3,):
-        raise ValueError(
-            f"obstacle {index}: {obstacle.kind} must be one shape, got a batch of {centre.shape[:-1]}"
-        )
-    if np.abs(np.concatenate((centre[dimension:], half[dimension:]))).max(initial=0.0) > FLAT:
-        raise ValueError(
-            f"obstacle {index}: {obstacle.kind} must lie in the plane, with z = 0 and without a rise, got centre "
-            f"{centre.tolist()} and half-axis {half.tolist()}"
-        )
-    return np.concatenate((centre[:dimension], half[:dimension], [float(to_numpy(obstacle.radius))]))
 
 
 def add_to_model(

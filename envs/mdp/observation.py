@@ -12,9 +12,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.types import Float, Numbers, Observation
+from viapoint.envs.geometry.rows import CAPSULES, observed_rows, rows_of_observed
 from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
-from viapoint.envs.scenes.scene import LARGEST_HALF_AXIS, LARGEST_RADIUS, Scenes
+from viapoint.envs.scenes.scene import (
+    FARTHEST_SHAPE,
+    LARGEST_HALF_AXIS,
+    LARGEST_HALF_LENGTH,
+    LARGEST_RADIUS,
+    Scenes,
+)
 from viapoint.primitives.array_api import Array
 
 if TYPE_CHECKING:
@@ -40,17 +47,21 @@ class ObservationLayout:
     """Names, sizes, bounds and units of the observation's parts.
 
     `hand` and `goal` [m], `joints` [rad] and, where there may be obstacles, `obstacles`: n rows of centre (D),
-    half-axis vector (D) and radius [m] and a 1 for present, flattened. The rows are in random order.
+    half-axis vector (D) and radius [m] and a 1 for present, flattened. Where obstacles may have other shapes than
+    capsules, `obstacles` are n rows (shape one-hot, centre 3 [m], rotation 6, half lengths 3 [m], present), not
+    flattened, see :func:`~viapoint.envs.geometry.rows.observation_rows`. The rows are in random order.
     """
 
     dimension: int
     joint_range: tuple[tuple[float, float], ...]
     n_rows: int
+    shapes: tuple[str, ...] = CAPSULES
+    """Names of the shapes that obstacles may have."""
 
     @classmethod
-    def of(cls, arm: Arm, n_rows: int) -> ObservationLayout:
-        """Return the layout for an arm and at most `n_rows` obstacles."""
-        return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows)
+    def of(cls, arm: Arm, n_rows: int, shapes: tuple[str, ...] = CAPSULES) -> ObservationLayout:
+        """Return the layout for an arm and at most `n_rows` obstacles of some shapes."""
+        return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows, shapes=shapes)
 
     @functools.cached_property
     def _joint_bounds(self) -> tuple[Float, Float]:
@@ -72,7 +83,12 @@ class ObservationLayout:
             "goal": (-point, point),
             "joints": (low, high),
         }
-        if self.n_rows:
+        if self.n_rows and self.shapes != CAPSULES:
+            kinds = np.ones(len(self.shapes))
+            row = np.concatenate((kinds, 3 * [FARTHEST_SHAPE], np.ones(6), 3 * [LARGEST_HALF_LENGTH], [1.0]))
+            lowest = np.concatenate((0.0 * kinds, 3 * [-FARTHEST_SHAPE], -np.ones(6), np.zeros(4)))
+            bounds["obstacles"] = np.tile(lowest, (self.n_rows, 1)), np.tile(row, (self.n_rows, 1))
+        elif self.n_rows:
             half = np.full(self.dimension, LARGEST_HALF_AXIS)
             row = np.concatenate((point, half, [LARGEST_RADIUS, 1.0]))
             lowest = np.concatenate((-point, -half, [0.0, 0.0]))
@@ -95,15 +111,29 @@ class ObservationLayout:
             "joints": np.clip(joints, low, high),
         }
         if self.n_rows:
-            rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1)
-            parts["obstacles"] = rows.reshape(len(rows), -1)
+            parts["obstacles"] = self.observed_obstacles(scenes)
         return {name: part.astype(np.float32) for name, part in parts.items()}
+
+    def observed_obstacles(self, scenes: Scenes) -> Float:
+        """Return the `obstacles` part of N scenes in double precision, shape (N, .) or (N, n, .)."""
+        if self.shapes != CAPSULES:
+            return observed_rows(scenes.obstacles, self.shapes)
+        rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1)
+        return np.asarray(rows.reshape(len(rows), -1))
 
     def obstacles(self, flat: Array) -> ObstacleRows:
         """Return views of the `obstacles` part, shape (..., n (2 D + 2)), by name, in NumPy or torch."""
-        rows = flat.reshape((*flat.shape[:-1], self.n_rows, self.row_size))
+        rows = flat.reshape((*flat.shape[:-1], flat.shape[-1] // self.row_size, self.row_size))
         d = self.dimension
         return ObstacleRows(rows[..., :d], rows[..., d : 2 * d], rows[..., 2 * d], rows[..., 2 * d + 1])
+
+    def scene_rows(self, part: Numbers) -> Numbers:
+        """Return the `obstacles` part as rows of scenes, shape (..., n, .), see :mod:`viapoint.envs.geometry.rows`."""
+        if self.shapes != CAPSULES:
+            return rows_of_observed(part, self.shapes, self.dimension)
+        seen = self.obstacles(part)
+        radius = np.where(seen.present > 0.5, seen.radius, 0.0)[..., None]
+        return np.concatenate((seen.centre, seen.half_axis, radius), axis=-1)
 
 
 GREATEST_SPEED = 5.0

@@ -46,7 +46,7 @@ class Task:
     @property
     def observation(self) -> ObservationLayout:
         """Layout of the observation."""
-        return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1])
+        return ObservationLayout.of(self.arm, self.scenes.n_obstacles[1], self.scenes.shapes)
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""

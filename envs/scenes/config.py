@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from viapoint.envs.common.validation import check_increasing_pair, is_number
+from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.scenes.families import MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
 
@@ -23,6 +24,8 @@ class SceneDistribution:
 
     n_obstacles: tuple[int, int] = (1, 5)
     """Fewest and most obstacles."""
+    shapes: tuple[str, ...] = CAPSULES
+    """Names of the shapes that obstacles may have; spheres are capsules without a length."""
     uniform_share: float = 0.0
     """Share of scenes with ends and obstacles that are uniform in the workspace, see
     :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
@@ -54,6 +57,7 @@ class SceneDistribution:
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_shapes(self.shapes)
         check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
@@ -67,6 +71,8 @@ class SpaceDistribution(SpatialSizes):
 
     n_obstacles: tuple[int, int] = (1, 6)
     """Fewest and most obstacles; a scene has at least as many as its family needs."""
+    shapes: tuple[str, ...] = CAPSULES
+    """Names of the shapes that obstacles may have; spheres are capsules without a length."""
     uniform_share: float = 0.0
     """Share of scenes with ends and obstacles that are uniform in the workspace, see
     :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
@@ -89,6 +95,7 @@ class SpaceDistribution(SpatialSizes):
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_shapes(self.shapes)
         check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:

@@ -1,14 +1,21 @@
-"""Random numbers, feasible paths and vectors that all samplers of obstacles share."""
+"""Random numbers, feasible paths, vectors and shapes that all samplers of obstacles share."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Bool, Float, Index
+from viapoint.envs.geometry.rows import CAPSULES, dimension_of, has_shapes, shape_rows, turn_up_to, widened
+from viapoint.envs.geometry.shape import TALL
+from viapoint.envs.geometry.shapes import SHAPES
+
+RESHAPE_NUMBERS = 3
+"""Uniform numbers of an obstacle that decide its shape."""
 
 
 class Uniforms:
@@ -184,3 +191,64 @@ def present_first(rows: Float, count: int) -> Float:
 def shuffle_rows(rows: Float, chance: Float) -> Float:
     """Return obstacles, shape (N, K, 2 D + 1), in the order of uniform numbers, shape (N, K)."""
     return np.take_along_axis(rows, np.argsort(chance, axis=-1, kind="stable")[..., None], axis=1)
+
+
+def reshaped(rows: Float, u: Float, shapes: Sequence[str]) -> Float:
+    """Return obstacles as rows with shapes, in which every capsule has become one of some shapes inside it.
+
+    Whatever is clear of a capsule is clear of a shape inside it. Rows that have shapes already stay as they are.
+
+    Args:
+        rows: Rows of either kind, shape (..., .), [m].
+        u: Uniform numbers, shape (..., RESHAPE_NUMBERS).
+        shapes: Names of the shapes of scenes; half-spaces fit into no capsule.
+    """
+    names = [name for name in shapes if name != "half_space"]
+    if has_shapes(rows) or not names or tuple(shapes) == CAPSULES:
+        return rows if tuple(shapes) == CAPSULES else widened(rows)
+    found = np.zeros_like(widened(rows))
+    which = np.where(rows[..., -1] > 0.0, (u[..., 0] * len(names)).astype(np.int64), -1)
+    for number, name in enumerate(names):
+        some = which == number
+        quaternion, half = _inside(name, rows[some], u[some, 1:])
+        found[some] = shape_rows(name, rows[some][:, : dimension_of(rows)], quaternion, half)
+    return found
+
+
+def box_rows(centre: Float, heading: Float, half: Float) -> Float:
+    """Return upright boxes as rows with shapes, shape (..., .), [m].
+
+    Args:
+        centre: Shape (..., D), [m].
+        heading: Horizontal vectors along the first axes of the boxes, shape (..., D).
+        half: Half lengths along the heading, to its left and upwards, shape (..., 3), [m].
+    """
+    return shape_rows("box", centre, yaw(heading), half)
+
+
+def yaw(heading: Float) -> Float:
+    """Return the quaternions, shape (..., 4), that turn the first axis to horizontal vectors, shape (..., D)."""
+    angle = 0.5 * np.arctan2(heading[..., 1], heading[..., 0])
+    none = np.zeros_like(angle)
+    return np.stack((np.cos(angle), none, none, np.sin(angle)), axis=-1)
+
+
+def _inside(name: str, rows: Float, u: Float) -> tuple[Float, Float]:
+    """Return quaternions and half lengths of shapes that touch the capsules around them from inside."""
+    d, radius = dimension_of(rows), rows[:, -1]
+    axis = rows[:, d : 2 * d]
+    length = norm(axis)
+    if name == "sphere":
+        return turn_up_to(in_space(axis), 0.0 * length), np.stack(3 * [radius], axis=-1)
+    if name == "capsule":
+        return turn_up_to(in_space(axis), length), np.stack((radius, radius, length + radius), axis=-1)
+    slant, aspect = 0.5 * np.pi * (0.15 + 0.7 * u.T)
+    wide, long = radius * np.cos(slant), length + radius * np.sin(slant)
+    if d == 2 and SHAPES[name].round:
+        return turn_up_to(in_space(axis), 0.0 * length), np.stack(
+            (radius, radius, 0.0 * radius + TALL), axis=-1
+        )
+    if d == 2:
+        return yaw(axis), np.stack((long, wide, 0.0 * wide + TALL), axis=-1)
+    across = (wide, wide) if SHAPES[name].round else (wide * np.cos(aspect), wide * np.sin(aspect))
+    return turn_up_to(axis, length), np.stack((*across, long), axis=-1)

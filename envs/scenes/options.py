@@ -9,7 +9,7 @@ import numpy as np
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.shapes import obstacle_rows
+from viapoint.envs.geometry.rows import CAPSULES, obstacle_rows, row_size, widened
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
@@ -40,13 +40,14 @@ def draw_given(
         ValueError: A scene is impossible, with the reason.
     """
     collision_model, arm, number = sampler.collision_model, sampler.collision_model.arm, len(generators)
-    options = _with_rows(options, arm.dimension)
+    shapes = sampler.distribution.shapes
+    options = _with_rows(options, arm.dimension, shapes)
     nothing = Scenes(
         np.full((number, arm.dimension), np.nan),
         np.full((number, arm.dimension), np.nan),
-        np.zeros((number, n_rows, 2 * arm.dimension + 1)),
+        np.zeros((number, n_rows, row_size(arm.dimension, shapes))),
     )
-    given = given_scenes(options, nothing, arm)
+    given = given_scenes(options, nothing, arm, shapes)
     with np.errstate(invalid="ignore"):
         check_scenes(
             given, collision_model
@@ -78,7 +79,7 @@ def _sample(
         sampled = sampler(generators, (given.start, given.goal))
     except RuntimeError as error:
         raise ValueError(f"{error}; give the obstacles too, or ends farther inside the arm's reach") from None
-    return given_scenes(options, sampled, sampler.collision_model.arm)
+    return given_scenes(options, sampled, sampler.collision_model.arm, sampler.distribution.shapes)
 
 
 def _rows(value: Any, rows: Int, number: int, batched: int) -> Any:
@@ -87,21 +88,24 @@ def _rows(value: Any, rows: Int, number: int, batched: int) -> Any:
     return array[rows] if array.ndim == batched and len(array) == number else array
 
 
-def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scenes:
+def given_scenes(
+    options: Mapping[str, Any], sampled: Scenes, arm: Arm, shapes: Sequence[str] = CAPSULES
+) -> Scenes:
     """Return sampled scenes with the parts that `options` gives in their place.
 
     Args:
         options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
-            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m]; or a list of spheres and capsules, or
-            of their dictionaries, for all scenes, or N such lists.
+            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m]; or a list of shapes, or of their
+            dictionaries, for all scenes, or N such lists.
         sampled: Scenes to overwrite.
         arm: Arm, for the dimension D.
+        shapes: Names of the shapes that the scenes may have.
 
     Raises:
         ValueError: An array is not finite or has another shape, or a name is unknown.
     """
     refuse_unknown_options(options, GIVEN)
-    options = _with_rows(options, arm.dimension)
+    options = _with_rows(options, arm.dimension, shapes)
     fields = sampled._asdict()
     for name, field in fields.items():
         if name in options:
@@ -111,14 +115,17 @@ def given_scenes(options: Mapping[str, Any], sampled: Scenes, arm: Arm) -> Scene
     return Scenes(**fields)
 
 
-def _with_rows(options: Mapping[str, Any], dimension: int) -> Mapping[str, Any]:
-    """Return options with obstacles that are shapes or dictionaries as rows."""
+def _with_rows(options: Mapping[str, Any], dimension: int, shapes: Sequence[str]) -> Mapping[str, Any]:
+    """Return options with obstacles as rows of scenes that may have some shapes."""
     if "obstacles" not in options:
         return options
     try:
-        return {**options, "obstacles": obstacle_rows(options["obstacles"], dimension)}
+        rows = obstacle_rows(options["obstacles"], dimension, shapes)
     except ValueError as error:
         raise ValueError(f"options['obstacles']: {error}") from None
+    if tuple(shapes) != CAPSULES and np.shape(rows)[-1:] == (row_size(dimension),):
+        rows = widened(_numbers("obstacles", rows))
+    return {**options, "obstacles": rows}
 
 
 def refuse_unknown_options(options: Mapping[str, Any], known: Sequence[str]) -> None:

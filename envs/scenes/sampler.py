@@ -14,15 +14,16 @@ import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float, Index, Int
+from viapoint.envs.geometry.rows import CAPSULES, row_size
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.draws import ObstacleSampler, Uniforms
+from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, ObstacleSampler, Uniforms, reshaped
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.feasible_path import DRAW_ORDER, DrawOrder, Ends, sample_ends, sample_paths
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS
 from viapoint.envs.scenes.planar_obstacles import FamilyObstacles, HandObstacles, WholeArmObstacles
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.scenes.spatial_obstacles import SpatialObstacles
-from viapoint.envs.scenes.uniform import UniformScenes
+from viapoint.envs.scenes.uniform import UniformScenes, blocks_straight_movement
 
 Distribution = SceneDistribution | SpaceDistribution
 
@@ -72,7 +73,7 @@ class SceneSampler:
         scenes = Scenes(
             np.zeros((number, dimension)),
             np.zeros((number, dimension)),
-            np.zeros((number, self._obstacles.rows, 2 * dimension + 1)),
+            np.zeros((number, self._obstacles.rows, self._row_size)),
         )
         pending, shared = np.arange(number), np.zeros(number)
         if fixed is not None:
@@ -83,7 +84,9 @@ class SceneSampler:
             u = numbers.draw(pending)
             if fixed is not None:
                 sharing = max(sum(self._order.groups[:SHARED_GROUPS]) - made, 0)
-                u[:, :sharing, self._size - self._obstacles.size + fixed] = shared[pending, None]
+                u[:, :sharing, self._size - self._reshape_size - self._obstacles.size + fixed] = shared[
+                    pending, None
+                ]
             first = self._attempts(u, pending, ends, scenes)
             numbers.put_back(pending, first)
             pending = pending[first < 0]
@@ -102,10 +105,21 @@ class SceneSampler:
         return f"no scene with {n_obstacles} obstacles was found in {attempts} attempts {where}"
 
     @property
+    def _row_size(self) -> int:
+        """Number of values of an obstacle."""
+        return row_size(self.arm.dimension, self.distribution.shapes)
+
+    @property
     def _size(self) -> int:
         """Uniform numbers of one attempt."""
         ends = 2 * self.arm.dimension * self._order.n_ends
-        return ends + 3 * self._order.n_paths + self._obstacles.size
+        return ends + 3 * self._order.n_paths + self._obstacles.size + self._reshape_size
+
+    @property
+    def _reshape_size(self) -> int:
+        """Uniform numbers that decide the shapes of obstacles."""
+        shaped = self.distribution.shapes != CAPSULES
+        return RESHAPE_NUMBERS * self._obstacles.rows if shaped else 0
 
     def _attempts(self, u: Float, pending: Int, ends: Ends, scenes: Scenes) -> Int:
         """Store the scene of the first good attempt at each, and return which it was, shape (P,), -1 for none.
@@ -146,12 +160,28 @@ class SceneSampler:
         if not good.all():
             some = np.flatnonzero(good)
             uniforms, rows, feasible = uniforms.at(some), rows[some], feasible.take(some)
-        obstacles = np.zeros((0, self._obstacles.rows, 2 * arm.dimension + 1))
+        obstacles = np.zeros((0, self._obstacles.rows, self._row_size))
         if len(rows):
             obstacles, good = self._obstacles(uniforms, feasible)
             some = np.flatnonzero(good)
             rows, feasible, obstacles = rows[some], feasible.take(some), obstacles[some]
-        return rows, Scenes(feasible.start, feasible.goal, obstacles)
+            uniforms = uniforms.at(some)
+        return self._reshaped(uniforms, rows, Scenes(feasible.start, feasible.goal, obstacles))
+
+    def _reshaped(self, uniforms: Uniforms, rows: Index, scenes: Scenes) -> tuple[Index, Scenes]:
+        """Return the good attempts and their scenes with obstacles of the distribution's shapes.
+
+        What is inside a capsule may no longer be in the way of the straight movement; such attempts fail.
+        """
+        if not self._reshape_size:
+            return rows, scenes
+        u = uniforms.take_table(self._obstacles.rows, RESHAPE_NUMBERS)
+        obstacles = reshaped(scenes.obstacles, u, self.distribution.shapes)
+        scenes = scenes._replace(obstacles=obstacles)
+        some = np.flatnonzero(
+            blocks_straight_movement(self.collision_model, scenes) | ~scenes.present.any(-1)
+        )
+        return rows[some], scenes.take(some)
 
 
 class UniformSampler(SceneSampler):
@@ -169,10 +199,11 @@ class UniformSampler(SceneSampler):
 
     @property
     def _size(self) -> int:
-        return self._uniform.size
+        return self._uniform.size + self._reshape_size
 
     def _attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
-        return self._uniform(uniforms, ends)
+        rows, scenes = self._uniform(uniforms, ends)
+        return self._reshaped(uniforms.at(rows), rows, scenes)
 
 
 class MixedSampler(SceneSampler):
@@ -194,7 +225,9 @@ class MixedSampler(SceneSampler):
         number, d = len(generators), self.arm.dimension
         uniform = np.array([each.random() for each in generators]) < self.distribution.uniform_share
         most = self.distribution.n_obstacles[1]
-        scenes = Scenes(np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, most, 2 * d + 1)))
+        scenes = Scenes(
+            np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, most, self._row_size))
+        )
         for rows, sample in (
             (np.flatnonzero(uniform), self._uniform),
             (np.flatnonzero(~uniform), super().__call__),

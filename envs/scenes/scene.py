@@ -12,6 +12,9 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
+from viapoint.envs.geometry.rows import has_shapes, shape_columns, shape_rows
+from viapoint.envs.geometry.shape import UNIT_TOLERANCE
+from viapoint.envs.geometry.shapes import SHAPES
 
 LARGEST_HALF_AXIS = 0.3
 """Greatest half length of a bar, [m]."""
@@ -19,6 +22,8 @@ LARGEST_RADIUS = 0.1
 """Greatest radius of an obstacle, [m]."""
 FARTHEST_CENTRE = 1.0
 """Greatest coordinate of an obstacle's centre, [m]."""
+LARGEST_HALF_LENGTH, FARTHEST_SHAPE = 1.0, 2.0
+"""Greatest half length and coordinate of the box of an obstacle where obstacles may have any shape, [m]."""
 
 TARGETS = {
     "T1": (-0.32, 0.42),
@@ -43,7 +48,8 @@ class Scenes(NamedTuple):
     goal: Float
     """Shape (N, D), [m]."""
     obstacles: Float
-    """Rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m]; absent rows are zero."""
+    """Rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m], or rows with shapes, see
+    :mod:`viapoint.envs.geometry.rows`; absent rows are zero."""
 
     @property
     def present(self) -> Bool:
@@ -117,7 +123,7 @@ def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Proble
         yield (
             least <= 0.0,
             lambda i, n=name, t=touched, c=least: (  # type: ignore[misc]
-                f"obstacle {t[i]} {_shown(scenes.obstacles[i, t[i]])} m touches the arm at the {n} "
+                f"obstacle {t[i]} {_described(scenes.obstacles[i, t[i]])} touches the arm at the {n} "
                 f"(clearance {c[i]:.4f} m; more than 0 is needed)"
             ),
         )
@@ -142,6 +148,9 @@ def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
 
 def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
     """Yield the faults of single obstacles."""
+    if has_shapes(scenes.obstacles):
+        yield from _problems_of_shapes(scenes)
+        return
     dimension = scenes.start.shape[-1]
     half = norm(scenes.obstacles[..., dimension : 2 * dimension])
     radius = scenes.obstacles[..., -1]
@@ -158,7 +167,34 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
         yield (
             wrong.any(axis=-1),
             lambda i, w=wrong, x=what: (  # type: ignore[misc]
-                f"obstacle {w[i].argmax()} {_shown(scenes.obstacles[i, w[i].argmax()])} m {x}"
+                f"obstacle {w[i].argmax()} {_described(scenes.obstacles[i, w[i].argmax()])} {x}"
+            ),
+        )
+
+
+def _problems_of_shapes(scenes: Scenes) -> Iterator[Problem]:
+    """Yield the faults of single obstacles of any shape."""
+    rows, (kind, centre, quaternion, half) = scenes.obstacles, shape_columns(scenes.obstacles)
+    again = rows.copy()
+    known = {number: name for number, (name, shape) in enumerate(SHAPES.items()) if shape.in_scenes}
+    strange = ~np.isin(kind, list(known)) | (np.abs(norm(quaternion) - 1.0) > UNIT_TOLERANCE)
+    for number in np.unique(kind[scenes.present & ~strange]):
+        some = scenes.present & (kind == number)
+        place = centre[some][:, : scenes.start.shape[-1]]
+        again[some] = shape_rows(known[int(number)], place, quaternion[some], half[some])
+    strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
+    for wrong, what in (
+        ((rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"),
+        ((half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"),
+        (
+            (np.abs(centre) > FARTHEST_SHAPE).any(axis=-1),
+            f"has its centre over {FARTHEST_SHAPE:g} m from the origin",
+        ),
+    ):
+        yield (
+            wrong.any(axis=-1),
+            lambda i, w=wrong, x=what: (  # type: ignore[misc]
+                f"obstacle {w[i].argmax()} {_described(rows[i, w[i].argmax()])} {x}"
             ),
         )
 
@@ -179,6 +215,16 @@ def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel
     return np.concatenate(
         (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
     )
+
+
+def _described(row: Float) -> str:
+    """Return an obstacle as text."""
+    if not has_shapes(row):
+        return f"{_shown(row)} m"
+    kind, centre, _, half = shape_columns(row)
+    names = list(SHAPES)
+    name = names[int(kind)] if 0 <= kind < len(names) else "?"
+    return f"({name} at {_shown(centre)} m, half lengths {_shown(half)} m)"
 
 
 def _shown(values: Float) -> str:

@@ -12,6 +12,7 @@ from viapoint.envs.common.types import Float, Index, Int, Single
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.geometry.narrow_phase import branch_and_bound
+from viapoint.envs.geometry.rows import has_shapes, pair_distance
 
 OUTER = 5
 """Links next to the hand, which obstacles near its path touch first; only chosen obstacles are compared with others."""
@@ -58,7 +59,7 @@ class LinkBodies(NamedTuple):
         :func:`~viapoint.envs.geometry.narrow_phase.branch_and_bound`.
 
         Args:
-            rows: Obstacles, shape (N, n, 7), [m]; absent ones, without a radius, are as far away as `most`.
+            rows: Obstacles of either kind, shape (N, n, .), [m]; absent ones, without a radius, are as far as `most`.
             most: Upper limit of the result, [m]; a low one saves time.
             margin: Margin at each time, shape (T,), or at all times, [m].
             floor: Value below which the result need not be exact, [m].
@@ -94,7 +95,9 @@ class LinkBodies(NamedTuple):
         """Return clearances, shape (M,), [m], of pairs of an obstacle and a link at one time."""
         links, times = self.balls.shape[2:]
         ends = self.ends.reshape(6, -1).take(row // rows.shape[1] * (links * times) + ball, axis=1)
-        obstacles = rows.reshape(-1, 7).take(row, axis=0)
+        obstacles = rows.reshape(-1, rows.shape[-1]).take(row, axis=0)
+        if has_shapes(rows):
+            return np.asarray(pair_distance(obstacles, ends[:3].T, ends[3:].T) - self.radii[ball // times])
         # Components apart in memory, which are mostly read one after the other.
         first, second = ends[:3].T[:, None], ends[3:].T[:, None]
         squared = segment_distance_squared(first, second, obstacles.astype(np.float32, order="F")[:, None])

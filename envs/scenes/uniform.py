@@ -78,7 +78,8 @@ class UniformScenes:
         obstacles, enough = self._first(drawn, self._free(drawn), count)
         some = np.flatnonzero(enough)
         rows, scenes = rows[some], Scenes(start[some], goal[some], obstacles[some])
-        some = np.flatnonzero(self._blocks(scenes) | (count[some] == 0))
+        blocked = blocks_straight_movement(self._collision_model, scenes)
+        some = np.flatnonzero(blocked | (count[some] == 0))
         return rows[some], scenes.take(some)
 
     def _ends(self, uniforms: Uniforms, ends: Ends) -> tuple[Float, Float, Bool]:
@@ -129,13 +130,14 @@ class UniformScenes:
         chosen[np.arange(self.rows) >= count[:, None]] = 0.0
         return chosen, free.sum(axis=-1) >= count
 
-    def _blocks(self, scenes: Scenes) -> Bool:
-        """Return in which scenes the straight movement cuts into an obstacle, shape (N,)."""
-        if not self.rows or not len(scenes.start):
-            return np.zeros(len(scenes.start), dtype=bool)
-        lines = _lines(scenes.start, scenes.goal)
-        least = self._collision_model.least_clearance(lines, scenes.obstacles, scenes.present)
-        return np.asarray(least < -IN_THE_WAY)
+
+def blocks_straight_movement(collision_model: CollisionModel, scenes: Scenes) -> Bool:
+    """Return in which of N scenes the straight movement cuts into an obstacle, shape (N,)."""
+    if not scenes.obstacles.size:
+        return np.zeros(len(scenes.start), dtype=bool)
+    lines = _lines(scenes.start, scenes.goal)
+    least = collision_model.least_clearance(lines, scenes.obstacles, scenes.present)
+    return np.asarray(least < -IN_THE_WAY)
 
 
 def _lines(start: Float, goal: Float) -> Float:

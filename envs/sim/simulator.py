@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,9 +14,11 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.narrow_phase import LinkPositions
+from viapoint.envs.geometry.rows import CAPSULES, ShapeColumns, dimension_of, shape_columns
+from viapoint.envs.geometry.shapes import SHAPES
 
-OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
-"""Position of absent obstacles, [m]."""
+OUT_OF_THE_WAY, UPRIGHT = np.array([0.0, 0.0, -10.0]), np.array([1.0, 0.0, 0.0, 0.0])
+"""Position [m] and orientation of absent obstacles."""
 
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 """Parts of a control sequence with moving obstacles: controls, then the obstacles' centres."""
@@ -35,10 +38,16 @@ class SimulationLog(NamedTuple):
 
 
 class Simulator:
-    """MuJoCo's batch engine with one arm and capsules of any place and size in each simulation."""
+    """MuJoCo's batch engine with one arm and obstacles of any place, size and shape in each simulation."""
 
     def __init__(
-        self, collision_model: CollisionModel, *, n_obstacles: int, num_envs: int, threads: int
+        self,
+        collision_model: CollisionModel,
+        *,
+        n_obstacles: int,
+        num_envs: int,
+        threads: int,
+        shapes: Sequence[str] = CAPSULES,
     ) -> None:
         """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
         self.collision_model, self.arm = collision_model, collision_model.arm
@@ -59,6 +68,10 @@ class Simulator:
             self._sizes = self.batch.expand("geom_size")
             self._bounds = self.batch.expand("geom_rbound")
             self._boxes = self.batch.expand("geom_aabb")
+        self._offsets = np.zeros((num_envs, n_obstacles, 3))
+        self._types = None
+        if n_obstacles and tuple(shapes) != CAPSULES:
+            self._types = self.batch.expand("geom_type")
 
     def place(
         self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
@@ -68,21 +81,23 @@ class Simulator:
         Args:
             sims: The simulations, shape (n,).
             joints: Shape (n, J), [rad].
-            obstacles: Rows (centre D, half-axis D, radius), shape (n, rows, 2 D + 1), [m].
+            obstacles: Rows of either kind, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
             present: True for rows that are obstacles, shape (n, rows).
         """
         self.batch.state[sims] = self._rest_state
         self.batch.bind("qpos")[sims] = joints
         if not self._geoms:
             return
-        dimension = (obstacles.shape[-1] - 1) // 2
-        centre = in_space(obstacles[..., :dimension])
-        axis = in_space(obstacles[..., dimension : 2 * dimension])
-        half = norm(axis)
-        radius = obstacles[..., -1]
-        self.batch.bind("mocap_pos")[sims] = np.where(present[..., None], centre, OUT_OF_THE_WAY)
-        self.batch.bind("mocap_quat")[sims] = _turn_up_to(axis, half)
-        self._resize(sims, np.where(present, radius, 0.01), np.where(present, half, 0.0))
+        shape = shape_columns(obstacles)
+        self.batch.bind("mocap_quat")[sims] = np.where(present[..., None], shape.quaternion, UPRIGHT)
+        if self._types is None:
+            # Exact half lengths, which those of boxes round.
+            length = norm(in_space(obstacles[..., dimension_of(obstacles) : -1]))
+            self._resize_capsules(sims, obstacles[..., -1], length, present)
+        else:
+            self._reshape(sims, shape, present)
+        centre = np.where(present[..., None], shape.centre, np.nan)
+        self.batch.bind("mocap_pos")[sims] = self._bodies(sims, centre)
 
     def rollout(self, sims: NDArray[np.int64], controls: Float) -> SimulationLog:
         """Run simulations under controls, all for the same number of steps.
@@ -114,8 +129,7 @@ class Simulator:
         """
         number = controls.shape[1]
         warnings = self._warnings(sims)
-        absent = np.isnan(places[..., :1])
-        where = np.where(absent, OUT_OF_THE_WAY, in_space(places)).reshape(*controls.shape[:2], -1)
+        where = self._bodies(sims, in_space(places)).reshape(*controls.shape[:2], -1)
         kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ()))
         out = self.batch.rollout(
             number, np.concatenate((controls, where), axis=-1), MOVING, record=(*kept, "ncon"), ids=sims
@@ -140,23 +154,42 @@ class Simulator:
     def _warnings(self, sims: NDArray[np.int64]) -> Any:
         return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
 
-    def _resize(self, sims: NDArray[np.int64], radius: Float, half: Float) -> None:
+    def _bodies(self, sims: NDArray[np.int64], centre: Float) -> Float:
+        """Return the positions of geoms, shape (n, ..., rows, 3), [m], from those of boxes, NaN for absent ones."""
+        offset = self._offsets[sims].reshape(len(sims), *(1,) * (centre.ndim - 3), -1, 3)
+        return np.where(np.isnan(centre[..., :1]), OUT_OF_THE_WAY, centre + offset)
+
+    def _resize_capsules(
+        self, sims: NDArray[np.int64], radius: Float, half: Float, present: NDArray[np.bool_]
+    ) -> None:
         """Set the sizes of the capsules and everything that MuJoCo derived from them when it compiled the model."""
         rows = np.ix_(sims, self._geoms)
+        radius, half = np.where(present, radius, 0.01), np.where(present, half, 0.0)
         length = half + radius
         self._sizes[rows] = np.stack((radius, half, np.zeros_like(half)), axis=-1)
         self._bounds[rows] = length
         self._boxes[rows] = np.stack((*[np.zeros_like(half)] * 3, radius, radius, length), axis=-1)
 
-
-def _turn_up_to(axis: Float, half: Float) -> Float:
-    """Return the quaternion that turns the z axis, along which MuJoCo's capsules lie, to `axis`."""
-    lying = half > 1e-9
-    unit = np.where(lying[..., None], axis / np.where(lying, half, 1.0)[..., None], (0.0, 0.0, 1.0))
-    unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction
-    x, y, z = (unit[..., i] for i in range(3))
-    length = np.sqrt(2.0 * (1.0 + z))
-    return np.stack(((1.0 + z) / length, -y / length, x / length, np.zeros_like(z)), axis=-1)
+    def _reshape(self, sims: NDArray[np.int64], shape: ShapeColumns, present: NDArray[np.bool_]) -> None:
+        """Set types and sizes of the geoms, and everything that MuJoCo derived from them; absent ones are capsules."""
+        assert self._types is not None
+        none = np.zeros(present.shape)
+        self._resize_capsules(sims, none, none, np.zeros_like(present))
+        geoms = np.array(self._geoms)
+        self._types[np.ix_(sims, geoms)] = mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._offsets[sims] = 0.0
+        for number in np.unique(shape.kind[present]):
+            sim, row = np.nonzero(present & (shape.kind == number))
+            kind, half, centre = list(SHAPES.values())[number], shape.half[sim, row], shape.centre[sim, row]
+            own = kind.from_box(centre, shape.quaternion[sim, row], half)
+            sim, geom = sims[sim], geoms[row]
+            self._offsets[sim, row] = own.position - centre
+            unit = kind.from_box(np.zeros(3), UPRIGHT, np.ones(3))
+            self._types[sim, geom] = unit.geoms()[0].type
+            self._sizes[sim, geom] = kind.geom_size(half)
+            axis, radius = kind.bound(half)
+            self._bounds[sim, geom] = norm(axis) + radius if kind.sizes else 0.0
+            self._boxes[sim, geom] = np.concatenate((np.zeros_like(half), half), axis=-1)
 
 
 def _finite(joints: Float) -> NDArray[np.bool_]:

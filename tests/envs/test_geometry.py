@@ -459,7 +459,8 @@ def test_a_batch_takes_a_list_of_obstacles_for_each_scene():
     envs.reset(seed=0, options={"obstacles": [ball]})
     assert envs.scenes.present.sum(axis=1).tolist() == [1, 1, 1]
     with pytest.raises(
-        ValueError, match=r"options\['obstacles'\]: scene 1: obstacle 0: environments simulate spheres"
+        ValueError,
+        match=r"options\['obstacles'\]: scene 1: obstacle 0: the scenes of this environment have the shapes",
     ):
         envs.reset(options={"obstacles": [[], [Box((0.1, 0.1, 0.1))], []]})
     envs.close()
@@ -476,7 +477,8 @@ def test_plans_avoid_shapes_as_they_avoid_rows():
     [
         (
             Box((0.1, 0.1, 0.1)),
-            "obstacle 1: environments simulate spheres and capsules; box is for distances only",
+            "obstacle 1: the scenes of this environment have the shapes capsule, sphere, not box; make it with "
+            "shapes=('capsule', 'box')",
         ),
         (Sphere(0.02, position=(0.1, 0.4, 0.1)), "obstacle 1: sphere must lie in the plane, with z = 0"),
         (Capsule(0.02, 0.1, position=(0.1, 0.4, 0.0)), "obstacle 1: capsule must lie in the plane"),

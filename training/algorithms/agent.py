@@ -79,9 +79,9 @@ class Agent(BaseAlgorithm):
         Args:
             start: Position of the hand, shape (D,), [m].
             goal: Position of the target, shape (D,), [m].
-            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; or a list of spheres and
-                capsules of :mod:`viapoint.envs`; None for none. At most as many as the environment of the agent may
-                have.
+            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; or a list of shapes of
+                :mod:`viapoint.envs` that the environment of the agent may have; None for none. At most as many as the
+                environment may have.
 
         Raises:
             ValueError: An argument has another shape or is not finite, the scene is impossible, or an action of the

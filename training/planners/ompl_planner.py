@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.geometry.rows import has_shapes, pair_distance
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 
@@ -126,12 +127,19 @@ class MotionPlanner:
         model = self._task.collision_model
         arm, whole_arm = model.arm, model.whole_arm
         rows = scene.obstacles[0][scene.present[0]]
-        capsules = [(*_split(row), float(row[-1]) + arm.hand_radius + margin) for row in rows]
+        shaped = has_shapes(rows)
+        capsules = [
+            (*_split(row), float(row[-1]) + arm.hand_radius + margin) for row in (() if shaped else rows)
+        ]
 
         def clear(first: Float, second: Float) -> bool:
             p, q = tuple(map(float, first)), tuple(map(float, second))
             if any(_nearer(p, q, centre, half, least) for centre, half, least in capsules):
                 return False
+            if shaped and len(rows):
+                ends = (np.tile(in_space(end), (len(rows), 1)) for end in (first, second))
+                if pair_distance(rows, *ends).min() < arm.hand_radius + margin:
+                    return False
             count = max(2, int(np.ceil(norm(second - first) / CHECK_SPACING)) + 1) if whole_arm else 4
             points = first + np.linspace(0.0, 1.0, count)[:, None] * (second - first)
             if (np.asarray(arm.reach_margin(points)) < 0.0).any():

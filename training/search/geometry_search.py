@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Numbers, Single
 from viapoint.envs.common.validation import whole_number
+from viapoint.envs.geometry.rows import CAPSULES, obstacle_rows, row_size, widened
 from viapoint.envs.geometry.shape import Shape
-from viapoint.envs.geometry.shapes import obstacle_rows
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes, problems
@@ -151,18 +151,17 @@ class GeometrySearch:
         Args:
             start: Hand position, shape (D,), [m].
             goal: Goal position, shape (D,), [m].
-            obstacles: Rows of centre (D), half-axis (D) and radius, shape (n, 2 D + 1), [m]; or a list of spheres and
-                capsules of :mod:`viapoint.envs`; None for none.
+            obstacles: Rows of centre (D), half-axis (D) and radius, shape (n, 2 D + 1), [m]; or a list of shapes of
+                :mod:`viapoint.envs` that scenes of the task may have; None for none.
 
         Raises:
             ValueError: An argument has another shape or is not finite, an end is out of reach or touches an obstacle,
                 or an obstacle is too large.
         """
         scene = scene_from_rest(self.task, start, goal, obstacles)
-        rows: Float = np.concatenate((scene.obstacles, scene.present[..., None]), axis=-1)
         observation: dict[str, Float] = {"hand": scene.start, "goal": scene.goal}
-        if rows.size:
-            observation["obstacles"] = rows.reshape(1, -1)
+        if scene.obstacles.size:
+            observation["obstacles"] = self.task.observation.observed_obstacles(scene)
         return self.task.action.decode(self.decide(observation), scene.start, scene.goal).take(0)
 
     def _steps(self, replanning: bool) -> Single:
@@ -213,9 +212,12 @@ def scene_from_rest(
     """
     d = task.arm.dimension
     first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
-    given = obstacle_rows([] if obstacles is None else obstacles, d)
-    given = given if np.size(given) else np.zeros((0, 2 * d + 1))
-    scene = Scenes(first, last, _numbers("obstacles", given, (None, 2 * d + 1))[None])
+    shapes = task.scenes.shapes
+    given = obstacle_rows([] if obstacles is None else obstacles, d, shapes)
+    capsules = np.shape(given)[-1:] == (row_size(d),)
+    size = row_size(d) if capsules else row_size(d, shapes)
+    rows = _numbers("obstacles", given if np.size(given) else np.zeros((0, size)), (None, size))
+    scene = Scenes(first, last, (rows if shapes == CAPSULES else widened(rows))[None])
     for wrong, reason in problems(scene, task.collision_model):
         if wrong.any():
             raise ValueError(reason(0))

@@ -1,0 +1,125 @@
+"""Contact in MuJoCo and negative clearance agree: random poses of arms among obstacles of every shape of scenes.
+
+OMP_NUM_THREADS=1 python benchmarks/contacts.py --out docs/contacts.json
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs import SHAPES
+from viapoint.envs.arms import ADULT, PANDA
+from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.geometry.rows import shape_rows
+from viapoint.envs.scenes.scene import Scenes, rest_clearance
+from viapoint.envs.sim.simulator import Simulator
+
+TOLERANCE = 1e-4
+"""Clearance within which contact and its sign may differ, [m]."""
+BATCH = 2000
+"""Poses that are simulated together."""
+KINDS = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
+MODELS = {
+    "panda": CollisionModel(PANDA, whole_arm=True),
+    "planar": CollisionModel(ADULT, whole_arm=True),
+    "planar hand": CollisionModel(ADULT, whole_arm=False),
+}
+
+
+class Contacts(NamedTuple):
+    """Comparison of contacts with clearances."""
+
+    poses: int
+    contacts: int
+    wrong: int
+    """Poses whose clearance is farther from 0 than TOLERANCE and has the wrong sign."""
+    shallowest: float
+    """Least depth of these, [m]; infinite if there are none."""
+
+
+def random_obstacles(kind, places, generator):
+    """Return rows of one shape near places, shape (N, D), [m], in random orientations."""
+    number, d = places.shape
+    half = generator.uniform(0.01, 0.15, (number, 3))
+    if d == 3:
+        quaternion = generator.normal(size=(number, 4))
+        quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    else:
+        turn = generator.uniform(-np.pi, np.pi, number)
+        quaternion = np.stack((np.cos(turn / 2), 0.0 * turn, 0.0 * turn, np.sin(turn / 2)), axis=-1)
+        half[:, 2] = 1.0
+    shape = SHAPES[kind]
+    if d == 2 and kind in ("capsule", "half_space"):  # their axes lie in the plane
+        turn = 0.5 * turn
+        quaternion = np.stack((np.cos(turn), -np.sin(turn), np.cos(turn), np.sin(turn)), axis=-1) * 0.5**0.5
+        half[:, 2] = generator.uniform(0.0, 0.15, number)
+    if shape.round:
+        half[:, 1] = half[:, 0]
+    half[:, 2] = {"sphere": half[:, 0], "capsule": half[:, 0] + half[:, 2]}.get(kind, half[:, 2])
+    if kind == "half_space":
+        half[:] = 1.0
+    # The reach of a shape along a random direction, so that about half of the obstacles touch the arm.
+    away = generator.normal(size=(number, d))
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    apart = generator.uniform(0.5, 2.5, (number, 1)) * (half.min(axis=-1, keepdims=True) + 0.05)
+    if kind == "half_space":
+        unit = shape.from_box(np.zeros((number, 3)), quaternion, half)
+        away = -np.stack(unit._axes[2], axis=-1)[:, :d]
+        apart = 1.0 + generator.uniform(-0.05, 0.15, (number, 1))
+    return shape_rows(kind, places + apart * away, quaternion, half)
+
+
+def contacts(name, kind, number, seed=0):
+    """Compare contacts of an arm, by its name in MODELS, with obstacles of a shape."""
+    generator, model = np.random.default_rng(seed), MODELS[name]
+    arm = model.arm
+    low, high = (np.array(corner) for corner in arm.workspace)
+    hand = low + (high - low) * generator.random((4 * number, arm.dimension))
+    hand = hand[np.asarray(arm.reach_margin(hand)) > 0.0][:number]
+    joints = np.asarray(arm.inverse_kinematics(hand))
+    links = np.asarray(arm.links(joints))
+    each, share = generator.integers(links.shape[1], size=len(hand)), generator.random((len(hand), 1))
+    ends = links[np.arange(len(hand)), each]
+    places = ends[:, 0] + share * (ends[:, 1] - ends[:, 0]) if model.whole_arm else hand
+    rows = random_obstacles(kind, places, generator)[:, None]
+    scenes = Scenes(hand, hand, rows)
+    clearance = rest_clearance(scenes, hand, model)[:, 0]
+    simulator = Simulator(model, n_obstacles=1, num_envs=min(BATCH, number), threads=1, shapes=KINDS)
+    touched = []
+    for first in range(0, len(hand), BATCH):
+        some = slice(first, first + BATCH)
+        sims = np.arange(len(hand[some]))
+        simulator.place(sims, joints[some], rows[some], np.ones((len(sims), 1), dtype=bool))
+        still = np.zeros((len(sims), 1, simulator.model.nu))
+        touched.append(simulator.rollout(sims, still).contact[:, 0])
+    contact = np.concatenate(touched)
+    wrong = (contact != (clearance < 0.0)) & (np.abs(clearance) > TOLERANCE)
+    return Contacts(
+        len(hand), int(contact.sum()), int(wrong.sum()), float((-clearance[wrong]).min(initial=np.inf))
+    )
+
+
+def main():
+    """Print the comparison of all shapes, and write it as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--poses", type=int, default=10_000)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    found = {}
+    for name in MODELS:
+        for kind in KINDS:
+            each = contacts(name, kind, arguments.poses)
+            found.setdefault(name, {})[kind] = each._asdict()
+            print(
+                f"{name:12} {kind:12} {each.poses} poses, {each.contacts} contacts, {each.wrong} wrong, the "
+                f"shallowest {each.shallowest:.3f} m deep"
+            )
+    if arguments.out:
+        arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

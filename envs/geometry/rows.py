@@ -1,0 +1,337 @@
+"""Obstacles of scenes as rows of numbers.
+
+A scene of spheres and capsules has rows (centre D, half-axis D, radius). Where scenes have other shapes, too, the same
+numbers are a capsule around the obstacle, which bounds its distance from below, and the shape stands in between:
+
+    (centre D, half-axis D, kind 1, quaternion 4, half lengths 3, radius 1)
+
+The kind is an index into :data:`~viapoint.envs.geometry.shapes.SHAPES`; pose and half lengths are those of the box of
+:meth:`~viapoint.envs.geometry.shape.Shape.box`. Rows of zeros are absent obstacles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.arrays import in_space, norm
+from viapoint.envs.common.types import Float, Int, Numbers, Single
+from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shapes import SHAPES, as_obstacles
+from viapoint.primitives.array_api import Array, to_numpy
+
+CAPSULES = ("capsule",)
+"""Shapes of scenes whose rows are capsules; spheres are capsules without a length."""
+SHAPE_SIZE = 8
+"""Numbers of the shape in a row."""
+POSE_SIZE = 13
+"""Number of values of one obstacle in an observation after those of its kind."""
+
+
+class ShapeColumns(NamedTuple):
+    """Shapes of rows, see the module."""
+
+    kind: Int
+    """Indices into SHAPES, shape (...,)."""
+    centre: Float
+    """Shape (..., 3), [m]."""
+    quaternion: Float
+    """Shape (..., 4)."""
+    half: Float
+    """Half lengths, shape (..., 3), [m]."""
+
+
+def row_size(dimension: int, shapes: Sequence[str] = CAPSULES) -> int:
+    """Return the number of values of a row, for scenes of some shapes in D dimensions."""
+    return 2 * dimension + 1 + (0 if tuple(shapes) == CAPSULES else SHAPE_SIZE)
+
+
+def has_shapes(rows: Array) -> bool:
+    """Return True for rows with other shapes than capsules."""
+    return int(rows.shape[-1]) > 2 * 3 + 1
+
+
+def dimension_of(rows: Array) -> int:
+    """Return the dimension D of rows."""
+    return (int(rows.shape[-1]) - 1 - SHAPE_SIZE * has_shapes(rows)) // 2
+
+
+def shape_columns(rows: Float) -> ShapeColumns:
+    """Return kind, pose and half lengths of rows of either kind, shape (..., .)."""
+    d = dimension_of(rows)
+    if not has_shapes(rows):
+        axis, radius = in_space(rows[..., d : 2 * d]), rows[..., -1]
+        length = norm(axis)
+        kind = np.full(rows.shape[:-1], _number("capsule"))
+        half = np.stack((radius, radius, length + radius), axis=-1)
+        return ShapeColumns(kind, in_space(rows[..., :d]), turn_up_to(axis, length), half)
+    columns = rows[..., 2 * d : -1]
+    return ShapeColumns(
+        columns[..., 0].astype(np.int64), in_space(rows[..., :d]), columns[..., 1:5], columns[..., 5:]
+    )
+
+
+def shape_rows(kind: str, centre: Float, quaternion: Float, half: Float) -> Float:
+    """Return rows of one kind of shape, shape (..., 2 D + 1 + SHAPE_SIZE), [m].
+
+    Args:
+        kind: Key of SHAPES.
+        centre: Centres of the bounding boxes, shape (..., D), [m].
+        quaternion: Orientations, shape (..., 4).
+        half: Half lengths of the bounding boxes, shape (..., 3), [m].
+    """
+    local, radius = SHAPES[kind].bound(half)
+    axes = rotation_axes(quaternion)
+    half_axis = local[..., :1] * axes[0] + local[..., 1:2] * axes[1] + local[..., 2:] * axes[2]
+    number = np.full_like(half[..., :1], _number(kind))
+    parts = (centre, half_axis[..., : centre.shape[-1]], number, quaternion, half, radius[..., None])
+    return np.concatenate(parts, axis=-1)
+
+
+def widened(rows: Float) -> Float:
+    """Return rows of capsules as rows with shapes; rows with shapes stay as they are."""
+    if has_shapes(rows):
+        return rows
+    shape, present = shape_columns(rows), rows[..., -1:] > 0.0
+    half = np.where(present, shape.half, 0.0)
+    wide = shape_rows("capsule", rows[..., : dimension_of(rows)], shape.quaternion, half)
+    return np.where(present, wide, 0.0)
+
+
+def rotation_axes(quaternion: Float) -> tuple[Float, Float, Float]:
+    """Return the axes of frames, shape (..., 3) each, from their quaternions, shape (..., 4)."""
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    return (
+        np.stack((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)), axis=-1),
+        np.stack((2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)), axis=-1),
+        np.stack((2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)), axis=-1),
+    )
+
+
+def turn_up_to(axis: Float, length: Float) -> Float:
+    """Return the quaternions that turn the z axis, along which capsules lie, to axes of some lengths."""
+    lying = length > 1e-9
+    unit = np.where(lying[..., None], axis / np.where(lying, length, 1.0)[..., None], (0.0, 0.0, 1.0))
+    unit = np.where(unit[..., 2:] < 0.0, -unit, unit)  # a capsule has no sense of direction
+    x, y, z = (unit[..., i] for i in range(3))
+    size = np.sqrt(2.0 * (1.0 + z))
+    return np.stack(((1.0 + z) / size, -y / size, x / size, np.zeros_like(z)), axis=-1)
+
+
+def pair_distance(rows: Float, first: Float, second: Float | None = None) -> Float:
+    """Return the signed distance of M spheres' centres or segments, each from the shape of one row, shape (M,), [m].
+
+    Args:
+        rows: Rows with shapes, shape (M, .).
+        first: Points, or one end of segments, shape (M, 3), [m].
+        second: Other ends; None for points.
+    """
+    found, shapes = np.empty(len(rows)), shape_columns(rows)
+    for number in np.unique(shapes.kind):
+        some = np.flatnonzero(shapes.kind == number)
+        centre, quaternion, half = (part[some] for part in shapes[1:])
+        shape = list(SHAPES.values())[number].from_box(centre, quaternion, half)
+        points = first[some].astype(np.float64, copy=False)
+        if second is None:
+            found[some] = shape.distance(points)
+        else:
+            found[some] = shape.segment_distance(points, second[some].astype(np.float64, copy=False))
+    return found
+
+
+def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSULES) -> Any:
+    """Return obstacles as the rows of scenes, shape (n, row_size), [m].
+
+    Args:
+        obstacles: Shapes and dictionaries, or one list of them for each of N scenes; anything else is returned as it
+            is, such as rows.
+        dimension: D. In the plane, spheres, capsules and centres lie at the height 0, and boxes and cylinders stand
+            upright; their heights do not matter.
+        shapes: Names of the shapes that the scenes may have. Spheres count as capsules where they have no name of their
+            own.
+
+    Returns:
+        Rows of shape (n, 2 D + 1) for capsules alone, else (n, 2 D + 1 + SHAPE_SIZE); for N lists (N, n, .), where rows
+        that a scene lacks are zero.
+
+    Raises:
+        ValueError: A shape is not allowed in scenes, or does not lie in the plane.
+
+    Example:
+        >>> from viapoint.envs import Capsule, obstacle_rows
+        >>> obstacle_rows([Capsule.between((0.0, 0.3), (0.2, 0.3), radius=0.02)], dimension=2).round(3).tolist()
+        [[0.1, 0.3, 0.1, 0.0, 0.02]]
+    """
+    if not isinstance(obstacles, list | tuple):
+        return obstacles
+    if any(isinstance(each, Shape | Mapping) for each in obstacles):
+        return np.array([_row(i, o, dimension, tuple(shapes)) for i, o in enumerate(as_obstacles(obstacles))])
+    inner = [each for each in obstacles if isinstance(each, list | tuple)]
+    if not any(isinstance(each, Shape | Mapping) for scene in inner for each in scene):
+        return obstacles
+    rows = np.zeros((len(obstacles), max(map(len, obstacles)), row_size(dimension, shapes)))
+    for i, scene in enumerate(obstacles):
+        try:
+            if scene:
+                rows[i, : len(scene)] = obstacle_rows(scene, dimension, shapes)
+        except ValueError as error:
+            raise ValueError(f"scene {i}: {error}") from None
+    return rows
+
+
+def obstacles_from_rows(rows: Float) -> list[Shape]:
+    """Return the obstacles of one scene; rows without a radius are none.
+
+    Args:
+        rows: Rows of either kind, shape (n, .), [m].
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs import obstacles_from_rows
+        >>> obstacles_from_rows(np.array([(0.1, 0.3, 0.1, 0.0, 0.02), (0.0, 0.0, 0.0, 0.0, 0.0)]))[0].half_length
+        array(0.1)
+    """
+    found = list[Shape]()
+    d = dimension_of(rows)
+    for row in rows[rows[:, -1] > 0.0]:
+        centre, axis, radius = in_space(row[:d]), in_space(row[d : 2 * d]), row[-1]
+        kind, _, quaternion, half = shape_columns(row)
+        shape = list(SHAPES.values())[int(kind)]
+        if shape is not Capsule or (has_shapes(row) and axis.any()):
+            exact = shape.from_box(centre, quaternion, half)
+            values = {name: getattr(exact, name) for name in (*shape.sizes, "position")}
+            found.append(shape(**values, quaternion=quaternion))
+        elif axis.any():
+            found.append(Capsule.between(centre - axis, centre + axis, radius))
+        else:
+            found.append(Sphere(radius, position=centre))
+    return found
+
+
+def observation_rows(obstacles: Sequence[Shape], n_rows: int, shapes: Sequence[str] | None = None) -> Single:
+    """Return obstacles as rows of numbers for networks, one for each; absent rows are zero.
+
+    A row is (shape one-hot, centre 3, rotation 6, half lengths 3, present): the centre and half lengths are those of
+    the bounding box along the axes of the shape's frame, [m], and the rotation is the first two axes of the frame (Zhou
+    et al., On the continuity of rotation representations in neural networks, 2019).
+
+    Args:
+        obstacles: Shapes.
+        n_rows: Number of rows.
+        shapes: Names of the shapes of the one-hot part; by default all of SHAPES.
+
+    Example:
+        >>> from viapoint.envs import Box, observation_rows
+        >>> rows = observation_rows([Box((0.1, 0.2, 0.25), position=(0.5, 0.0, 0.25))], n_rows=2)
+        >>> rows[0, 7:].astype(float).round(3).tolist()  # behind the one-hot
+        [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.2, 0.25, 1.0]
+    """
+    if len(obstacles) > n_rows:
+        raise ValueError(f"there may be at most {n_rows} obstacles, got {len(obstacles)}")
+    kinds = list(SHAPES if shapes is None else shapes)
+    rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
+    for row, each in zip(rows, obstacles, strict=False):
+        row[kinds.index(each.kind)] = 1.0
+        centre, half = each.box()
+        row[len(kinds) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
+    return rows
+
+
+def observed_rows(rows: Float, shapes: Sequence[str]) -> Float:
+    """Return rows with shapes, shape (..., n, .), as those of :func:`observation_rows`."""
+    kind, centre, quaternion, half = shape_columns(rows)
+    present = rows[..., -1:] > 0.0
+    one_hot = kind[..., None] == np.array([_number(name) for name in shapes])
+    first, second, _ = rotation_axes(quaternion)
+    found = np.concatenate((one_hot, centre, first, second, half, present), axis=-1)
+    return np.where(present, found, 0.0)
+
+
+def rows_of_observed(seen: Numbers, shapes: Sequence[str], dimension: int) -> Float:
+    """Return the rows of scenes from those of :func:`observed_rows`, shape (..., n, .).
+
+    Args:
+        seen: Shape (..., n, .).
+        shapes: Names of the shapes of the one-hot part.
+        dimension: D.
+    """
+    kind, place = seen[..., : len(shapes)].argmax(axis=-1), len(shapes)
+    values: Float = seen[..., place:].astype(np.float64)
+    centre, rotation, half = values[..., :3], values[..., 3:9], values[..., 9:12]
+    quaternion, present = quaternion_of_axes(rotation[..., :3], rotation[..., 3:]), seen[..., -1] > 0.5
+    found = np.zeros((*seen.shape[:-1], row_size(dimension, shapes)))
+    for number, name in enumerate(shapes):
+        some = present & (kind == number)
+        found[some] = shape_rows(name, centre[some][:, :dimension], quaternion[some], half[some])
+    return found
+
+
+def quaternion_of_axes(first: Float, second: Float) -> Float:
+    """Return the quaternions, shape (..., 4), of frames by their first two axes, shape (..., 3).
+
+    Of the products of w, x, y and z with one of them, those with the greatest are taken (S. W. Shepperd, Quaternion
+    from rotation matrix, 1978).
+    """
+    third = np.cross(first, second)
+    (a, b, c), (d, e, f), (g, h, i) = (np.moveaxis(axis, -1, 0) for axis in (first, second, third))
+    products = np.stack(
+        [
+            np.stack((1.0 + a + e + i, f - h, g - c, b - d), axis=-1),
+            np.stack((f - h, 1.0 + a - e - i, d + b, g + c), axis=-1),
+            np.stack((g - c, d + b, 1.0 - a + e - i, h + f), axis=-1),
+            np.stack((b - d, g + c, h + f, 1.0 - a - e + i), axis=-1),
+        ],
+        axis=-2,
+    )
+    greatest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    chosen = np.take_along_axis(products, greatest[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(chosen / norm(chosen)[..., None])
+
+
+def check_shapes(shapes: Any) -> tuple[str, ...]:
+    """Return the names of the shapes that scenes may have.
+
+    Raises:
+        ValueError: A name is unknown or repeated, or there is none.
+    """
+    known = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
+    names = (shapes,) if isinstance(shapes, str) else tuple(shapes) if isinstance(shapes, Sequence) else ()
+    if not names or len(set(names)) < len(names) or not set(names) <= set(known):
+        raise ValueError(f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}")
+    return names
+
+
+def _number(kind: str) -> int:
+    return list(SHAPES).index(kind)
+
+
+def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -> Float:
+    """Return an obstacle as a row of a scene."""
+    kind = obstacle.kind
+    if kind == "sphere" and kind not in shapes and "capsule" in shapes:
+        kind = "capsule"
+    if kind not in shapes:
+        also = ", sphere" if "capsule" in shapes and "sphere" not in shapes else ""
+        reason = f"the scenes of this environment have the shapes {', '.join(shapes)}{also}, not {kind}"
+        if type(obstacle).in_scenes:
+            reason += f"; make it with shapes={(*shapes, kind)!r}"
+        else:
+            reason += ", which is for distances only"
+        raise ValueError(f"obstacle {index}: {reason}")
+    wanted = {**obstacle.sizes, "position": (3,), "quaternion": (4,)}
+    for name, shape in wanted.items():
+        if (got := tuple(getattr(obstacle, name).shape)) != shape:
+            batch = got[: len(got) - len(shape)]
+            raise ValueError(f"obstacle {index}: {obstacle.kind} must be one shape, got a batch of {batch}")
+    try:
+        centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()
+    except ValueError as error:
+        raise ValueError(f"obstacle {index}: {error}") from None
+    quaternion = to_numpy(obstacle.quaternion).astype(np.float64)
+    if shapes == CAPSULES:
+        axis = to_numpy(obstacle.half_axis) if isinstance(obstacle, Capsule) else np.zeros(3)
+        return np.concatenate((centre[:dimension], axis[:dimension], half[:1]))
+    return shape_rows(kind, centre[:dimension], quaternion, half)

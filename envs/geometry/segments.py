@@ -1,0 +1,59 @@
+"""Nearest points of points, segments and the axes of capsules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from viapoint.envs.common.arrays import clamp, dot
+from viapoint.primitives.array_api import Array, namespace_of
+
+TINY = 1e-12
+"""Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
+
+
+def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
+    """Return the squared distance of points p from segments c + t a, -1 <= t <= 1, [m^2].
+
+    The nearest point of the segment is at t = (p - c) . a / |a|^2, clamped.
+
+    Args:
+        offset: Components of p - c, [m].
+        axis: Components of a, [m].
+    """
+    square = dot(axis, axis)
+    along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)
+    rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
+    return dot(rest, rest)
+
+
+def segment_axis_squared(gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]) -> Array:
+    """Return the squared distance of segments p + s u from segments q + t v, 0 <= s, t <= 1, [m^2].
+
+    The nearest points of two segments by clamping one parameter after the other (C. Ericson, Real-Time Collision
+    Detection, 2005, section 5.1.9, in its notation): the point of the link nearest to the obstacle's line, the point of
+    the obstacle's axis nearest to that, and the point of the link nearest to that.
+
+    Args:
+        gap: Components of p - q, [m].
+        link: Components of u, [m].
+        axis: Components of v, [m].
+    """
+    on_link, on_axis = nearest_on_segments(gap, link, axis)
+    rest = [g + on_link * u - on_axis * v for g, u, v in zip(gap, link, axis, strict=True)]
+    return dot(rest, rest)
+
+
+def nearest_on_segments(
+    gap: Sequence[Array], link: Sequence[Array], axis: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return s and t of the nearest points of two segments; see :func:`segment_axis_squared`."""
+    xp = namespace_of(gap[0])
+    a, e, b = dot(link, link), dot(axis, axis), dot(link, axis)
+    c, f = dot(link, gap), dot(axis, gap)
+    a, e = xp.maximum(a, TINY), xp.maximum(e, TINY)
+    determinant = a * e - b * b
+    crosses = determinant > TINY * a * e  # else parallel: any point of the link will do to begin with
+    crossing = (b * f - c * e) / xp.where(crosses, determinant, 1.0)
+    on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
+    on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
+    return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis

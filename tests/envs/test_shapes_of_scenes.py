@@ -1,0 +1,257 @@
+"""Scenes with obstacles of any shape: rows, simulation, observation and given scenes agree with the shapes."""
+
+import re
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs import (
+    SHAPES,
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    HalfSpace,
+    PointCloud,
+    Sphere,
+    as_obstacle,
+    obstacle_rows,
+    obstacles_from_json,
+    obstacles_from_rows,
+    obstacles_to_json,
+)
+from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
+from viapoint.envs.geometry.rows import (
+    pair_distance,
+    quaternion_of_axes,
+    rotation_axes,
+    shape_columns,
+    shape_rows,
+    widened,
+)
+from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, reshaped
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from contacts import KINDS, contacts, random_obstacles
+
+EVERY = pytest.mark.parametrize("kind", KINDS)
+PANDA = "viapoint/PandaObstacles-v0"
+ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
+SCENE = [
+    Box((0.1, 0.02, 0.03), position=(0.5, 0.0, 0.4), quaternion=(0.96, 0.0, 0.0, 0.28)),
+    Cylinder(0.03, 0.1, position=(0.6, 0.25, 0.1)),
+    HalfSpace(position=(0.0, 0.0, -0.05)),
+    Sphere(0.03, position=(0.5, 0.0, 0.6)),
+    Capsule(0.02, 0.1, position=(0.7, -0.2, 0.1), quaternion=(0.6, 0.8, 0.0, 0.0)),
+]
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(3)
+
+
+@pytest.fixture
+def env():
+    made = gym.make(PANDA, shapes=KINDS).unwrapped
+    yield made
+    made.close()
+
+
+@EVERY
+@pytest.mark.parametrize("name", ["panda", "planar hand"])
+def test_contact_in_mujoco_is_negative_clearance(name, kind):
+    found = contacts(name, kind, 400)
+    assert 50 < found.contacts < 390
+    assert found.wrong == 0
+
+
+@EVERY
+def test_rows_keep_the_shape(kind, generator):
+    rows = random_obstacles(kind, generator.uniform(-0.3, 0.3, (20, 3)), generator)
+    if kind == "half_space":  # whose centre is chosen
+        rows = obstacle_rows(obstacles_from_rows(rows), 3, KINDS)
+    again = obstacle_rows(obstacles_from_rows(rows), 3, KINDS)
+    np.testing.assert_allclose(again, rows, atol=1e-12)
+    first, second = generator.uniform(-0.5, 0.5, (2, 20, 3))
+    for row, shape, a, b in zip(rows, obstacles_from_rows(rows), first, second, strict=True):
+        assert shape.kind == kind
+        exact = shape.distance(a), shape.segment_distance(a, b)
+        np.testing.assert_allclose(pair_distance(row[None], a[None]), exact[0], atol=1e-12)
+        np.testing.assert_allclose(pair_distance(row[None], a[None], b[None]), exact[1], atol=1e-12)
+
+
+@EVERY
+def test_the_capsule_of_a_row_bounds_distances_from_below(kind, generator):
+    rows = random_obstacles(kind, generator.uniform(-0.3, 0.3, (300, 3)), generator)
+    points = generator.uniform(-0.6, 0.6, (300, 3))
+    capsules, present = np.concatenate((rows[:, :6], rows[:, -1:]), axis=-1), np.ones((300, 1), dtype=bool)
+    bound = hand_clearance(points[:, None], 0.0, capsules[:, None], present)[:, 0]
+    assert (bound <= pair_distance(rows, points) + 1e-9).all()
+
+
+@EVERY
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_least_clearance_is_that_of_the_shapes(kind, dimension, generator):
+    rows = random_obstacles(kind, generator.uniform(-0.3, 0.3, (6, dimension)), generator)[None]
+    links = generator.uniform(-0.5, 0.5, (1, 8, 3, 2, dimension))
+    present = np.ones((1, 6), dtype=bool)
+    radii = (0.01, 0.02, 0.03)
+    flat = np.concatenate((links, np.zeros((*links.shape[:-1], 3 - dimension))), axis=-1)[0]
+    wanted = [
+        min(
+            (shape.segment_distance(flat[:, i, 0], flat[:, i, 1]) - radius).min()
+            for i, radius in enumerate(radii)
+        )
+        for shape in obstacles_from_rows(rows[0])
+    ]
+    np.testing.assert_allclose(arm_clearance(links, radii, rows, present)[0], wanted, atol=1e-9)
+    wanted = [shape.distance(flat[:, 0, 0]).min() - 0.01 for shape in obstacles_from_rows(rows[0])]
+    np.testing.assert_allclose(hand_clearance(links[..., 0, 0, :], 0.01, rows, present)[0], wanted, atol=1e-9)
+
+
+def test_quaternions_are_those_of_axes(generator):
+    quaternion = generator.normal(size=(500, 4))
+    quaternion[np.arange(100), generator.integers(4, size=100)] = 0.0
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    axes = rotation_axes(quaternion)
+    again = quaternion_of_axes(*axes[:2])
+    np.testing.assert_allclose(np.abs((again * quaternion).sum(axis=-1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.stack(axes, axis=-1)[0], Box((1, 1, 1), quaternion=quaternion[0]).rotation)
+
+
+def test_observation_and_scene_agree(env):
+    observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": SCENE})
+    assert env.observation_space.contains(observation)
+    rows = env.batch.scenes.obstacles
+    seen = env.observation_layout.scene_rows(observation["obstacles"][None])
+    np.testing.assert_allclose(seen, rows, atol=1e-6)
+    assert (observation["obstacles"][5:] == 0.0).all()
+    given = obstacles_from_rows(rows[0])
+    assert [each.kind for each in given] == [each.kind for each in SCENE]
+    points = np.random.default_rng(0).uniform(-0.5, 0.8, (200, 3))
+    for mine, theirs in zip(given, SCENE, strict=True):
+        np.testing.assert_allclose(mine.distance(points), theirs.distance(points), atol=1e-9)
+
+
+def test_scenes_are_given_as_records_dictionaries_json_and_rows(env):
+    wanted, _ = env.reset(seed=0, options={**ENDS, "obstacles": SCENE})
+    text = obstacles_to_json(obstacles_from_rows(env.batch.scenes.obstacles[0]))
+    rows = env.batch.scenes.obstacles[0]
+    for obstacles in ([each.to_dict() for each in SCENE], obstacles_from_json(text), rows):
+        observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": obstacles})
+        np.testing.assert_allclose(observation["obstacles"], wanted["obstacles"], atol=1e-6)
+    bar = obstacle_rows([Capsule(0.02, 0.1, position=(0.7, -0.2, 0.1))], 3)
+    observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": bar})  # rows of capsules are taken, too
+    assert observation["obstacles"][0, KINDS.index("capsule")] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("env_id", "shapes"),
+    [
+        (PANDA, ("capsule", "box")),
+        ("viapoint/PlanarWholeArm-v0", ("box", "cylinder")),
+        ("viapoint/PlanarObstacles-v0", ("sphere", "capsule", "box")),
+        ("viapoint/PandaMovingObstacles-v0", ("capsule", "box")),
+    ],
+)
+def test_random_scenes_have_all_shapes_and_contact_is_negative_clearance(env_id, shapes):
+    envs = gym.make_vec(env_id, num_envs=24, threads=1, shapes=shapes).unwrapped
+    observation, _ = envs.reset(seed=0)
+    scenes, space = envs.scenes, envs.observation_space
+    kinds = np.array(list(SHAPES))[shape_columns(scenes.obstacles).kind[scenes.present]]
+    assert set(kinds) == set(shapes)
+    assert all(space[name].contains(part) for name, part in observation.items())
+    *_, info = envs.step(np.zeros(envs.action_space.shape))
+    assert info["collision"].mean() > 0.1
+    apart = np.abs(info["min_clearance"]) > 1e-4
+    assert ((info["min_clearance"] < 0.0) == info["collision"])[apart].all()
+    state = envs.state()
+    envs.step(np.zeros(envs.action_space.shape))
+    envs.restore(state)
+    envs.close()
+
+
+def test_what_replaces_a_capsule_is_inside_it(generator):
+    for d in (2, 3):
+        rows = np.concatenate(
+            (
+                generator.uniform(-0.3, 0.3, (200, d)),
+                generator.uniform(-0.1, 0.1, (200, d)),
+                np.full((200, 1), 0.03),
+            ),
+            axis=-1,
+        )
+        rows[::2, d : 2 * d] = 0.0
+        other = reshaped(rows, generator.random((200, RESHAPE_NUMBERS)), ("sphere", "box", "cylinder"))
+        points = np.zeros((200, 3))
+        points[:, :d] = generator.uniform(-0.4, 0.4, (200, d))
+        assert (pair_distance(other, points) >= pair_distance(widened(rows), points) - 1e-9).all()
+        np.testing.assert_array_equal(other[:, :d], rows[:, :d])
+
+
+def test_an_ellipsoid_of_ones_own_can_be_in_scenes():
+    rows = shape_rows("box", np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]), np.full((1, 3), 0.1))
+    assert rows.shape == (1, 15)
+    assert as_obstacle({"shape": "box", "size": (0.1, 0.1, 0.1)}) == obstacles_from_rows(rows)[0]
+
+
+CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "reason"),
+    [
+        (Box((0.3, 0.3, 0.3), position=(0.45, -0.3, 0.4)), "obstacle 0 (box at (0.45, -0.3, 0.4) m, half lengths"),
+        (Box((0.05, 0.05, 2.0), position=(0.5, 0.0, 0.3)), "has a half length over 1 m"),
+        (Sphere(0.05, position=(3.0, 0.0, 0.3)), "has its centre over 2 m from the origin"),
+        (ConvexMesh(CUBE), "obstacle 0: the scenes of this environment have the shapes"),
+        (PointCloud(CUBE), "not point_cloud, which is for distances only"),
+        ({"shape": "convex_mesh", "vertices": [*CUBE, (0.05, 0.05, 0.05)]}, "ConvexMesh.hull(vertices) is the hull"),
+        ({"shape": "box", "size": (0.1, 0.0, 0.1)}, "obstacle 0: box: size must be greater than 0"),
+        ({"shape": "box", "size": (0.1, 0.1, 0.1), "quaternion": (1, 1, 0, 0)}, "quaternion must have length 1"),
+        ({"shape": "pyramid"}, "obstacle 0: unknown shape 'pyramid'"),
+        (np.full((1, 15), 0.1), "is no row of a shape"),
+    ],
+)  # fmt: skip
+def test_impossible_obstacles_are_refused_with_their_name(env, obstacle, reason):
+    obstacles = obstacle if isinstance(obstacle, np.ndarray) else [obstacle]
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        env.reset(options={**ENDS, "obstacles": obstacles})
+
+
+@pytest.mark.parametrize(
+    ("shapes", "reason"),
+    [
+        ((), "shapes must be some of sphere, capsule, cylinder, box, half_space, without repetition"),
+        (("box", "box"), "without repetition"),
+        (("pyramid",), "got ('pyramid',)"),
+        (("convex_mesh",), "got ('convex_mesh',)"),
+        (3, "got 3"),
+    ],
+)
+def test_unknown_shapes_of_scenes_are_refused(shapes, reason):
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        gym.make(PANDA, shapes=shapes)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "reason"),
+    [
+        (
+            Box((0.1, 0.1, 0.1), position=(0.0, 0.4, 0.1)),
+            "box must lie in the plane, with its centre at z = 0",
+        ),
+        (
+            Cylinder(0.1, 0.1, position=(0.0, 0.4, 0.0), quaternion=(0.6, 0.8, 0.0, 0.0)),
+            "cylinder must lie in the",
+        ),
+        (HalfSpace(position=(0.0, 0.4, 0.0)), "half_space must have a horizontal normal"),
+    ],
+)
+def test_obstacles_of_planar_arms_stand_upright(obstacle, reason):
+    with pytest.raises(ValueError, match=reason):
+        obstacle_rows([obstacle], 2, KINDS)
