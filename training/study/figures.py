@@ -134,9 +134,7 @@ def _series(numbers: Numbers) -> dict[str, list[Numbers]]:
     for each in numbers["rows"]:
         made, kind = each["made"], each["kind"]
         changed = (
-            made["training"]
-            if kind == "agent"
-            else made["env_kwargs"] or made["time_of"] or made["n_scenes"]
+            made["training"] if kind == "agent" else made["env_kwargs"] or made["time_of"] or made["n_scenes"]
         )
         if each["checks"] is None or changed or each.get("untrained") or each.get("unrevised"):
             continue
