@@ -1,90 +1,223 @@
-"""Bounding capsules of the geoms of a link."""
+"""Capsules and spheres that cover the geoms of a link.
+
+A capsule contains the convex hull of points if it contains the points. The point of a capsule that is farthest from a
+convex body K is on one of the balls at its ends; the signed distance d of K tells how far. So for ends a, b, radius R
+
+    excess = R + max(d(a), d(b)),   R = max over the points p of K of |p - segment(a, b)|.                        (1)
+
+The ends minimise the excess. Where it is over the tolerance, a plane cuts K into two convex pieces, and a capsule for
+each contains the piece; (1) still takes d from the whole of K.
+"""
 
 from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.convex_mesh import ConvexMesh, Polytope
+from viapoint.envs.geometry.distance import point_distance_squared
 
 Geom = mujoco.mjtGeom
-Capsule = tuple[Float, float]
-"""Ends of the axis, shape (2, 3), and radius, [m]."""
 
-MIN_LENGTH = 1e-3
-"""Least length of a capsule's axis, [m]."""
 ROUNDING = 1e-6
 """Added to the radius, so that rounding leaves nothing outside, [m]."""
+SHORTEST = 1e-3
+"""Length of the axis below which a capsule becomes a sphere, [m]."""
 RIM_POINTS = 24
-"""Points on each rim of a cylinder."""
+"""Corners of the prism around a cylinder, and of each ring around an ellipsoid."""
+CUTS = (0.35, 0.5, 0.65)
+"""Places of the planes that cut a body, as shares of its length along a principal axis."""
+LEAST_SHARE = 0.3
+"""Least length along an axis across which a body is cut, as a share of the greatest."""
+FIRST_STEP, LAST_STEP = 0.25, 5e-4
+"""First and last step of the search for the ends, as shares of the size of the body."""
+MOST_CAPSULES = 64
+"""Greatest number of capsules for one geom."""
 
 
-def bounding_balls(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[Float, float]:
-    """Return balls whose convex hull is a geom: centres in the world, shape (n, 3), [m], and their common radius, [m].
+class Capsule(NamedTuple):
+    """Capsule, or sphere, that covers a part of a link."""
 
-    Ellipsoids count as their bounding boxes. Cylinders count as inscribed prisms, whose faces are up to 0.9 % of the
-    radius inside. Planes, height fields and other unbounded geoms have no balls.
+    ends: Float
+    """Ends of the axis, shape (2, 3), equal for a sphere, [m]."""
+    radius: float
+    """Radius, [m]."""
+    excess: float
+    """Greatest distance of a point of the capsule from the geom that it covers, [m]."""
+
+
+def cover_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, tolerance: float) -> list[Capsule]:
+    """Return capsules and spheres that together contain a geom, in the world's frame.
+
+    Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
+    covered. Planes, height fields and other unbounded geoms have no capsules.
+
+    Args:
+        model: Model of the arm.
+        data: Positions of its parts.
+        geom: Index of the geom.
+        tolerance: Greatest distance of a point of the capsules from the geom, [m].
+
+    Raises:
+        ValueError: The geom needs more than MOST_CAPSULES capsules.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    radius = 0.0
+    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
+        half = size[1] * turn[:, 2] if kind == Geom.mjGEOM_CAPSULE else np.zeros(3)
+        return [Capsule(np.stack((place - half, place + half)), float(size[0]), 0.0)]
+    corners = corners_of(model, geom)
+    if not len(corners):
+        return []
+    found = cover_points(corners, tolerance)
+    return [each._replace(ends=place + each.ends @ turn.T) for each in found]
+
+
+def corners_of(model: mujoco.MjModel, geom: int) -> Float:
+    """Return points whose convex hull contains a geom, in the geom's frame, shape (n, 3), [m].
+
+    The polytopes around cylinders and ellipsoids are up to 0.9 % and 1.8 % larger. Geoms that are neither boxes,
+    cylinders, ellipsoids nor meshes have no points.
+    """
+    size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
+    angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
+    wide = 1.0 / np.cos(np.pi / RIM_POINTS)
+    rim = np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1) * (wide, wide, 1.0)
     if kind == Geom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
-        local = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
-    elif kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
-        half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
-        local, radius = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(size[0])
-    elif kind == Geom.mjGEOM_CYLINDER:
-        angle = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-        rim = size[0] * np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1)
-        local = np.concatenate((rim - (0.0, 0.0, size[1]), rim + np.array([0.0, 0.0, size[1]])))
-    elif kind in (Geom.mjGEOM_BOX, Geom.mjGEOM_ELLIPSOID):
-        local = size * np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
-    else:
-        return np.empty((0, 3)), 0.0
-    return place + local @ turn.T, radius
+        return np.asarray(model.mesh_vert[first : first + model.mesh_vertnum[mesh]], np.float64)
+    if kind == Geom.mjGEOM_BOX:
+        return np.asarray(size * np.array(list(itertools.product((-1.0, 1.0), repeat=3))))
+    if kind == Geom.mjGEOM_CYLINDER:
+        return np.concatenate([size[0] * rim + (0.0, 0.0, side * size[1]) for side in (-1.0, 1.0)])
+    if kind == Geom.mjGEOM_ELLIPSOID:
+        heights = np.sin(np.pi * (np.arange(1, RIM_POINTS // 2) / (RIM_POINTS // 2) - 0.5))
+        rings = [np.sqrt(1.0 - z * z) * rim + (0.0, 0.0, z) for z in heights]
+        poles = np.array([(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+        return np.asarray(size * wide * np.concatenate((*rings, poles)))
+    return np.empty((0, 3))
 
 
-def fit_capsule(centres: Float, radii: Float, axes: Float) -> Capsule:
-    """Return the smallest capsule by volume, among some directions of its axis, that contains all balls.
+def cover_points(points: Float, tolerance: float) -> list[Capsule]:
+    """Return capsules and spheres that together contain the convex hull of points.
 
     Args:
-        centres: Centres of the balls, shape (n, 3), [m].
-        radii: Radii of the balls, shape (n,), [m].
-        axes: Directions to try, shape (m, 3), besides the principal axes of the centres.
+        points: Shape (n, 3), [m].
+        tolerance: Greatest distance of a point of the capsules from the hull, [m].
+
+    Raises:
+        ValueError: More than MOST_CAPSULES capsules are needed.
     """
-    centred = centres - centres.mean(axis=0)
-    # The tiny rows give three axes where fewer than three points do not.
-    principal = np.linalg.svd(np.concatenate((centred, np.eye(3) * 1e-9)), full_matrices=False)[2]
-    capsules = [_capsule_along(centres, radii, axis) for axis in np.concatenate((axes, principal))]
-    return min(capsules, key=_volume)
+    body = ConvexMesh.hull(points)
+    pieces, found = [(body.vertices, fit_capsule(body.vertices, body))], []
+    while pieces:
+        corners, capsule = pieces.pop()
+        if capsule.excess <= tolerance:
+            found.append(capsule)
+            continue
+        if len(pieces) + len(found) + 2 > MOST_CAPSULES:
+            raise ValueError(
+                f"tolerance {tolerance:g} m takes more than {MOST_CAPSULES} capsules for one geom"
+            )
+        pieces += _best_halves(corners, body, tolerance)
+    return found
 
 
-def _capsule_along(centres: Float, radii: Float, axis: Float) -> Capsule:
-    """Return a capsule of a given direction that contains all balls.
+def fit_capsule(corners: Float, body: ConvexMesh) -> Capsule:
+    """Return a capsule that contains points with little excess over a convex body that contains them.
 
-    The axis runs through the middle of the bounding rectangle of the cross-section. The radius is the least that
-    contains all balls from there, and the length the least for this radius: a ball of radius r at distance d from the
-    axis is inside a cap whose centre is up to sqrt((R - r)^2 - d^2) away from it along the axis.
+    Args:
+        corners: Points, shape (n, 3), [m].
+        body: Convex body.
     """
-    length = float(np.linalg.norm(axis))
-    axis = axis / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
-    sideways = np.linalg.svd(axis[None])[2][1:]  # two directions normal to the axis
-    flat = centres @ sideways.T
-    middle = 0.5 * ((flat - radii[:, None]).min(axis=0) + (flat + radii[:, None]).max(axis=0))
-    away = norm(flat - middle)
-    radius = float((away + radii).max()) + ROUNDING
-    slack = np.sqrt((radius - radii) ** 2 - np.minimum(away, radius - radii) ** 2)
-    along = centres @ axis
-    low, high = float((along + slack).min()), float((along - slack).max())
-    if high - low < MIN_LENGTH:
-        low, high = 0.5 * (low + high - MIN_LENGTH), 0.5 * (low + high + MIN_LENGTH)
-    centre = middle @ sideways
-    return np.stack((centre + low * axis, centre + high * axis)), radius
+    centre, axes, (low, high) = _principal_frame(corners)
+    size = float((high - low).max())
+    best, least = np.empty((2, 3)), np.inf
+    for i in range(3):
+        others = 0.5 * (np.delete(low, i) + np.delete(high, i))
+        inset = min(0.5 * float(np.delete(high - low, i).max()), 0.5 * float(high[i] - low[i]))
+        ends = np.array([np.insert(others, i, z) for z in (low[i] + inset, high[i] - inset)])
+        start = centre + ends @ axes.T
+        refined, value = _refine(start, corners, body, size)
+        if value < least:
+            best, least = refined, value
+    if norm(best[1] - best[0]) < SHORTEST:
+        best = np.repeat(best.mean(axis=0)[None], 2, axis=0)
+    radius = float(_radii(best[None], corners)[0]) + ROUNDING
+    return Capsule(best, radius, radius + float(np.asarray(body.distance(best)).max()))
 
 
-def _volume(capsule: Capsule) -> float:
-    ends, radius = capsule
-    return float(np.pi * radius**2 * (np.linalg.norm(ends[1] - ends[0]) + 4.0 / 3.0 * radius))
+def _refine(ends: Float, corners: Float, body: ConvexMesh, size: float) -> tuple[Float, float]:
+    """Return ends of the least excess (1) near some ends, by a compass search, and the excess without rounding."""
+    moves = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3)))).reshape(-1, 2, 3)
+    moves = np.concatenate((moves, -moves))
+    normals, offsets = body.polytope.normals, body.polytope.offsets
+
+    def excess(probes: Float) -> Float:
+        heights = (probes @ normals.T - offsets).max(axis=(-2, -1))  # d of points inside, less than d outside
+        return np.asarray(_radii(probes, corners) + heights)
+
+    step, least = FIRST_STEP * size, float(excess(ends[None])[0])
+    while step > LAST_STEP * size:
+        probes = ends + step * moves
+        values = excess(probes)
+        i = int(values.argmin())
+        if values[i] < least - 1e-9:
+            ends, least = probes[i], float(values[i])
+        else:
+            step *= 0.5
+    return ends, least
+
+
+def _radii(ends: Float, corners: Float) -> Float:
+    """Return the greatest distance of points from each of M segments, (M, 2, 3), shape (M,), [m]."""
+    rows = np.concatenate(
+        (ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0]), np.zeros((len(ends), 1))), axis=-1
+    )
+    return np.asarray(np.sqrt(point_distance_squared(corners, rows).max(axis=-1)))
+
+
+def _best_halves(corners: Float, body: ConvexMesh, tolerance: float) -> list[tuple[Float, Capsule]]:
+    """Return the corners of two pieces of a polytope, and their capsules, cut by the best of some planes."""
+    centre, axes, (low, high) = _principal_frame(corners)
+    polytope, size = ConvexMesh.hull(corners).polytope, high - low
+    best: list[tuple[Float, Capsule]] = []
+    least = 2, np.inf
+    for i in np.flatnonzero(size >= LEAST_SHARE * size.max()):
+        for share in CUTS:
+            level = float(centre @ axes[:, i] + low[i] + share * size[i])
+            halves = [
+                (piece, fit_capsule(piece, body))
+                for piece in cut_polytope(corners, polytope, axes[:, i], level)
+            ]
+            excess = [capsule.excess for _, capsule in halves]
+            merit = sum(each > tolerance for each in excess), max(excess)
+            if not best or merit < least:
+                best, least = halves, merit
+    return best
+
+
+def cut_polytope(corners: Float, polytope: Polytope, normal: Float, offset: float) -> tuple[Float, Float]:
+    """Return the corners of the two pieces of a polytope below and above the plane normal . x = offset."""
+    height = corners @ normal - offset
+    first, along = polytope.starts @ normal - offset, polytope.edges @ normal
+    crosses = first * (first + along) < 0.0
+    share = -first[crosses] / along[crosses]
+    between = polytope.starts[crosses] + share[:, None] * polytope.edges[crosses]
+    # Corners on the plane belong to both pieces.
+    low, high = corners[height <= ROUNDING], corners[height >= -ROUNDING]
+    return np.concatenate((low, between)), np.concatenate((high, between))
+
+
+def _principal_frame(points: Float) -> tuple[Float, Float, Float]:
+    """Return the mean of points, principal axes as columns, and lowest and highest coordinates, shape (2, 3)."""
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2].T
+    local = (points - centre) @ axes
+    return centre, axes, np.stack((local.min(axis=0), local.max(axis=0)))

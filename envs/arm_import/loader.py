@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from viapoint.envs.arm_import import mjcf_reader
-from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
+from viapoint.envs.arm_import.capsule_fit import cover_geom
 from viapoint.envs.arm_import.mjcf_reader import ParsedMjcf
 from viapoint.envs.arm_import.reachability import (
     FIRST_OFF_TABLE,
     Feasibility,
-    LinkCapsule,
     check_room,
     check_strength,
     corner_configurations,
@@ -33,7 +33,7 @@ from viapoint.envs.arms.mjcf import (
     read_spec,
     zero_configuration,
 )
-from viapoint.envs.arms.serial_arm import SerialArm, serial_arm
+from viapoint.envs.arms.serial_arm import LinkCapsule, SerialArm, serial_arm
 from viapoint.envs.common.types import Float
 
 STAGE = "stage.xml"
@@ -57,12 +57,14 @@ def load_arm(
     torque_limit: ArrayLike | None = None,
     velocity_limit: ArrayLike | None = None,
     hand_radius: float = 0.02,
+    tolerance: float = 0.025,
 ) -> SerialArm:
     """Load an arm from an MJCF file.
 
-    The arm keeps the file's joints, inertias and limits. Each link gets one capsule around its geoms. Other joints are
-    fixed as in the file's first keyframe, and everything else is left out. The hand keeps the orientation that it has
-    at home; the reach is a box of hand positions around home.
+    The arm keeps the file's joints, inertias and limits, and the spheres and capsules of its links. Capsules cover the
+    links' other geoms: nothing sticks out of them. Other joints are fixed as in the file's first keyframe, and
+    everything else is left out. The hand keeps the orientation that it has at home; the reach is a box of hand
+    positions around home.
 
     Args:
         path: MJCF file.
@@ -80,6 +82,8 @@ def load_arm(
         velocity_limit: Velocity limit of each joint or of all, [rad/s]; by default the file's custom number of that
             name, or 2.
         hand_radius: Radius of the sphere that is the hand, [m].
+        tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m].
+            Smaller values take more capsules, and more time to load the arm and to compute clearances.
 
     Returns:
         The arm. Pass it to `gymnasium.make(id, arm=...)`, or register it with `register_arm`.
@@ -109,6 +113,7 @@ def load_arm(
     corners = None if workspace is None else mjcf_reader.workspace_corners(workspace)
     zero = None if origin is None else mjcf_reader.point("origin", origin)
     hand_radius = mjcf_reader.positive_radius(hand_radius)
+    tolerance = mjcf_reader.fit_tolerance(tolerance)
     name = mjcf_reader.arm_name(file.stem if name is None else name)
     parsed = mjcf_reader.parse_mjcf(
         file,
@@ -121,7 +126,7 @@ def load_arm(
     )
     frames = joint_frames(parsed.model, parsed.joints)
     zero = np.array([*frames[0][1][:2], 0.0]) if zero is None else zero
-    capsules = _link_capsules(parsed, frames, hand_radius)
+    capsules = _link_capsules(parsed, frames, hand_radius, tolerance)
     # The chain is that of the written model, whose first frame is relative to the new origin.
     chain = kinematic_chain(_write(parsed, frames, zero, capsules, [], hand_radius).compile(), parsed.joints)
     hand_offset = in_frame(frames[-1], zero_configuration(parsed.model).site(hand_site).xpos)
@@ -133,31 +138,31 @@ def load_arm(
         low, high = (np.array(corner) for corner in table.box)
         corners = np.stack((low + WORKSPACE_MARGIN, high - WORKSPACE_MARGIN))
     arm = serial_arm(
-        _write(parsed, frames, zero, capsules, check.overlapping, hand_radius).to_xml(),
+        _write(parsed, frames, zero, capsules, check.may_touch, hand_radius).to_xml(),
         name=name,
         joint_names=parsed.joints,
         hand_site="hand",
         ik=table,
         workspace=as_box(corners),
+        may_touch_itself=False,  # the whole reach was checked
     )
     check_room(arm, table.box)
     check_strength(parsed, chain, *corner_configurations(arm))
     return arm
 
 
-def _link_capsules(parsed: ParsedMjcf, frames: list[Pose], hand_radius: float) -> list[LinkCapsule]:
-    """Return one capsule around each link's geoms, those that collide if any do, and one from the last to the hand."""
+def _link_capsules(
+    parsed: ParsedMjcf, frames: list[Pose], hand_radius: float, tolerance: float
+) -> list[LinkCapsule]:
+    """Return the capsules of each link's geoms, those that collide if any do, and one from the last to the hand."""
     model, data, capsules = parsed.model, zero_configuration(parsed.model), []
     collides = (model.geom_contype | model.geom_conaffinity) > 0
     for index, (joint, frame) in enumerate(zip(parsed.joints, frames, strict=True)):
         moved = np.isin(model.geom_bodyid, bodies_moved_by(model, joint))
-        geoms = np.flatnonzero(moved & collides) if (moved & collides).any() else np.flatnonzero(moved)
-        balls = [bounding_balls(model, data, int(geom)) for geom in geoms]
-        centres = np.concatenate([np.empty((0, 3)), *(each[0] for each in balls)])
-        if len(centres):
-            radii = np.concatenate([np.full(len(each[0]), each[1]) for each in balls])
-            (first, second), radius = fit_capsule(centres, radii, np.array([frame[0][:, 2]]))
-            capsules.append(LinkCapsule(index, (in_frame(frame, first), in_frame(frame, second)), radius))
+        for geom in np.flatnonzero(moved & collides if (moved & collides).any() else moved):
+            for ends, radius, _ in cover_geom(model, data, int(geom), tolerance):
+                first, second = (in_frame(frame, end) for end in ends)
+                capsules.append(LinkCapsule(index, (first, second), radius))
     if not capsules:
         raise ValueError(
             f"no geom moves with any of {', '.join(parsed.joints)}: nothing of the arm can collide"
@@ -176,17 +181,17 @@ def _write(
     frames: list[Pose],
     origin: Float,
     capsules: list[LinkCapsule],
-    overlapping: list[tuple[int, int]],
+    may_touch: list[tuple[int, int]],
     hand_radius: float,
 ) -> mujoco.MjSpec:
-    """Return the arm as a complete model: one body, hinge and capsule for each link.
+    """Return the arm as a complete model: one body and hinge for each link, and its capsules.
 
     Args:
         parsed: Arm in the form of its file.
         frames: Joint frames at angle 0.
         origin: Point that becomes the origin, shape (3,), [m].
         capsules: Links.
-        overlapping: Pairs of capsules between which contacts do not count.
+        may_touch: Pairs of links, by their joints, between which contacts do not count.
         hand_radius: Radius of the hand, [m].
     """
     spec = read_spec(STAGE)
@@ -207,8 +212,7 @@ def _write(
         turn, place = frame
     for number, capsule in enumerate(capsules):
         spec.body(f"link_{capsule.joint}").add_geom(
-            name=f"capsule_{number}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=np.ravel(capsule.ends),
-            size=(capsule.radius, 0.0, 0.0), conaffinity=SELF_BIT,
+            name=f"capsule_{number}", **_geometry(capsule), conaffinity=SELF_BIT,
             contype=OBSTACLE_BIT | SELF_BIT | (TABLE_BIT if capsule.joint >= FIRST_OFF_TABLE else 0),
         )  # fmt: skip
     hand = capsules[-1].ends[1]
@@ -217,6 +221,15 @@ def _write(
         contype=OBSTACLE_BIT | TABLE_BIT, conaffinity=0, rgba=(0.16, 0.20, 0.28, 1.0),
     )  # fmt: skip
     parent.add_site(name="hand", pos=hand, size=(0.004, 0.0, 0.0), rgba=(0.0, 0.0, 0.0, 0.0))
-    for first, second in {(capsules[i].joint, capsules[j].joint) for i, j in overlapping}:
+    for first, second in may_touch:
         spec.add_exclude(bodyname1=f"link_{first}", bodyname2=f"link_{second}", name=f"near_{first}_{second}")
     return spec
+
+
+def _geometry(capsule: LinkCapsule) -> dict[str, Any]:
+    """Return type, place and size of a capsule's geom."""
+    first, second = capsule.ends
+    if first == second:
+        return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "pos": first, "size": (capsule.radius, 0.0, 0.0)}
+    ends = np.ravel(capsule.ends)
+    return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "fromto": ends, "size": (capsule.radius, 0.0, 0.0)}

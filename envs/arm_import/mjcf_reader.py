@@ -18,6 +18,8 @@ MIN_WORKSPACE_WIDTH = 1e-3
 """Least width of a workspace along each axis, [m]."""
 MAX_COORDINATE = 0.95
 """Greatest coordinate of a hand position, [m]: observations end at 1."""
+MIN_TOLERANCE = 0.005
+"""Least tolerance of fitted capsules, [m]."""
 POSITION_TOLERANCE = 1e-6
 """Greatest difference of positions and axes that count as equal, [m]."""
 DEFAULT_VELOCITY_LIMIT = 2.0
@@ -107,6 +109,15 @@ def positive_radius(value: Any) -> float:
     if not (is_number(value) and 0.0 < float(value) < MAX_COORDINATE):
         raise ValueError(
             f"hand_radius must be a positive number of m, less than {MAX_COORDINATE}, got {value!r}"
+        )
+    return float(value)
+
+
+def fit_tolerance(value: Any) -> float:
+    """Return the greatest distance of fitted capsules from their geoms, [m]."""
+    if not (is_number(value) and MIN_TOLERANCE <= float(value) < MAX_COORDINATE):
+        raise ValueError(
+            f"tolerance must be a number of m from {MIN_TOLERANCE} to less than {MAX_COORDINATE}, got {value!r}"
         )
     return float(value)
 

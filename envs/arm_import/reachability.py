@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,8 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.ik_table import IKTable, fit_ik_table, hand_pose, solve_inverse_kinematics
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.mjcf import as_box, grid
-from viapoint.envs.arms.serial_arm import LIMIT_SHARE, SerialArm
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE, LinkCapsule, SerialArm, capsule_pair_clearance
 from viapoint.envs.common.types import Bool, Box, Float
-from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.sampler import SceneSampler
 
@@ -41,20 +40,11 @@ ROOM_SCENES = 64
 """Scenes that are sampled to check that movements fit into the workspace."""
 
 
-class LinkCapsule(NamedTuple):
-    """Collision capsule of a link in its joint's frame."""
-
-    joint: int
-    ends: tuple[Constants, Constants]
-    radius: float
-
-
 class Feasibility:
     """Check of configurations and hand positions of an imported arm.
 
     A position is feasible if the inverse kinematics that starts at home finds a configuration that puts the hand there,
-    oriented as at home, with all margins of this module. Links that overlap at home already are not compared, because
-    capsules are wider than links.
+    oriented as at home, with all margins of this module. Links that may touch are not compared.
     """
 
     def __init__(
@@ -66,14 +56,20 @@ class Feasibility:
         """Hand position at home, shape (3,), [m]."""
         pairs = [
             (i, j)
-            for i, first in enumerate(capsules)
-            for j, second in enumerate(capsules)
+            for (i, first), (j, second) in itertools.combinations(enumerate(capsules), 2)
             if second.joint - first.joint >= 2
         ]
-        close = [self._clearance(parsed.home[None], [pair])[0, 0] < LINK_MARGIN for pair in pairs]
-        self.overlapping = [pair for pair, near in zip(pairs, close, strict=True) if near]
-        """Pairs of capsules that overlap at home."""
-        self._pairs = [pair for pair, near in zip(pairs, close, strict=True) if not near]
+        near = self._clearance(parsed.home[None], pairs)[0] < LINK_MARGIN
+        touching = {
+            (capsules[i].joint, capsules[j].joint)
+            for (i, j), close in zip(pairs, near, strict=False)
+            if close
+        }
+        self.may_touch = sorted(touching)
+        """Pairs of links, by their joints, that may touch because they come closer than LINK_MARGIN at home.
+
+        Those of consecutive joints may touch, too."""
+        self._pairs = [(i, j) for i, j in pairs if (capsules[i].joint, capsules[j].joint) not in touching]
 
     def reachable_box(self, workspace: Float | None) -> Box:
         """Return the largest box of feasible positions around home, or around a given workspace, shape (2, 3).
@@ -171,14 +167,11 @@ class Feasibility:
         return np.asarray(self.chain.points(joints, places)).reshape(len(joints), -1, 2, 3)
 
     def _clearance(self, joints: Float, pairs: list[tuple[int, int]]) -> Float:
-        """Return the clearance of pairs of capsules, shape (N, pairs), [m]."""
-        ends, each = self._ends(joints), []
-        for i, j in pairs:
-            middle, half = ends[:, j].mean(axis=1), 0.5 * (ends[:, j, 1] - ends[:, j, 0])
-            row = np.concatenate((middle, half, np.zeros((len(joints), 1))), axis=-1)[:, None]
-            squared = segment_distance_squared(ends[:, i, :1], ends[:, i, 1:], row)[:, 0, 0]
-            each.append(np.sqrt(squared) - self._capsules[i].radius - self._capsules[j].radius)
-        return np.stack(each, axis=-1) if each else np.full((len(joints), 1), np.inf)
+        """Return the clearance of pairs of capsules, shape (N, pairs), [m]; one column of infinity without pairs."""
+        if not pairs:
+            return np.full((len(joints), 1), np.inf)
+        radii = np.array([capsule.radius for capsule in self._capsules])
+        return np.asarray(capsule_pair_clearance(self._ends(joints), radii, pairs))
 
 
 def fit_feasible_table(check: Feasibility, box: Box, required: Float) -> IKTable:

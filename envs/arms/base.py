@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Box, Float
+from viapoint.envs.common.types import Bool, Box, Float, Numbers
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.primitives.array_api import Array
@@ -44,7 +44,18 @@ class Arm(Protocol):
 
     @property
     def link_radii(self) -> tuple[float, ...]:
-        """Radii of the L link capsules, [m]."""
+        """Radii of the L capsules and spheres of the links, [m]; the last one ends in the hand."""
+
+    @property
+    def link_joints(self) -> tuple[int, ...]:
+        """Index of the joint that each of the L capsules moves with, in increasing order."""
+
+    @property
+    def may_touch_itself(self) -> bool:
+        """True if a configuration within reach may touch the arm itself or the table.
+
+        Then clearances of plans include :meth:`self_clearance`.
+        """
 
     @property
     def joint_range(self) -> tuple[tuple[float, float], ...]:
@@ -66,7 +77,7 @@ class Arm(Protocol):
 
     @property
     def traced(self) -> tuple[str, ...]:
-        """Names of the sites that the simulation records: the hand, then both ends of each link.
+        """Names of the sites that the simulation records: the hand, then both ends of each capsule.
 
         Without names, positions are computed from the joints; for few links that is faster.
         """
@@ -87,7 +98,17 @@ class Arm(Protocol):
         """
 
     def links(self, joints: Array) -> Array:
-        """Return both ends of the axis of each link's capsule, shape (..., L, 2, D), [m].
+        """Return both ends of the axis of each capsule, equal for spheres, shape (..., L, 2, D), [m].
+
+        Args:
+            joints: Joint angles, shape (..., J), [rad].
+        """
+
+    def self_clearance(self, joints: Array) -> Array:
+        """Return the least clearance of the arm from itself and the table, shape (...,), [m]; at most MAX_CLEARANCE.
+
+        It is negative exactly where the simulated arm is in contact without obstacles. Links that may touch one another
+        do not count.
 
         Args:
             joints: Joint angles, shape (..., J), [rad].
@@ -144,23 +165,42 @@ class CollisionModel:
     ) -> Float:
         """Return the least clearance over time and obstacles, shape (N,).
 
+        Without joint angles, as for a plan, :meth:`with_self_clearance` applies.
+
         Args:
             hand: Hand positions, shape (N, T, D), [m].
             obstacles: Obstacles at rest, shape (N, n, 2 D + 1), [m].
             present: True for rows that are obstacles, shape (N, n).
             joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
         """
-        if not obstacles.shape[1]:
-            return np.full(len(hand), MAX_CLEARANCE)
-        links = self._links(hand, joints)
-        if links is not None and self.arm.traced:
-            return nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present)
-        return np.asarray(self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1))
+        least = np.full(len(hand), MAX_CLEARANCE)
+        if obstacles.shape[1]:
+            links = self._links(hand, joints)
+            if links is not None and self.arm.traced:
+                least = nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present)
+            else:
+                least = self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1)
+        return np.asarray(self.with_self_clearance(least, hand, time_axis=1) if joints is None else least)
+
+    def with_self_clearance(self, least: Any, hand: Numbers, time_axis: int | None = None) -> Any:
+        """Return the minimum of clearances and a planned arm's clearance from itself, if links count and may touch.
+
+        Args:
+            least: Clearances from obstacles, with the shape of the result.
+            hand: Planned hand positions, shape (..., D), [m].
+            time_axis: Axis of time over which the minimum is taken; None for the clearance at each time.
+        """
+        if not (self.whole_arm and self.arm.may_touch_itself):
+            return least
+        found = np.asarray(self.arm.self_clearance(self.arm.inverse_kinematics(hand)))
+        return np.minimum(least, found if time_axis is None else found.min(axis=time_axis))
 
     def clearance_profile(
         self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
     ) -> Float:
         """Return the clearance from each obstacle, which may move, at each time, shape (N, T, n).
+
+        Without joint angles, as for a plan, :meth:`with_self_clearance` applies.
 
         Args:
             hand: Hand positions, shape (N, T, D), [m].
@@ -178,7 +218,10 @@ class CollisionModel:
             links = links.reshape(-1, 1, *links.shape[2:])
         rows, shown = obstacles.reshape(-1, *obstacles.shape[2:]), np.repeat(present, times, axis=0)
         profile = self._clearance(hand.reshape(-1, 1, hand.shape[-1]), radius, links, rows, shown)
-        return profile.reshape(number, times, most)
+        profile = profile.reshape(number, times, most)
+        if joints is None:
+            profile = np.moveaxis(self.with_self_clearance(np.moveaxis(profile, -1, 0), hand), 0, -1)
+        return profile
 
     def _links(self, hand: Float, joints: Float | None) -> Float | None:
         if not self.whole_arm:

@@ -11,6 +11,7 @@ import numpy as np
 
 from viapoint.envs.arms.mjcf import add_obstacles, read_spec
 from viapoint.envs.common.types import Box
+from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 
@@ -56,6 +57,8 @@ class PlanarArm:
     dimension: int = 2
     traced: tuple[str, ...] = ()
     velocity_limit: tuple[float, ...] = ()
+    link_joints: tuple[int, ...] = (0, 1)
+    may_touch_itself: bool = False
 
     @classmethod
     def from_file(cls, model_file: str) -> PlanarArm:
@@ -135,6 +138,10 @@ class PlanarArm:
         zero = xp.zeros_like(upper)
         ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
         return _batch_first(xp, xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
+
+    def self_clearance(self, joints: Array) -> Array:
+        """Return MAX_CLEARANCE: adjacent links may touch; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
+        return namespace_of(joints).full_like(joints[..., 0], MAX_CLEARANCE)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
         """Return both ends of each link for the hand at `hand`, shape (..., 2), [m], without computing angles.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.mjcf import (
+    Pose,
     add_obstacles,
     bodies_moved_by,
     in_frame,
@@ -19,6 +22,8 @@ from viapoint.envs.arms.mjcf import (
     zero_configuration,
 )
 from viapoint.envs.common.types import Box, Float
+from viapoint.envs.geometry.distance import MAX_CLEARANCE
+from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.primitives.array_api import Array, namespace_of
 
 DIFFERENCE_STEP = 1e-3
@@ -49,19 +54,17 @@ class InverseKinematics(Protocol):
         """Return the distance of the hand inside the reach, shape (...,), [m]; negative out of reach."""
 
 
-class Link(NamedTuple):
-    """Collision capsule that moves with a joint."""
+class LinkCapsule(NamedTuple):
+    """Capsule, or sphere, of an arm that collides; a link may have any number of them."""
 
-    name: str
-    """Name of the geom."""
-    body: str
-    """Name of the body that has the geom."""
     joint: int
-    """Index of the joint."""
+    """Index of the joint that it moves with; -1 for the base, which does not move."""
     ends: tuple[Constants, Constants]
-    """Ends of the capsule's axis in the joint's frame, [m]."""
+    """Ends of the axis in the joint's frame, [m]; equal for a sphere. The base is in the world's frame."""
     radius: float
     """Radius, [m]."""
+    name: str = ""
+    """Name of the geom."""
 
 
 class JointMotion(NamedTuple):
@@ -93,8 +96,14 @@ class SerialArm:
     chain: Chain
     ik: InverseKinematics
     """Inverse kinematics."""
-    shape: tuple[Link, ...]
-    """Links from the base to the hand."""
+    shape: tuple[LinkCapsule, ...]
+    """Capsules of the links in order from the base; the last one ends in the hand."""
+    base: tuple[LinkCapsule, ...]
+    """Capsules of the base, which obstacles may overlap and the arm must not touch."""
+    self_pairs: tuple[tuple[int, int], ...]
+    """Pairs of capsules that must not touch one another, as indices into `(*shape, *base)`."""
+    off_table: tuple[int, ...]
+    """Indices of capsules that must not touch the table, the plane z = 0."""
     hand_offset: Constants
     """Hand in the last joint's frame, [m]."""
     hand_radius: float
@@ -112,17 +121,23 @@ class SerialArm:
     """Stiffness of the hand's servo, [N/m]."""
     hand_damping: float
     """Damping of the hand's servo, [N s/m]."""
+    may_touch_itself: bool
     dimension: int = 3
 
     @property
     def link_radii(self) -> tuple[float, ...]:
-        """Radii of the link capsules, [m]."""
-        return tuple(link.radius for link in self.shape)
+        """Radii of the capsules, [m]."""
+        return tuple(capsule.radius for capsule in self.shape)
+
+    @property
+    def link_joints(self) -> tuple[int, ...]:
+        """Index of the joint that each capsule moves with."""
+        return tuple(capsule.joint for capsule in self.shape)
 
     @property
     def traced(self) -> tuple[str, ...]:
-        """Names of the sites of the hand and of both ends of each link."""
-        return (self.hand_site, *(f"{link.name}_{end}" for link in self.shape for end in (0, 1)))
+        """Names of the sites of the hand and of both ends of each capsule."""
+        return (self.hand_site, *(f"{capsule.name}_{end}" for capsule in self.shape for end in (0, 1)))
 
     def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
         """Return the MuJoCo model; see :meth:`viapoint.envs.arms.base.Arm.compile`."""
@@ -137,11 +152,26 @@ class SerialArm:
         return self.chain.points(joints, ((len(self.joint_range) - 1, self.hand_offset),))[..., 0, :]
 
     def links(self, joints: Array) -> Array:
-        """Return link segments; see :meth:`viapoint.envs.arms.base.Arm.links`."""
+        """Return the axes of the capsules; see :meth:`viapoint.envs.arms.base.Arm.links`."""
         xp = namespace_of(joints)
-        places = tuple((link.joint, end) for link in self.shape for end in link.ends)
+        places = tuple((capsule.joint, end) for capsule in self.shape for end in capsule.ends)
         points = self.chain.points(joints, places)
         return xp.reshape(points, (*joints.shape[:-1], len(self.shape), 2, 3))
+
+    def self_clearance(self, joints: Array) -> Array:
+        """Return the clearance of the arm from itself; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
+        xp, links = namespace_of(joints), self.links(joints)
+        base = xp.asarray(np.array([c.ends for c in self.base]).reshape(-1, 2, 3), dtype=joints.dtype)
+        ends = xp.concat((links, xp.broadcast_to(base, (*joints.shape[:-1], *base.shape))), axis=-3)
+        radii = np.array([capsule.radius for capsule in (*self.shape, *self.base)])
+        found = [xp.full_like(joints[..., :1], MAX_CLEARANCE)]
+        if self.self_pairs:
+            found.append(capsule_pair_clearance(ends, radii, self.self_pairs))
+        if self.off_table:
+            some = list(self.off_table)
+            lowest = xp.min(ends[..., some, :, :][..., 2], axis=-1)
+            found.append(lowest - xp.asarray(radii[some], dtype=joints.dtype))
+        return xp.min(xp.concat(found, axis=-1), axis=-1)
 
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`."""
@@ -193,15 +223,16 @@ class SerialArm:
         return JointMotion(now, rate, *self.chain.torques(now, rate, gain))
 
     def _add_links(self, spec: mujoco.MjSpec, whole_arm: bool) -> None:
-        """Add sites at the links' ends, from which the simulation records them; let links collide or not."""
+        """Add sites at the capsules' ends, from which the simulation records them; let links collide or not."""
         data = zero_configuration(spec.copy().compile())
         frames = self.chain.frames(np.zeros(len(self.joint_range)))
-        for link in self.shape:
-            body, geom = data.body(link.body), spec.geom(link.name)
+        for capsule in self.shape:
+            geom = spec.geom(capsule.name)
+            body = data.body(geom.parent.name)
             turn = body.xmat.reshape(3, 3)
-            for end, point in enumerate(link.ends):
-                place = turn.T @ (np.array(frames[link.joint].transform(point)) - body.xpos)
-                spec.body(link.body).add_site(name=f"{link.name}_{end}", pos=place, **MARKER)
+            for end, point in enumerate(capsule.ends):
+                place = turn.T @ (np.array(frames[capsule.joint].transform(point)) - body.xpos)
+                geom.parent.add_site(name=f"{capsule.name}_{end}", pos=place, **MARKER)
             if not whole_arm:
                 geom.contype, geom.conaffinity = 0, 0
 
@@ -219,6 +250,23 @@ class SerialArm:
             _add_servo(spec, name, mujoco.mjtTrn.mjTRN_JOINT, stiffness, damping).target = name
 
 
+def capsule_pair_clearance(ends: Array, radii: Float, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Return the clearance of P pairs of capsules, shape (..., P), [m].
+
+    Args:
+        ends: Ends of the axes of C capsules, shape (..., C, 2, 3), [m].
+        radii: Radii, shape (C,), [m].
+        pairs: Pairs of indices of capsules.
+    """
+    xp = namespace_of(ends)
+    first, second = (list(each) for each in zip(*pairs, strict=True))
+    here, there = ends[..., first, :, :], ends[..., second, :, :]
+    parts = here[..., 0, :] - there[..., 0, :], *(each[..., 1, :] - each[..., 0, :] for each in (here, there))
+    squared = segment_axis_squared(*([part[..., i] for i in range(3)] for part in parts))
+    # The small summand keeps gradients of capsules whose axes meet finite.
+    return xp.sqrt(squared + 1e-24) - xp.asarray(radii[first] + radii[second], dtype=ends.dtype)
+
+
 def serial_arm(
     model_file: str,
     *,
@@ -228,8 +276,11 @@ def serial_arm(
     ik: InverseKinematics,
     workspace: Box,
     hand_gains: tuple[float, float] | None = None,
+    may_touch_itself: bool = True,
 ) -> SerialArm:
-    """Return the arm of a complete MJCF file: capsules for links, a sphere `hand`, limits of joints and torques.
+    """Return the arm of a complete MJCF file: named capsules and spheres for links and base, a sphere `hand`, limits.
+
+    Links touch one another, the base or the table `table` where their contact bits allow it.
 
     Args:
         model_file: File among the package's assets, a path, or the text of a file.
@@ -240,6 +291,7 @@ def serial_arm(
         workspace: Two opposite corners of the box in which movements start and end, [m].
         hand_gains: Stiffness [N/m] and damping [N s/m] of the hand's servo; by default those of its effective mass in
             the middle of the workspace.
+        may_touch_itself: False if it is known that no configuration within reach touches the arm itself or the table.
     """
     model = read_spec(model_file).compile()
     joints = [model.joint(joint) for joint in joint_names]
@@ -248,6 +300,9 @@ def serial_arm(
     if hand_gains is None:
         hand_gains = hand_mass * HAND_BANDWIDTH**2, 2.0 * HAND_DAMPING_RATIO * hand_mass * HAND_BANDWIDTH
     hand = zero_configuration(model).site(hand_site).xpos
+    shape = _link_capsules(model, joint_names)
+    fixed = [int(body) for body in np.flatnonzero(model.body_weldid == 0)]
+    base = tuple(_capsules_of(model, fixed, -1, (np.eye(3), np.zeros(3))))
     return SerialArm(
         name=name,
         model_file=model_file,
@@ -255,7 +310,10 @@ def serial_arm(
         hand_site=hand_site,
         chain=kinematic_chain(model, joint_names),
         ik=ik,
-        shape=_link_capsules(model, joint_names),
+        shape=shape,
+        base=base,
+        self_pairs=_self_pairs(model, [capsule.name for capsule in (*shape, *base)]),
+        off_table=tuple(i for i, capsule in enumerate(shape) if _meets_table(model, capsule.name)),
         hand_offset=in_frame(joint_frames(model, joint_names)[-1], hand),
         hand_radius=float(model.geom("hand").size[0]),
         joint_range=tuple((float(joint.range[0]), float(joint.range[1])) for joint in joints),
@@ -266,22 +324,57 @@ def serial_arm(
         joint_damping=tuple(2.0 * float(m) * JOINT_BANDWIDTH for m in inertias),
         hand_stiffness=hand_gains[0],
         hand_damping=hand_gains[1],
+        may_touch_itself=may_touch_itself,
     )
 
 
-def _link_capsules(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[Link, ...]:
-    """Return the capsules that move with the joints."""
-    data, links = zero_configuration(model), []
+def _link_capsules(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[LinkCapsule, ...]:
+    """Return the capsules and spheres that move with the joints, except the hand."""
+    links = []
     for index, (joint, frame) in enumerate(zip(joint_names, joint_frames(model, joint_names), strict=True)):
-        for geom in np.flatnonzero(np.isin(model.geom_bodyid, bodies_moved_by(model, joint))):
-            if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
-                continue
-            radius, half = model.geom_size[geom, :2]
-            axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
-            first, second = (in_frame(frame, data.geom_xpos[geom] + side * axis) for side in (1.0, -1.0))
-            body = model.body(model.geom_bodyid[geom]).name
-            links.append(Link(model.geom(geom).name, body, index, (first, second), float(radius)))
+        links += _capsules_of(model, bodies_moved_by(model, joint), index, frame)
     return tuple(links)
+
+
+def _capsules_of(model: mujoco.MjModel, bodies: list[int], joint: int, frame: Pose) -> list[LinkCapsule]:
+    """Return the capsules and spheres of some bodies, except the hand, in a joint's frame."""
+    data, found = zero_configuration(model), []
+    for geom in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
+        long, name = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE, model.geom(geom).name
+        if not (long or model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE) or name == "hand":
+            continue
+        radius, half = model.geom_size[geom, :2]
+        axis = (half if long else 0.0) * data.geom_xmat[geom].reshape(3, 3)[:, 2]
+        first, second = (in_frame(frame, data.geom_xpos[geom] + side * axis) for side in (1.0, -1.0))
+        found.append(LinkCapsule(joint, (first, second), float(radius), name))
+    return found
+
+
+def _self_pairs(model: mujoco.MjModel, names: list[str]) -> tuple[tuple[int, int], ...]:
+    """Return the pairs of geoms that MuJoCo lets collide, as indices into their names.
+
+    Geoms that move together, those of a link and of the one that carries it, excluded pairs of bodies and geoms whose
+    contact bits do not match never collide.
+    """
+    weld, excluded = model.body_weldid, {int(signature) for signature in model.exclude_signature}
+
+    def collide(first: int, second: int) -> bool:
+        one, other = (int(weld[model.geom_bodyid[geom]]) for geom in (first, second))
+        carries = any(a and int(weld[model.body_parentid[b]]) == a for a, b in ((one, other), (other, one)))
+        bodies = sorted(int(model.geom_bodyid[geom]) for geom in (first, second))
+        bits = model.geom_contype[first] & model.geom_conaffinity[second]
+        bits |= model.geom_contype[second] & model.geom_conaffinity[first]
+        return bool(bits) and one != other and not carries and (bodies[0] << 16) + bodies[1] not in excluded
+
+    geoms = [model.geom(name).id for name in names]
+    pairs = itertools.combinations(range(len(geoms)), 2)
+    return tuple((i, j) for i, j in pairs if collide(geoms[i], geoms[j]))
+
+
+def _meets_table(model: mujoco.MjModel, name: str) -> bool:
+    """Return True if a geom and the table collide."""
+    geom, table = model.geom(name), model.geom("table")
+    return bool(geom.contype & table.conaffinity | table.contype & geom.conaffinity)
 
 
 def _effective_inertias(

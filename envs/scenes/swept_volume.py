@@ -14,8 +14,9 @@ from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.geometry.narrow_phase import branch_and_bound
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
 
-OUTER = 5
-"""Links next to the hand, which obstacles near its path touch first; only chosen obstacles are compared with others."""
+OUTER = 3
+"""Joints next to the hand, whose links obstacles near its path touch first; only chosen obstacles are compared with
+others."""
 LENGTH = 1e-4
 """Length of the link that stands for a hand alone, [m]: a link must have a length."""
 ABOVE = 0.06
@@ -117,11 +118,11 @@ class SweptVolume(NamedTuple):
         arm = collision_model.arm
         if collision_model.whole_arm:
             links, radii = np.asarray(arm.links(arm.inverse_kinematics(hand))), arm.link_radii
+            first = sum(joint <= arm.link_joints[-1] - OUTER for joint in arm.link_joints)
         else:
             links = np.stack((hand, hand + np.array([0.0, 0.0, LENGTH])), axis=-2)[:, :, None]
-            radii = (arm.hand_radius,)
+            radii, first = (arm.hand_radius,), 0
         ends = links.astype(np.float32).transpose(3, 4, 0, 2, 1)
-        first = max(len(radii) - OUTER, 0)
         return cls(
             *(LinkBodies.of(ends[..., some, :], radii[some]) for some in (slice(first, None), slice(first)))
         )

@@ -1,5 +1,6 @@
 """Laws of arms that are loaded from MJCF files."""
 
+import itertools
 import pickle
 import re
 from importlib.util import find_spec
@@ -14,9 +15,12 @@ from gymnasium.envs.registration import EnvSpec
 from imported_arms import HOME, JOINTS, UR5E, ur5e
 
 import viapoint.envs
-from viapoint.envs.arm_import.capsule_fit import bounding_balls, fit_capsule
+from viapoint.envs.arm_import import capsule_fit
+from viapoint.envs.arm_import.capsule_fit import corners_of, cover_geom, cover_points
 from viapoint.envs.arm_import.loader import load_arm
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
+from viapoint.envs.geometry.convex_mesh import ConvexMesh
+from viapoint.envs.geometry.distance import point_distance_squared
 from viapoint.envs.registration import OWN_ARM_TASKS
 
 assert viapoint.envs, "importing it registers the environments"
@@ -81,16 +85,76 @@ def test_everywhere_in_its_reach_the_hand_gets_there_turned_as_at_home(arm):
     assert arm.reach_margin(np.array(arm.ik.box[1]) + 0.01) < 0.0
 
 
-def test_capsules_contain_the_links():
-    model = mujoco.MjModel.from_xml_path(str(UR5E))
+GEOMS = """<mujoco>
+  <asset><mesh name="wedge" vertex="0 0 0  .2 0 0  0 .1 0  .2 .1 0  0 0 .1  0 .1 .1"/></asset>
+  <worldbody>
+    <geom type="sphere" size=".05" pos=".1 .2 .3"/>
+    <geom type="capsule" size=".04 .1" pos="0 .2 .1" euler="10 20 30"/>
+    <geom type="box" size=".1 .04 .06" euler="40 10 0"/>
+    <geom type="cylinder" size=".06 .15" euler="0 60 10"/>
+    <geom type="ellipsoid" size=".04 .06 .12" pos=".3 0 0" euler="0 60 10"/>
+    <geom type="mesh" mesh="wedge" pos="1 0 0" euler="0 30 10"/>
+  </worldbody>
+</mujoco>"""
+
+
+def points_in(model, geom, rng, number=3000):
+    """Random points of a geom in its frame, many of them on its surface."""
+    size, kind = model.geom_size[geom], model.geom_type[geom]
+    ball = rng.normal(size=(number, 3))
+    ball *= (rng.random((number, 1)) ** 0.1) / np.linalg.norm(ball, axis=1, keepdims=True)
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return size * ball
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        disc = rng.normal(size=(number, 2))
+        disc *= np.sqrt(rng.random((number, 1))) / np.linalg.norm(disc, axis=1, keepdims=True)
+        return np.concatenate((size[0] * disc, size[1] * rng.uniform(-1, 1, (number, 1))), axis=1)
+    corners = corners_of(model, geom)
+    weights = rng.dirichlet(np.full(len(corners), 0.2), number)
+    return np.concatenate((corners, weights @ corners))
+
+
+@pytest.mark.parametrize("tolerance", [0.015, 0.2])
+def test_capsules_contain_every_geom_and_reach_no_farther_beyond_it_than_the_tolerance(tolerance):
+    model = mujoco.MjModel.from_xml_string(GEOMS)
     data, rng = mujoco.MjData(model), np.random.default_rng(2)
     mujoco.mj_kinematics(model, data)
-    for geom in range(model.ngeom):
-        points, around = bounding_balls(model, data, geom)
-        ends, radius = fit_capsule(points, np.full(len(points), around), rng.normal(size=(3, 3)))
-        along = np.clip((points - ends[0]) @ (ends[1] - ends[0]) / ((ends[1] - ends[0]) ** 2).sum(), 0.0, 1.0)
-        away = np.linalg.norm(points - ends[0] - along[:, None] * (ends[1] - ends[0]), axis=-1)
-        assert (away + around <= radius + 1e-9).all()
+    for geom in range(2, model.ngeom):
+        turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+        found = cover_geom(model, data, geom, tolerance)
+        rows = np.array(
+            [[*each.ends.mean(0), *(0.5 * (each.ends[1] - each.ends[0])), each.radius] for each in found]
+        )
+        points = place + points_in(model, geom, rng) @ turn.T
+        depth = np.sqrt(point_distance_squared(points, rows)) - rows[:, -1:]
+        assert depth.min(axis=0).max() <= 0.0
+        body = ConvexMesh.hull(place + corners_of(model, geom) @ turn.T)
+        ball = rng.normal(size=(4000, 3))
+        ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+        for each in found:
+            surface = np.concatenate([end + each.radius * ball for end in each.ends])
+            np.testing.assert_allclose(body.distance(surface).max(), each.excess, atol=1.5e-3)
+            assert body.distance(surface).max() <= each.excess <= tolerance
+
+
+def test_spheres_and_capsules_of_a_file_stay_as_they_are():
+    model = mujoco.MjModel.from_xml_string(GEOMS)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    (ball,), (rod,) = (cover_geom(model, data, geom, 0.025) for geom in (0, 1))
+    np.testing.assert_allclose(ball.ends, [(0.1, 0.2, 0.3)] * 2)
+    np.testing.assert_allclose(0.5 * (rod.ends[1] - rod.ends[0]), 0.1 * data.geom_xmat[1].reshape(3, 3)[:, 2])
+    assert (ball.radius, rod.radius, ball.excess, rod.excess) == (0.05, 0.04, 0.0, 0.0)
+
+
+def test_a_cube_takes_one_capsule_and_many_where_little_may_stick_out(monkeypatch):
+    cube = 0.05 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    (ball,) = cover_points(cube, 0.04)
+    assert ball.radius == pytest.approx(0.05 * 3**0.5, abs=2e-3)  # a short capsule is no better
+    assert 2 < len(cover_points(cube, 0.02)) < 20
+    monkeypatch.setattr(capsule_fit, "MOST_CAPSULES", 3)
+    with pytest.raises(ValueError, match=r"tolerance 0\.015 m takes more than 3 capsules for one geom"):
+        cover_points(cube, 0.015)
 
 
 @pytest.mark.parametrize("env_id", OWN_ARM_TASKS)
@@ -180,6 +244,9 @@ def test_posture_in_torch_is_the_same_and_differentiable(arm):
         ({"hand_radius": -1}, "hand_radius must be a positive number"),
         ({"hand_radius": np.nan}, "hand_radius must be a positive number"),
         ({"hand_radius": "small"}, "hand_radius must be a positive number"),
+        ({"tolerance": 0.0}, "tolerance must be a number of m from 0.005 to less than 0.95, got 0.0"),
+        ({"tolerance": "fine"}, "tolerance must be a number of m .* got 'fine'"),
+        ({"tolerance": np.nan}, "tolerance must be a number of m"),
         ({"joints": 5}, "joints must be names, in order from the base to the hand, got 5"),
         ({"joints": "elbow"}, "joints must be names"),
         ({"name": 5}, "name must be a string"),

@@ -1,5 +1,7 @@
 """Laws of the arm with seven joints."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -192,6 +194,52 @@ def test_contact_exactly_where_a_link_reaches_into_an_obstacle():
     clearance = arm_clearance(PANDA.links(joints)[:, None], PANDA.link_radii, obstacles, present).min(axis=-1)
     np.testing.assert_array_equal(contact, clearance < 0.0)
     assert 0.1 < contact.mean() < 0.9
+
+
+def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itself_is_negative():
+    model, rng = PANDA.compile(0, whole_arm=True), np.random.default_rng(7)
+    data, joints = mujoco.MjData(model), rng.uniform(*np.array(PANDA.joint_range).T, (600, 7))
+    clearance, contact = PANDA.self_clearance(joints), np.zeros(600, dtype=bool)
+    for i, data.qpos[:] in enumerate(joints):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        contact[i] = data.ncon > 0
+    np.testing.assert_array_equal(contact, clearance < 0.0)
+    assert 0.2 < contact.mean() < 0.8
+    batches = (
+        PANDA.self_clearance(joints.reshape(6, 100, 7)),
+        PANDA.self_clearance(torch.as_tensor(joints)).numpy(),
+    )
+    for batch in batches:
+        np.testing.assert_allclose(batch.ravel(), clearance, atol=1e-12)
+
+
+def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
+    joints = torch.as_tensor(np.random.default_rng(8).uniform(*np.array(PANDA.joint_range).T, (20, 7)))
+    assert torch.autograd.gradcheck(PANDA.self_clearance, joints.requires_grad_(), atol=1e-4)
+
+
+def test_plans_of_an_arm_that_may_touch_itself_have_no_more_than_its_own_clearance():
+    """Where no obstacle is near; executed movements and other arms are compared with obstacles alone."""
+    arm = dataclasses.replace(PANDA, may_touch_itself=True)
+    hand = np.random.default_rng(9).uniform(*np.array(PANDA.workspace), (30, 4, 3))
+    far = np.concatenate(
+        (np.full((30, 1, 3), 0.95), np.zeros((30, 1, 3)), np.full((30, 1, 1), 0.01)), axis=-1
+    )
+    joints, present = arm.inverse_kinematics(hand), np.ones((30, 1), dtype=bool)
+    own, there = arm.self_clearance(joints), np.repeat(far[:, None], 4, axis=1)
+    for whole_arm, joints_given in ((True, None), (True, joints), (False, None)):
+        model, other = CollisionModel(arm, whole_arm), CollisionModel(PANDA, whole_arm)
+        least = other.least_clearance(hand, far, present)
+        profile = other.clearance_profile(hand, there, present)
+        if whole_arm and joints_given is None:
+            least, profile = np.minimum(least, own.min(axis=1)), np.minimum(profile, own[..., None])
+            np.testing.assert_array_equal(
+                model.least_clearance(hand, far[:, :0], present[:, :0]), own.min(axis=1)
+            )
+        np.testing.assert_array_equal(model.least_clearance(hand, far, present, joints_given), least)
+        np.testing.assert_array_equal(model.clearance_profile(hand, there, present, joints_given), profile)
+    assert (own < 0.2).all()
 
 
 def test_the_arm_collides_with_itself_and_with_the_table():

@@ -155,29 +155,34 @@ def test_a_pair_looks_the_same_from_everywhere(d, with_axis):
     assert torch.allclose(features(torch.eye(d, dtype=torch.float64), -1.0), seen, atol=1e-4)
 
 
-def scene(number=4, plans=5, instants=6, bodies=2, d=3):
+def scene(number=4, plans=5, instants=6, networks=(0, 1), d=3):
     torch.manual_seed(1)
+    bodies = max(len(networks), 1)
     poses = Poses(
         torch.randn(bodies, d, number, plans, instants),
         torch.nn.functional.normalize(torch.randn(bodies, d, number, plans, instants), dim=1),
         torch.linspace(0.0, 1.0, instants).expand(number, plans, -1),
+        torch.linspace(0.1, 0.2, bodies),
+        torch.linspace(0.03, 0.05, bodies),
     )
     rows = np.random.default_rng(0).uniform(-0.2, 0.2, (number, 3, 2 * d + 1))
     rows[..., -1] = 0.02
-    return poses, rows, PairMinimum(d, bodies, 8)
+    return poses, rows, PairMinimum(d, networks, 8)
 
 
-def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles():
-    poses, rows, network = scene()
+@pytest.mark.parametrize("networks", [(0, 1), (0, 0, 1)])
+def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles(networks):
+    poses, rows, network = scene(networks=networks)
     present = np.array([[True, True, True], [True, False, True], [False, True, False], [False, False, False]])
     whole = network(poses, cut_obstacles(rows, present))
     single = []
-    for obstacle, instant, body in itertools.product(range(3), range(6), range(2)):
+    for obstacle, instant, body in itertools.product(range(3), range(6), range(len(networks))):
         only = present & (np.arange(3) == obstacle)
         one = Poses(
             poses.centre[..., instant : instant + 1],
             poses.axis[..., instant : instant + 1],
             poses.time[..., :1],
+            *poses[3:],
         )
         parts = cut_obstacles(rows, only)
         values = network._values(one, parts, *torch.nonzero(parts.present, as_tuple=True))[:, :, body, 0]
@@ -189,15 +194,29 @@ def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles():
     expected = torch.stack(single).amin(dim=0)
     assert torch.allclose(whole[:3], expected[:3], atol=1e-5)
     assert (whole[3] == 1.0).all()
+    with torch.no_grad():
+        assert torch.allclose(network(poses, cut_obstacles(rows, present)), whole, atol=1e-5)
 
 
-@pytest.mark.parametrize("bodies", [0, 2])
-def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_minimum(bodies, monkeypatch):
-    poses, rows, _ = scene(bodies=max(bodies, 1))
-    poses = poses._replace(half_length=torch.tensor([0.1, 0.2]), radius=torch.tensor([0.03, 0.05]))
-    if not bodies:
+def test_bodies_that_share_a_network_differ_by_their_size():
+    """Equal bodies have equal values in any order; a body of another size has another value."""
+    poses, rows, network = scene(networks=(0, 0, 1))
+    parts = cut_obstacles(rows, np.ones((4, 3), dtype=bool))
+    same = poses._replace(centre=poses.centre[[0, 0, 2]], axis=poses.axis[[0, 0, 2]])
+    scenes, rest = torch.nonzero(parts.present, as_tuple=True), slice(2, None)
+    values = network._values(same, parts, *scenes)
+    swapped = same._replace(half_length=poses.half_length[[1, 0, 2]], radius=poses.radius[[1, 0, 2]])
+    other = network._values(swapped, parts, *scenes)
+    assert not torch.allclose(values[:, :, 0], values[:, :, 1])
+    assert torch.equal(values[:, :, 0], other[:, :, 1])
+    assert torch.equal(values[:, :, rest], other[:, :, rest])
+
+
+@pytest.mark.parametrize("networks", [(), (0, 1), (0, 0, 1)])
+def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_minimum(networks, monkeypatch):
+    poses, rows, network = scene(networks=networks)
+    if not networks:
         poses = Poses(poses.centre, None, poses.time)
-    network = PairMinimum(3, bodies, 8)
     present = np.array([[True, True, True], [True, False, True], [False, True, False], [False, False, False]])
     velocity = np.random.default_rng(1).uniform(-0.2, 0.2, (4, 3, 3))
     for moving in (None, velocity):
@@ -209,7 +228,7 @@ def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_mi
             monkeypatch.setattr(pair_networks, "NEAR", near)
             least.append(network.of_near_pairs(poses, parts))
             assert (least[-1] >= whole - 1e-6).all()
-        assert not bodies or (least[0] > whole + 1e-3).any()  # one pair of links is not enough
+        assert not networks or (least[0] > whole + 1e-3).any()  # one pair of links is not enough
         assert torch.allclose(least[-1], whole, atol=1e-6)
 
 

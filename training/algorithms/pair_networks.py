@@ -5,15 +5,16 @@ outcome of single movements which pair of obstacle and link determined it:
 
     m(s, a) = min over obstacle parts i, bodies h, instants t of q_h(i seen from h at t)
 
-Each q_h is a small network. Its input is the pose of an obstacle relative to a link; the planned pose of the link
-follows from the plan alone. The distance between surfaces is learned, not computed. Long obstacles are cut into parts,
-because an obstacle is the union of its parts and short parts resemble each other.
+Each q_h is a small network. Its input is the pose of an obstacle relative to a body, a capsule of the arm; the planned
+pose of the body follows from the plan alone. Bodies may share a network, which then also gets their size. The distance
+between surfaces is learned, not computed. Long obstacles are cut into parts, because an obstacle is the union of its
+parts and short parts resemble each other.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -137,10 +138,10 @@ def pair_features(
 
 
 class PairNetworks(nn.Module):
-    """Networks of the same shape, one for each body of the arm, evaluated in batched matrix products.
+    """Networks of the same shape, one for each body or link of the arm, evaluated in batched matrix products.
 
     Args:
-        bodies: Number of bodies L.
+        bodies: Number of networks.
         inputs: Number of inputs F.
         width: Width of the two hidden layers.
     """
@@ -187,14 +188,20 @@ class PairMinimum(nn.Module):
 
     Args:
         dimension: Spatial dimension D.
-        bodies: Number of links L; 0 for the spherical hand alone.
+        networks: Index of the network of each body, in increasing order; empty for the spherical hand alone. Networks
+            that several bodies share have their half-length and radius as further inputs.
         width: Width of the hidden layers.
     """
 
-    def __init__(self, dimension: int, bodies: int, width: int) -> None:
+    def __init__(self, dimension: int, networks: Sequence[int], width: int) -> None:
         super().__init__()
-        inputs = 4 if not bodies else 2 * dimension + (1 if dimension == 2 else 0)
-        self.networks = PairNetworks(max(bodies, 1), inputs, width)
+        inputs = 4 if not networks else 2 * dimension + (1 if dimension == 2 else 0)
+        number = networks[-1] + 1 if networks else 1
+        self.shared = len(networks) > number
+        """True if bodies share networks."""
+        self.network_of = list(networks) or [0]
+        """Index of the network of each body."""
+        self.networks = PairNetworks(number, inputs + 2 * self.shared, width)
 
     def forward(self, poses: Poses, parts: Parts, until: Tensor | None = None) -> Tensor:
         """Return the minimum for each plan, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles.
@@ -256,7 +263,7 @@ class PairMinimum(nn.Module):
         distance = _distance_from_axis(apart, axis, poses) - size
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
         flat = (distance <= (nearest + NEAR)[:, None]).flatten().nonzero()[:, 0]
-        bodies, rows, _, instants = distance.shape
+        _, rows, _, instants = distance.shape
         pose = flat % (plans * instants)  # index of plan and instant
         plan, of_body = pose // instants, flat // (plans * instants)
         body, row = of_body // rows, of_body % rows
@@ -267,8 +274,10 @@ class PairMinimum(nn.Module):
             [half[:, i, 0, 0][row] for i in dimensions],
             radius[:, 0, 0][row],
         )
-        # Pairs are in the order of their bodies.
-        counts = torch.bincount(body, minlength=bodies).tolist()
+        features += self._sizes(poses, body)
+        # Pairs are in the order of their bodies, and so of their networks.
+        network = torch.tensor(self.network_of)[body]
+        counts = torch.bincount(network, minlength=len(self.networks.nearness)).tolist()
         pieces = zip(*(torch.split(each, counts) for each in features), strict=True)
         values = [self._evaluate([each[None] for each in piece], h)[0] for h, piece in enumerate(pieces)]
         least = torch.full((plans,), torch.inf)
@@ -327,8 +336,28 @@ class PairMinimum(nn.Module):
             axis = [pointing[:, i] for i in range(dimension)]
         halves = [half[:, i, None, None] for i in range(dimension)]
         features = pair_features(centre, axis, halves, parts.radius[b, k][:, None, None])
-        values = self._evaluate(features)
+        if self.shared:
+            every = (size[:, None, None, None].expand_as(features[0]) for size in self._sizes(poses))
+            features = [each.reshape(bodies, -1) for each in (*features, *every)]
+            counts = torch.bincount(torch.tensor(self.network_of)).tolist()
+            pieces = zip(*(torch.split(each, counts) for each in features), strict=True)
+            values = torch.cat(
+                [
+                    self._evaluate([each.reshape(1, -1) for each in piece], h)[0]
+                    for h, piece in enumerate(pieces)
+                ]
+            )
+        else:
+            values = self._evaluate(features)
         return values.reshape(bodies, len(b), plans, instants).permute(1, 2, 0, 3)
+
+    def _sizes(self, poses: Poses, body: Tensor | slice = slice(None)) -> list[Tensor]:
+        """Return half-lengths and radii of bodies, [m], if bodies share networks; otherwise nothing."""
+        if not self.shared:
+            return []
+        assert poses.half_length is not None
+        assert poses.radius is not None
+        return [poses.half_length[body], poses.radius[body]]
 
     def _picked(
         self,
@@ -356,11 +385,12 @@ class PairMinimum(nn.Module):
             [half[:, i] for i in range(dimension)],
             parts.radius[scene, part],
         )
+        features += self._sizes(poses, body)
         every = self._evaluate([each.expand(len(self.networks.nearness), -1) for each in features])
-        return every.gather(0, body[None])[0]
+        return every.gather(0, torch.tensor(self.network_of)[body][None])[0]
 
     def _evaluate(self, features: list[Tensor], body: int | None = None) -> Tensor:
-        """Return values of shape (L, N) for features of shape (L, ...) each, of all bodies or of one."""
+        """Return values of shape (L, N) for features of shape (L, ...) each, of all L networks or of one."""
         bodies = features[0].shape[0]
         stacked = torch.stack([each.reshape(bodies, -1) for each in features], dim=1)
         distance = stacked[:, 0] if len(features) == 4 else torch.hypot(stacked[:, 0], stacked[:, 1])
@@ -404,6 +434,13 @@ def _root(square: Tensor) -> Tensor:
     return torch.sqrt(square.clamp_min(1e-10))
 
 
-def bodies_of(task: Task) -> int:
-    """Return the number of links that must clear obstacles; 0 if only the hand must."""
-    return len(task.arm.link_radii) if task.whole_arm else 0
+def networks_of(task: Task) -> list[int]:
+    """Return the index of the network of each capsule that must clear obstacles; empty if only the hand must.
+
+    Up to one capsule for each joint and one for the hand have a network each. Of arms with more capsules, those that
+    move with the same joint share one.
+    """
+    joints = task.arm.link_joints if task.whole_arm else ()
+    if len(joints) <= len(task.arm.joint_range) + 1:
+        return list(range(len(joints)))
+    return [sorted(set(joints)).index(joint) for joint in joints]

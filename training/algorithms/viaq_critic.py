@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses, bodies_of, dense
+from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses, dense, networks_of
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -112,7 +112,7 @@ class ViaQCritic(nn.Module):
         self.form, self.pooling, self.replanning = form, pooling, replanning
         self.pairs: Any = None
         if form == "poses":
-            self.pairs = PairMinimum(d, bodies_of(task), width)
+            self.pairs = PairMinimum(d, networks_of(task), width)
         else:
             outputs = heads if pooling == "minimum" else width
             self.pairs = dense(ends + row + size, width, width, outputs)

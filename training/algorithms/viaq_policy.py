@@ -53,6 +53,8 @@ LOCAL_ROUNDS = 4
 """Rounds of checks around the best checked plans in replanning tasks."""
 CHECKED_INSTANTS = 16
 """Number of instants at which plans are evaluated if the best of them are checked exactly."""
+SHORTEST_AXIS = 1e-9
+"""Length below which the axis of a capsule is that of a sphere, [m]."""
 POSITIONS = 1 << 16
 """Planned positions that are computed together, so that temporary arrays stay in the cache."""
 
@@ -327,7 +329,7 @@ def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
     first, last = (np.moveaxis(links[..., end, :], (-2, -1), (0, 1)) for end in (0, 1))
     axis = last - first
     length = np.sqrt((axis * axis).sum(axis=1, keepdims=True))
-    axis = axis / length
+    axis = axis / np.maximum(length, SHORTEST_AXIS)  # zero for spheres
     sizes = _tensor(0.5 * length[:, 0, 0, 0, 0]), _tensor(task.arm.link_radii)
     return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time), *sizes)
 

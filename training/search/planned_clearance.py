@@ -143,7 +143,8 @@ def least_clearance(
     """
     hand = np.asarray(moves.path, np.float32).swapaxes(1, 2)
     number, instants, plans, _ = hand.shape
-    least = np.full((number, plans), MAX_CLEARANCE, np.float32)
+    least: Single = np.full((number, plans), MAX_CLEARANCE, np.float32)
+    least = task.collision_model.with_self_clearance(least, hand, time_axis=1)
     if not obstacles.rows.shape[1]:
         return least
     drift, elapsed = None, moves.duration[:, None].astype(np.float32) * FRACTIONS[:, None].astype(np.float32)
