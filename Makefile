@@ -34,7 +34,7 @@ format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff check --fix .
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
-	@$(BIN)/python -m viapoint.training.scene_sets.generate
+	@PYTHONPATH=benchmarks $(BIN)/python -m scene_sets.generate
 
 hashes: $(READY) ## hash a thousand episodes of every environment anew
 	@$(BIN)/python benchmarks/reliability_determinism.py --write

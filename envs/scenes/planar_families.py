@@ -2,7 +2,7 @@
 
 Each function lays obstacles beside a feasible path; scenes in which they leave no room for it are rejected later (see
 :class:`~viapoint.envs.scenes.planar_obstacles.FamilyObstacles`). The difficulty of a scene is measured afterwards (see
-:mod:`viapoint.training.planners.difficulty`).
+`benchmarks/scene_sets/difficulty.py`).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
-sys.path.append(str(Path(__file__).parents[2] / "docs" / "figures"))
+sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("docs/figures", "benchmarks")]
 
 ENV = "viapoint/PlanarObstacles-v0"
 

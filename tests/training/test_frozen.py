@@ -7,16 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from viapoint.envs.scenes.families import scene_families
-from viapoint.envs.scenes.sampler import UniformSampler
-from viapoint.envs.scenes.scene import check_scenes
-from viapoint.training.planners.baselines import METHODS, make_method
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget, screen
-from viapoint.training.planners.difficulty import planned_share, solution_share
-from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import scene_set
-from viapoint.training.scene_sets.generate import (
+from scene_sets.difficulty import planned_share, solution_share
+from scene_sets.generate import (
     SEEDS,
     SETS,
     SIZES,
@@ -25,7 +17,15 @@ from viapoint.training.scene_sets.generate import (
     lots,
     remake,
 )
-from viapoint.training.scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
+from scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
+
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.sampler import UniformSampler
+from viapoint.envs.scenes.scene import check_scenes
+from viapoint.training.planners.baselines import METHODS, make_method
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget, screen
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, load, shipped_path
 from viapoint.training.search.geometry_search import GeometrySearch
 

@@ -5,8 +5,8 @@ import dataclasses
 import sys
 
 import pytest
+from scene_sets import generate
 
-from viapoint.training.scene_sets import generate
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 
 ENV = "viapoint/PlanarReach-v0"

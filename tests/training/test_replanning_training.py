@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scene_sets.replanning import SIZES, solution_shares
 
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
@@ -11,7 +12,6 @@ from viapoint.training.planners.baselines import make_method
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.replanning import SIZES, solution_shares
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"

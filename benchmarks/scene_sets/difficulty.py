@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,9 +9,6 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import screen
 from viapoint.training.rollouts.rollout import SceneSimulation
-
-if TYPE_CHECKING:
-    pass
 
 FEW, MANY, ENOUGH = 512, 4096, 8
 """Draws for each scene; draws where fewer than ENOUGH of the first succeed."""

@@ -1,6 +1,6 @@
 """Command that makes the frozen scenes again and compares them with those shipped.
 
-    python -m viapoint.training.scene_sets.generate [--env ID ...] [--sets test ...] [--write | --out DIR]
+    PYTHONPATH=benchmarks python -m scene_sets.generate [--env ID ...] [--sets test ...] [--write | --out DIR]
 
 `validation` and `test` are drawn from the training distribution with seeds that training never uses, a quarter of each
 set in each band of the solution share. `hard` holds equal numbers of scenes of several families, all with a share below
@@ -11,7 +11,7 @@ difficulty, and by the planner. `uniform` holds scenes in which nothing is place
 
 The search for scenes uses estimates of their shares, which change with the program. Each scene of a file therefore has
 its number among the drawn scenes. The command draws these scenes again, measures their shares, and compares hashes.
-Scenes that change during an episode: see :mod:`viapoint.training.scene_sets.replanning`.
+Scenes that change during an episode: see :mod:`scene_sets.replanning`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.mdp.task import Task, family_sampler
-from viapoint.envs.registration import REPLANNING_TASKS
-from viapoint.envs.scenes.families import scene_families
-from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.replanning import SIZES as REPLANNING_SIZES
-from viapoint.training.scene_sets.replanning import make_replanning
-from viapoint.training.scene_sets.scene_search import (
+from scene_sets.replanning import SIZES as REPLANNING_SIZES
+from scene_sets.replanning import make_replanning
+from scene_sets.scene_search import (
     Kinds,
     Source,
     first_solved,
@@ -40,6 +34,12 @@ from viapoint.training.scene_sets.scene_search import (
     redrawn,
     search,
 )
+from viapoint.envs.mdp.task import Task, family_sampler
+from viapoint.envs.registration import REPLANNING_TASKS
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import (
     BAND_EDGES,
     BANDS,

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from scene_sets.difficulty import planned_share, solution_share
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
-from viapoint.training.planners.difficulty import planned_share, solution_share
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.search.geometry_search import GeometrySearch
 

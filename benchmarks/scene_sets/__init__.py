@@ -1,0 +1,1 @@
+"""Generation of the frozen scenes."""
