@@ -23,13 +23,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<version>[0-9.]+)")
-TOOLS = ["pytest", "pytest-xdist", "hypothesis", "mpmath", "moviepy", "setuptools", "build", "ruff", "mypy"]
+EXTRAS = ("training", "cluster", "tuning")
+TOOLS = ["pytest", "pytest-xdist", "hypothesis", "mpmath", "moviepy", "setuptools", "build", "ruff", "mypy", "coal"]
 
 
 def lower_bounds() -> dict[str, str]:
     """Return the dependencies with their lower bounds."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *project["optional-dependencies"]["training"]]
+    extras = project["optional-dependencies"]
+    lines = [*project["dependencies"], *(line for name in EXTRAS for line in extras[name])]
     found = [BOUND.match(line) for line in lines]
     assert all(found), f"a dependency without a lower bound: {lines}"
     return {each["name"]: each["version"] for each in found if each}
@@ -53,7 +55,7 @@ def make(folder: Path, which: str) -> Path:
     bounds.write_text("\n".join(pinned if which == "oldest" else []))
     extra = ["--upgrade", "--upgrade-strategy", "eager"] if which == "newest" else []
     install = [python, "-m", "pip", "install", "--quiet", *extra, "-c", bounds]
-    subprocess.run([*install, "-e", f"{tree}[training]", *TOOLS], check=True, cwd=tree)
+    subprocess.run([*install, "-e", f"{tree}[{','.join(EXTRAS)}]", *TOOLS], check=True, cwd=tree)
     return python
 
 
