@@ -49,7 +49,12 @@ else:
     def __getattr__(name):
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(_MODULES[name]), name)
+        try:
+            return getattr(importlib.import_module(_MODULES[name]), name)
+        except ModuleNotFoundError as error:
+            from viapoint.training.cli.doctor import explain_import_error
+
+            raise ImportError(explain_import_error(error, f"viapoint.training.{name}")) from error
 
     def __dir__():
         return sorted({*globals(), *_MODULES})

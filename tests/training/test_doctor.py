@@ -184,6 +184,13 @@ def test_without_the_extra_the_command_says_in_one_line_what_to_install(without_
     assert "tyro" in line
 
 
+def test_without_the_extra_a_public_name_says_what_to_install(without_extra):
+    script = "import viapoint.training as vt\ntry:\n    vt.load_agent\nexcept ImportError as error:\n    print(error)"
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)
+    assert told.stdout.startswith("viapoint.training.load_agent needs the extra `training`"), told.stderr
+    assert told.stdout.rstrip().endswith("pip install 'viapoint[training]'")
+
+
 def test_without_the_extra_the_report_advises_the_extra_and_no_new_installation(without_extra):
     script = "import sys; sys.argv[1:] = ['doctor', '--json']; from viapoint.training.cli.entry import main; main()"
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=without_extra)

@@ -117,15 +117,15 @@ def run_without_command(words: Sequence[str]) -> NoReturn:
     raise AssertionError  # run exits
 
 
-def explain_import_error(error: ImportError) -> str:
-    """Return one line on a failed import: what to install if packages of an extra are missing."""
+def explain_import_error(error: ImportError, subject: str = "the command") -> str:
+    """Return one line on a failed import of `subject`: what to install if packages of an extra are missing."""
     extra = EXTRAS.get(error.name or "")
     if extra is not None:
-        return f"the command needs the extra `{extra}` (not installed: {error.name}): pip install 'viapoint[{extra}]'"
+        return f"{subject} needs the extra `{extra}` (not installed: {error.name}): pip install 'viapoint[{extra}]'"
     missing = missing_packages()
     if missing:
         names = ", ".join(missing)
-        return f"the command needs the extra `training` (not installed: {names}): {INSTALL_TRAINING}"
+        return f"{subject} needs the extra `training` (not installed: {names}): {INSTALL_TRAINING}"
     return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"
 
 
