@@ -24,7 +24,18 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<version>[0-9.]+)")
 EXTRAS = ("training", "cluster", "tuning")
-TOOLS = ["pytest", "pytest-xdist", "hypothesis", "mpmath", "moviepy", "setuptools", "build", "ruff", "mypy", "coal"]
+TOOLS = [
+    "pytest",
+    "pytest-xdist",
+    "hypothesis",
+    "mpmath",
+    "moviepy",
+    "setuptools",
+    "build",
+    "ruff",
+    "mypy",
+    "coal",
+]
 
 
 def lower_bounds() -> dict[str, str]:

@@ -87,7 +87,7 @@ def drawn(tuning):
         ({"sampler": {"name": "magic"}}, "tpe, random"),
         ({"sampler": {"name": "tpe", "speed": 1}}, "not 'speed'"),
         ({"pruner": "magic"}, "none, median, percentile, successive_halving"),
-        ({"pruner": {"name": "percentile", "percentile": 200.0}}, "percentile"),
+        ({"pruner": {"name": "percentile", "percentile": 200.0}}, "ercentile must be between 0 and 100"),
         ({"first": [{"tau": 1}]}, "first names 'tau'"),
         ({"first": [{"learning_rate": 1.0}]}, "learning_rate = 1.0 in its entry 0, which is out of range"),
         ({"env_kwargs": {"num_envs": 2}}, "--n-envs"),

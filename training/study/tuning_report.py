@@ -137,7 +137,8 @@ def importance(tuning: Results) -> dict[str, float]:
         return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return optuna.importance.get_param_importances(tuning.study)
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+        return optuna.importance.get_param_importances(tuning.study, evaluator=evaluator)
 
 
 def _importance(tuning: Results) -> list[str]:
