@@ -28,6 +28,7 @@ from viapoint.training.algorithms.viaq_critic import Values, _Saturated
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 from viapoint.training.search.candidates import best_duration, candidate_actions
 from viapoint.training.search.geometry_search import score_plans
+from viapoint.training.search.plan_checks import INFEASIBLE
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",
@@ -90,22 +91,29 @@ def test_nothing_is_learned_or_decided_from_the_geometry_of_obstacles(env_id, mo
 @pytest.mark.parametrize("checks", [1, 3, 11, 64])
 def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(env_id, checks, monkeypatch):
     model, env = small(env_id)
-    observation, scored = env.reset(), []
+    observation, scored = env.reset(), {}
 
     def score(observation, actions, task, margins):
         merits = score_plans(observation, actions, task, margins)
-        scored.append((actions, merits))
+        for goal, *found in zip(observation["goal"], actions, merits, strict=True):
+            scored.setdefault(goal.tobytes(), []).append(found)
         return merits
 
     monkeypatch.setattr(viaq_policy, "score_plans", score)
     model.policy.checks = checks
     decided = model.policy.decide(observation)
-    actions, merits = (np.concatenate(each, axis=1) for each in zip(*scored, strict=True))
-    assert actions.shape[1] == min(checks, 48)  # there are 48 candidates
-    np.testing.assert_array_equal(decided, actions[np.arange(8), merits.argmax(axis=1)])
-    if env_id == MOVING:  # the plan under way is among them
-        assert (actions == 0.0).all(axis=-1).any(axis=1).all()
+    numbers, most = set(), min(checks, 48)  # there are 48 candidates
+    for goal, action in zip(observation["goal"], decided, strict=True):
+        actions, merits = (np.concatenate(each) for each in zip(*scored[goal.tobytes()], strict=True))
+        numbers.add(len(actions))
+        np.testing.assert_array_equal(action, actions[merits.argmax()])
+        if env_id == MOVING:  # the plan under way is among them
+            assert (actions == 0.0).all(axis=-1).any()
+        elif len(actions) < most:  # further plans are checked only where none is clear
+            assert merits.max() > 0.5 * INFEASIBLE
     env.close()
+    assert numbers <= {most} if env_id == MOVING else max(numbers) == most
+    assert numbers <= {most, viaq_policy.PROPOSALS}
 
 
 @settings(deadline=None, max_examples=60)

@@ -29,6 +29,7 @@ from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import best_actions, score_plans
 from viapoint.training.search.plan_checks import (
     CLEARANCE_MARGIN,
+    INFEASIBLE,
     REACH_MARGIN,
     reward_bounds,
 )
@@ -48,9 +49,9 @@ N_ELITES = 8
 SPREAD = 0.15
 """Standard deviation of the first round of refinement, in the action space; each round halves it."""
 PROPOSALS = 32
-"""Number of proposals that are checked in replanning tasks before any plans around the best of them."""
+"""Greatest number of proposals that are checked; all further checks are of plans around the best of them."""
 LOCAL_ROUNDS = 4
-"""Rounds of checks around the best checked plans in replanning tasks."""
+"""Rounds of checks around the best checked plans."""
 CHECKED_INSTANTS = 16
 """Number of instants at which plans are evaluated if the best of them are checked exactly."""
 SHORTEST_AXIS = 1e-9
@@ -77,7 +78,7 @@ class ViaQPolicy(BasePolicy):
         candidates: Number of Sobol points in the action space.
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
-        checks: Number of highest-ranked candidates that exact geometry checks; 0 for none.
+        checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
     """
 
     def __init__(
@@ -254,19 +255,33 @@ class ViaQPolicy(BasePolicy):
         if not self.checks:
             return np.asarray(actions[rows, values.argmax(axis=1)])
         count = min(self.checks, values.shape[1])
-        local = max(count - PROPOSALS, 0) if self.replanning else 0
+        local = max(count - PROPOSALS, 0)
         checked = np.take_along_axis(actions, self._promising(values, count - local)[..., None], axis=1)
         worth = self._score(observation, checked)
+        best: Numbers = checked[rows, worth.argmax(axis=1)]
+        if not self.replanning:
+            rows = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
+        if local and len(rows):
+            best[rows] = self._improved(take_rows(observation, rows), checked[rows], worth[rows], local)
+        return np.asarray(best)
+
+    def _improved(self, observation: Observation, checked: Numbers, worth: Numbers, count: int) -> Numbers:
+        """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m).
+
+        Around plans that are clear, those with the greatest reward without obstacles are checked, and around others an
+        even selection.
+        """
         for each in range(LOCAL_ROUNDS):
-            share = (local + each) // LOCAL_ROUNDS
+            share = (count + each) // LOCAL_ROUNDS
             if share:
                 near = self._around(best_actions(checked, worth)[0], each)
                 _, bound = reward_bounds(observation, near, self.task, REACH_MARGIN)
-                top = np.argsort(-bound, axis=1)[:, :share]
+                clear = worth.max(axis=1, keepdims=True) > 0.5 * INFEASIBLE
+                top = np.argsort(np.where(clear, -bound, 0.0), axis=1, kind="stable")[:, :share]
                 near = np.take_along_axis(near, top[..., None], axis=1)
                 checked = np.concatenate((checked, near), axis=1)
                 worth = np.concatenate((worth, self._score(observation, near)), axis=1)
-        return np.asarray(checked[rows, worth.argmax(axis=1)])
+        return np.asarray(checked[np.arange(len(checked)), worth.argmax(axis=1)])
 
     def _score(self, observation: Observation, actions: Numbers) -> Numbers:
         """Return the merit of actions by computed geometry, shape (B, H)."""
