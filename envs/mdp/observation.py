@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Float, Numbers, Observation
-from viapoint.envs.geometry.rows import CAPSULES, observed_rows, rows_of_observed
+from viapoint.envs.geometry.rows import CAPSULES, POSE_SIZE, observed_rows, rows_of_observed
 from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
 from viapoint.envs.scenes.scene import (
     FARTHEST_SHAPE,
@@ -72,7 +72,7 @@ class ObservationLayout:
     @property
     def row_size(self) -> int:
         """Number of values of one obstacle."""
-        return 2 * self.dimension + 2
+        return 2 * self.dimension + 2 if self.shapes == CAPSULES else len(self.shapes) + POSE_SIZE
 
     def space(self) -> spaces.Dict:
         """Return the observation space of one environment."""

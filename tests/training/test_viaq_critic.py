@@ -3,7 +3,10 @@
 import copy
 import inspect
 import itertools
+import sys
+from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -18,10 +21,19 @@ import viapoint.envs.scenes.dynamic_scene
 import viapoint.envs.sim.outcome
 import viapoint.training.search.geometry_search
 import viapoint.training.search.plan_checks
+import viapoint.training.search.planned_clearance
 from viapoint.envs.registration import TASKS
 from viapoint.training.algorithms import pair_networks, viaq_policy
+from viapoint.training.algorithms.obstacle_parts import (
+    PART,
+    Poses,
+    ShapePairs,
+    cut_obstacles,
+    pair_features,
+    whole_obstacles,
+)
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.algorithms.pair_networks import PART, PairMinimum, Poses, cut_obstacles, pair_features
+from viapoint.training.algorithms.pair_networks import PairMinimum
 from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
 from viapoint.training.algorithms.viaq import ViaQ
 from viapoint.training.algorithms.viaq_critic import Values, _Saturated
@@ -29,6 +41,9 @@ from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 from viapoint.training.search.candidates import best_duration, candidate_actions
 from viapoint.training.search.geometry_search import score_plans
 from viapoint.training.search.plan_checks import INFEASIBLE
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from contacts import KINDS, random_obstacles
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",
@@ -43,6 +58,7 @@ KNOW_OBSTACLES = (
     viapoint.envs.geometry.broad_phase,
     viapoint.envs.sim.outcome,
     viapoint.training.search.plan_checks,
+    viapoint.training.search.planned_clearance,
     viapoint.training.search.geometry_search,
 )
 FEW = {"candidates": 32, "refinements": 1, "per_refinement": 16, "width": 8}
@@ -71,8 +87,9 @@ def refuse_geometry(monkeypatch):
 
 
 @pytest.mark.parametrize("env_id", [PLANE, WHOLE, SPACE, MOVING])
-def test_nothing_is_learned_or_decided_from_the_geometry_of_obstacles(env_id, monkeypatch):
-    model, env = small(env_id)
+@pytest.mark.parametrize("shapes", [("capsule",), ("capsule", "box", "cylinder")])
+def test_nothing_is_learned_or_decided_from_the_geometry_of_obstacles(env_id, shapes, monkeypatch):
+    model, env = small(env_id, shapes=shapes)
     model.learn(32)
     observation = env.reset()
     refuse_geometry(monkeypatch)
@@ -419,3 +436,53 @@ def test_algorithms_of_sb3_learn_with_a_minimum_critic(algorithm, policy):
     assert several.any()
     assert (q(rows)[several] <= q(fewer)[several] + 1e-6).all()
     env.close()
+
+
+def shape_pairs(count=64):
+    """Bodies near obstacles of all kinds: vectors to the obstacles, axes of the bodies, and columns of the obstacles."""
+    generator = np.random.default_rng(0)
+    rows = np.concatenate([random_obstacles(kind, np.zeros((count, 3)), generator) for kind in KINDS])
+    parts = whole_obstacles(rows[:, None], KINDS)
+    apart, axis = generator.normal(size=(2, len(rows), 3))
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    columns = list(parts.columns[:, 0].T)
+    return *(list(torch.tensor(each.T, dtype=torch.float32)) for each in (0.3 * apart, axis)), columns
+
+
+def test_features_of_shapes_do_not_change_with_the_symmetries_of_their_boxes():
+    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), 8), shape_pairs()
+    wanted = torch.stack(pairs.features(apart, axis, columns))
+    assert wanted.shape == (pairs.inputs, 64 * len(KINDS))
+    for flipped in range(3):  # a frame with one axis reversed is that of the same box
+        other = [-each if index // 3 == flipped else each for index, each in enumerate(columns)]
+        np.testing.assert_allclose(torch.stack(pairs.features(apart, axis, other)), wanted, atol=1e-5)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    rotate = lambda vector: list(turn @ torch.stack(vector))  # noqa: E731
+    other = [*rotate(columns[:3]), *rotate(columns[3:6]), *rotate(columns[6:9]), *columns[9:]]
+    again = pairs.features(rotate(apart), rotate(axis), other)
+    np.testing.assert_allclose(torch.stack(again), wanted, atol=1e-5)
+
+
+def test_round_shapes_may_turn_about_their_axis():
+    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), 8), shape_pairs()
+    first, second = (torch.stack(columns[i : i + 3]) for i in (0, 3))
+    other = [*(0.6 * first + 0.8 * second), *(0.6 * second - 0.8 * first), *columns[6:]]
+    wanted, again = (torch.stack(pairs.features(apart, axis, each)) for each in (columns, other))
+    changed = (wanted - again).abs().amax(dim=0).reshape(len(KINDS), -1).amax(dim=1) > 1e-4
+    assert [kind for kind, each in zip(KINDS, changed, strict=True) if each] == ["box"]
+
+
+def test_the_nearest_shapes_are_among_the_near_pairs():
+    envs = gym.make_vec(SPACE, num_envs=4, threads=1, shapes=("capsule", "box", "cylinder")).unwrapped
+    observation, _ = envs.reset(seed=0)
+    model, env = small(SPACE, shapes=("capsule", "box", "cylinder"))
+    policy = model.policy
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 16, 4)).astype(np.float32)
+    with torch.no_grad():
+        inputs = policy.inputs(observation, actions)
+        whole = policy.critic.pairs(inputs.poses, inputs.scene.parts)
+        near = policy.critic.pairs.of_near_pairs(inputs.poses, inputs.scene.parts)
+    assert (near >= whole - 1e-6).all()
+    assert (near - whole < 1e-6).float().mean() > 0.5
+    env.close()
+    envs.close()

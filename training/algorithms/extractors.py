@@ -46,9 +46,14 @@ class SceneExtractor(BaseFeaturesExtractor):
         own = 2 * self.dimension + 1 + ("start" in boxes) * self.dimension
         rest = sum(math.prod(boxes[name].shape) for name in (*self.turned, *self.plain))
         super().__init__(observation_space, own + rest + ("obstacles" in boxes) * 2 * width)
+        shape = boxes["obstacles"].shape if "obstacles" in boxes else (0,)
+        self.row_size = 2 * self.dimension + 2 if len(shape) == 1 else shape[1]
+        """Number of values of one obstacle; rows of shapes are not flattened."""
+        self.n_rows = math.prod(shape) // self.row_size
+        """Greatest number of obstacles."""
         self._scale = {name: float(1.0 / abs(boxes[name].high).max()) for name in (*self.turned, *self.plain)}
         self.each = nn.Sequential(
-            nn.Linear(2 * self.dimension + 1 + own, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+            nn.Linear(self.row_size - 1 + own, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
         )
 
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
@@ -84,12 +89,25 @@ class SceneExtractor(BaseFeaturesExtractor):
     def _obstacles(self, flat: Tensor, axes: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
         """Return obstacles in the frame of the line, shape (B, n, F), and their presence, shape (B, n, 1)."""
         d = self.dimension
-        rows = flat.reshape(len(flat), -1, 2 * d + 2)
+        rows = flat.reshape(len(flat), -1, self.row_size)
+        if flat.dim() == 3:
+            return self._shapes(rows, axes, middle), (rows[..., -1:] > 0.5).to(flat.dtype)
         centre = _turned(axes.unsqueeze(1), rows[..., :d] - middle.unsqueeze(1))
         half = _turned(axes.unsqueeze(1), rows[..., d : 2 * d])
         half = torch.where(half[..., 1:2] < 0.0, -half, half)  # the sign of a half-axis has no meaning
         seen = POSITION_SCALE * torch.cat((centre, half, rows[..., 2 * d : 2 * d + 1]), dim=-1)
         return seen, (rows[..., -1:] > 0.5).to(flat.dtype)
+
+    def _shapes(self, rows: Tensor, axes: Tensor, middle: Tensor) -> Tensor:
+        """Return obstacles of any shape in the frame of the line, shape (B, n, F)."""
+        d = self.dimension
+        frame = torch.eye(3, dtype=rows.dtype, device=rows.device).repeat(len(rows), 1, 1, 1)
+        frame[:, 0, :d, :d] = axes
+        origin = nn.functional.pad(middle, (0, 3 - d)).unsqueeze(1)
+        kind, centre, first, second, half = rows[..., :-1].split((rows.shape[-1] - 13, 3, 3, 3, 3), dim=-1)
+        place = POSITION_SCALE * _turned(frame, centre - origin)
+        turned = (_turned(frame, each) for each in (first, second))
+        return torch.cat((kind, place, *turned, POSITION_SCALE * half), dim=-1)
 
     def _encoded(self, seen: Tensor, present: Tensor, ends: Tensor) -> list[Tensor]:
         """Return sum and maximum over the obstacles that are present, shape (B, width) each."""

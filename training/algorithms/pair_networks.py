@@ -5,29 +5,26 @@ outcome of single movements which pair of obstacle and link determined it:
 
     m(s, a) = min over obstacle parts i, bodies h, instants t of q_h(i seen from h at t)
 
-Each q_h is a small network. Its input is the pose of an obstacle relative to a body, a capsule of the arm; the planned
-pose of the body follows from the plan alone. Bodies may share a network, which then also gets their size. The distance
-between surfaces is learned, not computed. Long obstacles are cut into parts, because an obstacle is the union of its
-parts and short parts resemble each other.
+Each q_h is a small network. Its input is the pose of an obstacle relative to a body, a capsule of the arm
+(:mod:`viapoint.training.algorithms.obstacle_parts`); the planned pose of the body follows from the plan alone. Bodies
+may share a network, which then also gets their size. The distance between surfaces is learned, not computed.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from viapoint.training.algorithms.obstacle_parts import CapsulePairs, PairGeometry, Parts, Poses
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
 
 
-PART = {2: 0.0625, 3: 0.15}
-"""Maximum half-length of an obstacle part by spatial dimension, [m]."""
 SCALE = 8.0
 """Scale of lengths at the input of the networks, [1/m]."""
 HIDDEN = 1 << 17
@@ -40,101 +37,6 @@ ROWS = 65_536
 """Pairs whose inputs are computed together, so that they stay in the cache."""
 NEAR = 0.12
 """Distance beyond that of the nearest pair of a plan up to which a pair counts as near, [m]."""
-
-
-class Parts(NamedTuple):
-    """Obstacle parts of B scenes, at most R in each."""
-
-    centre: Tensor
-    """Shape (B, R, D), [m]."""
-    half_axis: Tensor
-    """Shape (B, R, D), [m]."""
-    radius: Tensor
-    """Shape (B, R), [m]."""
-    velocity: Tensor
-    """Shape (B, R, D), [m/s]."""
-    present: Tensor
-    """Shape (B, R), bool."""
-
-
-class Poses(NamedTuple):
-    """Planned poses of L links at T instants of H plans in each of B scenes."""
-
-    centre: Tensor
-    """Shape (L, D, B, H, T), [m]."""
-    axis: Tensor | None
-    """Unit vectors along the links, shape (L, D, B, H, T); None if the only body is the spherical hand."""
-    time: Tensor
-    """Time since the start of the plan, shape (B, H, T), [s]."""
-    half_length: Tensor | None = None
-    """Half-lengths of the links, shape (L,), [m]; only needed to find near pairs."""
-    radius: Tensor | None = None
-    """Radii of the links, shape (L,), [m]; only needed to find near pairs."""
-
-
-def cut_obstacles(
-    rows: NDArray[np.floating], present: NDArray[np.bool_], velocity: NDArray[np.floating] | None = None
-) -> Parts:
-    """Cut capsules into parts of bounded length.
-
-    Args:
-        rows: Centre, half-axis and radius of n obstacles in B scenes, shape (B, n, 2 D + 1), [m].
-        present: Mask of the rows that hold an obstacle, shape (B, n).
-        velocity: Velocities, shape (B, n, D), [m/s]; zero if not given.
-    """
-    d = (rows.shape[-1] - 1) // 2
-    centre, half = rows[..., :d], rows[..., d : 2 * d]
-    length = np.sqrt((half * half).sum(axis=-1))
-    count = np.where(present, np.maximum(np.ceil(length / PART[d] - 1e-4), 1.0), 0.0).astype(np.int64)
-    scene, obstacle = (np.repeat(index, count.ravel()) for index in np.indices(count.shape).reshape(2, -1))
-    place = np.arange(len(scene)) - np.repeat(np.cumsum(count.ravel()) - count.ravel(), count.ravel())
-    number = count[scene, obstacle]
-    column = np.arange(len(scene)) - np.searchsorted(scene, scene)
-    most = max(int(count.sum(axis=1).max(initial=0)), 1)
-    offset = ((2.0 * place + 1.0) / number - 1.0)[:, None] * half[scene, obstacle]
-    values = {
-        "centre": centre[scene, obstacle] + offset,
-        "half_axis": half[scene, obstacle] / number[:, None],
-        "radius": rows[scene, obstacle, -1],
-        "velocity": np.zeros_like(offset) if velocity is None else velocity[scene, obstacle],
-        "present": np.ones(len(scene), dtype=bool),
-    }
-    parts = {}
-    for name, value in values.items():
-        whole = np.zeros((len(rows), most, *value.shape[1:]), dtype=bool if name == "present" else np.float32)
-        whole[scene, column] = value
-        parts[name] = torch.from_numpy(whole)
-    return Parts(**parts)
-
-
-def pair_features(
-    centre: list[Tensor], axis: list[Tensor] | None, half_axis: list[Tensor], radius: Tensor
-) -> list[Tensor]:
-    """Return invariants of the pose of an obstacle part relative to a body.
-
-    A capsule is symmetric under rotations about its axis and under reflections, a sphere under all rotations. The
-    invariants are the components of centre and half-axis along the axis of the body, in the direction of the centre
-    of the part, and perpendicular to both.
-
-    Args:
-        centre: D components of the vector from the centre of the body to that of the part, [m].
-        axis: D components of the unit axis of the body; None for a sphere.
-        half_axis: D components of the half-axis of the part, [m].
-        radius: Radius of the part, [m].
-    """
-    square, across, length = _dot(centre, centre), _dot(half_axis, centre), _dot(half_axis, half_axis)
-    if axis is None:
-        away = torch.sqrt(square + 1e-12)
-        radial = torch.abs(across) / away
-        return [away, radial, _root(length - radial * radial), radius.expand_as(away)]
-    along, turned = _dot(centre, axis), _dot(half_axis, axis)
-    away = _root(square - along * along)
-    radial = (across - along * turned) / away
-    sign = torch.where(radial < 0.0, -1.0, 1.0)
-    features = [along, away, turned * sign, radial * sign]
-    if len(centre) == 3:
-        features.append(_root(length - turned * turned - radial * radial))
-    return [*features, radius.expand_as(away)]
 
 
 class PairNetworks(nn.Module):
@@ -191,17 +93,20 @@ class PairMinimum(nn.Module):
         networks: Index of the network of each body, in increasing order; empty for the spherical hand alone. Networks
             that several bodies share have their half-length and radius as further inputs.
         width: Width of the hidden layers.
+        geometry: Description of the parts; by default that of capsules.
     """
 
-    def __init__(self, dimension: int, networks: Sequence[int], width: int) -> None:
+    def __init__(
+        self, dimension: int, networks: Sequence[int], width: int, *, geometry: PairGeometry | None = None
+    ) -> None:
         super().__init__()
-        inputs = 4 if not networks else 2 * dimension + (1 if dimension == 2 else 0)
+        self.geometry = geometry or CapsulePairs(dimension, bool(networks))
         number = networks[-1] + 1 if networks else 1
         self.shared = len(networks) > number
         """True if bodies share networks."""
         self.network_of = list(networks) or [0]
         """Index of the network of each body."""
-        self.networks = PairNetworks(number, inputs + 2 * self.shared, width)
+        self.networks = PairNetworks(number, self.geometry.inputs + 2 * self.shared, width)
 
     def forward(self, poses: Poses, parts: Parts, until: Tensor | None = None) -> Tensor:
         """Return the minimum for each plan, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles.
@@ -236,8 +141,8 @@ class PairMinimum(nn.Module):
         """Return the minimum over near pairs for each plan, shape (B, H), [m]; NO_OBSTACLE without obstacles.
 
         This takes a fraction of the time of the minimum over all pairs, and is never less. A pair is near if its
-        distance exceeds the least one of the plan by at most NEAR. Distance means here that of the part's centre from
-        the axis of the body, less both radii and half the half-length of the part.
+        distance exceeds the least one of the plan by at most NEAR. Distance means here the rough one of
+        :meth:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.gap`.
 
         Args:
             poses: Planned poses.
@@ -250,17 +155,16 @@ class PairMinimum(nn.Module):
         plans, number = poses.centre.shape[3], int(parts.present[scene].sum())
         if not number:
             return torch.full((plans,), NO_OBSTACLE)
-        part, half, radius, drift = (
-            each[scene, :number, ..., None, None]
-            for each in (parts.centre, parts.half_axis, parts.radius, parts.velocity)
+        part, described, drift = (
+            each[scene, :number, ..., None, None] for each in (parts.centre, parts.columns, parts.velocity)
         )
         if bool(drift.any()):
             part = part + drift * poses.time[scene]
-        dimensions = range(part.shape[1])
+        dimensions = range(poses.centre.shape[1])
         apart = [part[:, i] - poses.centre[:, i, scene, None] for i in dimensions]  # shape (L, R, H, T) each
         axis = None if poses.axis is None else [poses.axis[:, i, scene, None] for i in dimensions]
-        size = radius + 0.5 * torch.sqrt((half * half).sum(dim=1))
-        distance = _distance_from_axis(apart, axis, poses) - size
+        columns = [described[:, i] for i in range(described.shape[1])]
+        distance = self.geometry.gap(apart, axis, columns, poses)
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
         flat = (distance <= (nearest + NEAR)[:, None]).flatten().nonzero()[:, 0]
         _, rows, _, instants = distance.shape
@@ -268,11 +172,10 @@ class PairMinimum(nn.Module):
         plan, of_body = pose // instants, flat // (plans * instants)
         body, row = of_body // rows, of_body % rows
         along = body * (plans * instants) + pose
-        features = pair_features(
+        features = self.geometry.features(
             [each.expand_as(distance).flatten()[flat] for each in apart],
             None if axis is None else [each.flatten()[along] for each in axis],
-            [half[:, i, 0, 0][row] for i in dimensions],
-            radius[:, 0, 0][row],
+            [each[:, 0, 0][row] for each in columns],
         )
         features += self._sizes(poses, body)
         # Pairs are in the order of their bodies, and so of their networks.
@@ -320,7 +223,7 @@ class PairMinimum(nn.Module):
         """Return values of part k in scene b for every plan, body and instant, shape (P, H, L, T)."""
         bodies, dimension, _, plans, instants = poses.centre.shape
         here = poses.centre[:, :, b]
-        part, half = parts.centre[b, k], parts.half_axis[b, k]
+        part, described = parts.centre[b, k], parts.columns[b, k]
         drift = parts.velocity[b, k]
         moves = bool(drift.any())
         time = poses.time[b] if moves else None
@@ -334,8 +237,8 @@ class PairMinimum(nn.Module):
         if poses.axis is not None:
             pointing = poses.axis[:, :, b]
             axis = [pointing[:, i] for i in range(dimension)]
-        halves = [half[:, i, None, None] for i in range(dimension)]
-        features = pair_features(centre, axis, halves, parts.radius[b, k][:, None, None])
+        columns = [described[:, i, None, None] for i in range(described.shape[1])]
+        features = self.geometry.features(centre, axis, columns)
         if self.shared:
             every = (size[:, None, None, None].expand_as(features[0]) for size in self._sizes(poses))
             features = [each.reshape(bodies, -1) for each in (*features, *every)]
@@ -373,17 +276,16 @@ class PairMinimum(nn.Module):
         dimension = poses.centre.shape[1]
         here = poses.centre[body, :, scene, plan, instant]
         drift = parts.velocity[scene, part] * poses.time[scene, plan, instant][:, None]
-        apart = parts.centre[scene, part] + drift - here
+        apart = (parts.centre[scene, part] + drift)[:, :dimension] - here
         axis = None
         if poses.axis is not None:
             pointing = poses.axis[body, :, scene, plan, instant]
             axis = [pointing[:, i] for i in range(dimension)]
-        half = parts.half_axis[scene, part]
-        features = pair_features(
+        described = parts.columns[scene, part]
+        features = self.geometry.features(
             [apart[:, i] for i in range(dimension)],
             axis,
-            [half[:, i] for i in range(dimension)],
-            parts.radius[scene, part],
+            [described[:, i] for i in range(described.shape[1])],
         )
         features += self._sizes(poses, body)
         every = self._evaluate([each.expand(len(self.networks.nearness), -1) for each in features])
@@ -393,8 +295,7 @@ class PairMinimum(nn.Module):
         """Return values of shape (L, N) for features of shape (L, ...) each, of all L networks or of one."""
         bodies = features[0].shape[0]
         stacked = torch.stack([each.reshape(bodies, -1) for each in features], dim=1)
-        distance = stacked[:, 0] if len(features) == 4 else torch.hypot(stacked[:, 0], stacked[:, 1])
-        values: Tensor = self.networks(stacked * SCALE, distance, body)
+        values: Tensor = self.networks(stacked * SCALE, self.geometry.distance(stacked), body)
         return values
 
 
@@ -404,34 +305,6 @@ def dense(*sizes: int) -> nn.Sequential:
     for fan_in, fan_out in itertools.pairwise(sizes):
         layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
-
-
-def _distance_from_axis(apart: list[Tensor], axis: list[Tensor] | None, poses: Poses) -> Tensor:
-    """Return distances of points from bodies, less the radii of these, shape (L, R, H, T), [m].
-
-    Args:
-        apart: D components of the vector from the centres of the bodies.
-        axis: D components of the unit axes of the bodies; None for a sphere, whose radius is left out.
-        poses: Half-lengths and radii of the bodies.
-    """
-    square = _dot(apart, apart)
-    if axis is None or poses.half_length is None or poses.radius is None:
-        return _root(square)
-    half_length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
-    along = _dot(apart, axis)
-    inside = torch.minimum(torch.maximum(along, -half_length), half_length)
-    return _root(square - inside * (2.0 * along - inside)) - radius
-
-
-def _dot(first: list[Tensor], second: list[Tensor]) -> Tensor:
-    total = first[0] * second[0]
-    for u, v in zip(first[1:], second[1:], strict=True):
-        total = total + u * v
-    return total
-
-
-def _root(square: Tensor) -> Tensor:
-    return torch.sqrt(square.clamp_min(1e-10))
 
 
 def networks_of(task: Task) -> list[int]:

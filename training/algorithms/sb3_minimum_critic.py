@@ -52,9 +52,7 @@ class ObstacleRows(BaseFeaturesExtractor):
                 f"{', '.join(observation_space.spaces)}"
             )
         scene = SceneExtractor(observation_space, width=1)
-        boxes = cast("dict[str, spaces.Box]", dict(observation_space.items()))
-        self.row = 2 * scene.dimension + 1
-        self.rows = boxes["obstacles"].shape[0] // (self.row + 1)
+        self.row, self.rows = scene.row_size - 1, scene.n_rows
         self.ends = scene.features_dim - 2
         super().__init__(observation_space, self.ends + self.rows * (self.row + 1))
         self.scene = scene

@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from viapoint.envs.geometry.rows import CAPSULES
+from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.training.algorithms.pair_networks import PairMinimum, Parts, Poses, dense, networks_of
+from viapoint.training.algorithms.obstacle_parts import Parts, Poses, ShapePairs
+from viapoint.training.algorithms.pair_networks import PairMinimum, dense, networks_of
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -68,6 +71,11 @@ class PlanInputs(NamedTuple):
     """Time after which contact does not count, shape (B, H), [s]; None if plans are executed to their end."""
 
 
+def seen_row_size(layout: ObservationLayout) -> int:
+    """Return the number of values of an obstacle, without its velocity, in the frame of start and goal."""
+    return layout.row_size - 1
+
+
 class _Saturated(torch.autograd.Function):
     """Clamp whose gradient can move values back into the range, but not farther out of it."""
 
@@ -108,11 +116,13 @@ class ViaQCritic(nn.Module):
         super().__init__()
         d, size = task.arm.dimension, task.action.size
         ends = (4 * d + 3) if replanning else (2 * d + 1)
-        row = (3 * d + 1) if replanning else (2 * d + 1)
+        row = seen_row_size(task.observation) + (d if replanning else 0)
         self.form, self.pooling, self.replanning = form, pooling, replanning
         self.pairs: Any = None
         if form == "poses":
-            self.pairs = PairMinimum(d, networks_of(task), width)
+            networks, shapes = networks_of(task), task.scenes.shapes
+            geometry = None if shapes == CAPSULES else ShapePairs(len(shapes), bool(networks))
+            self.pairs = PairMinimum(d, networks, width, geometry=geometry)
         else:
             outputs = heads if pooling == "minimum" else width
             self.pairs = dense(ends + row + size, width, width, outputs)

@@ -14,16 +14,18 @@ from torch import Tensor
 
 from viapoint.envs.actions.via_points import frame
 from viapoint.envs.arms import ARMS
+from viapoint.envs.geometry.rows import CAPSULES, has_shapes
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.executor import SETTLING
-from viapoint.training.algorithms.pair_networks import Poses, cut_obstacles
+from viapoint.training.algorithms.obstacle_parts import Poses, cut_obstacles, whole_obstacles
 from viapoint.training.algorithms.viaq_critic import (
     Form,
     PlanInputs,
     Pooling,
     SceneInputs,
     ViaQCritic,
+    seen_row_size,
 )
 from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import best_actions, score_plans
@@ -149,13 +151,13 @@ class ViaQPolicy(BasePolicy):
         ends, rows, present = seen_from_line(observation, self.task)
         parts = None
         if self.settings["form"] == "poses" and "obstacles" in observation:
-            obstacles = self.task.observation.obstacles(observation["obstacles"])
-            whole = np.concatenate(
-                (obstacles.centre, obstacles.half_axis, obstacles.radius[..., None]), axis=-1
-            )
+            whole: Any = self.task.observation.scene_rows(observation["obstacles"])
             velocity = observation.get("obstacle_velocities")
-            moving = None if velocity is None else velocity.reshape(obstacles.centre.shape)
-            parts = cut_obstacles(whole, obstacles.present > 0.5, moving)
+            moving = None if velocity is None else velocity.reshape(*whole.shape[:2], -1)
+            if has_shapes(whole):
+                parts = whole_obstacles(whole, self.task.scenes.shapes, moving)
+            else:
+                parts = cut_obstacles(whole, whole[..., -1] > 0.0, moving)
         elif self.settings["form"] == "poses":
             none = np.zeros((len(ends), 1, 2 * self.task.arm.dimension + 1))
             parts = cut_obstacles(none, np.zeros((len(ends), 1), dtype=bool))
@@ -353,9 +355,9 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
     """Return ends, obstacle rows and their presence in the frame of the line from hand to goal.
 
     Returns:
-        Start, goal, distance and, in replanning tasks, the present motion, shape (B, E); rows of centre, half-axis,
-        radius and, in replanning tasks, velocity, shape (B, n, F); presence, shape (B, n). Lengths are scaled to
-        order one.
+        Start, goal, distance and, in replanning tasks, the present motion, shape (B, E); rows of centre, half-axis and
+        radius (or shape, centre, rotation and half lengths) and, in replanning tasks, velocity, shape (B, n, F);
+        presence, shape (B, n). Lengths are scaled to order one.
     """
     start, goal, line = observation["hand"], observation["goal"], direction(observation)
     axes = np.stack(frame(line), axis=-1)
@@ -365,9 +367,11 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
             ends.append((observation[name][:, None] @ axes)[:, 0] * scale)
         ends += [observation["remaining"], observation["time_left"]]
     together = np.concatenate(ends, axis=-1)
-    width = 2 * task.arm.dimension + 1 + (task.arm.dimension if is_replanning(observation) else 0)
+    width = seen_row_size(task.observation) + (task.arm.dimension if is_replanning(observation) else 0)
     if "obstacles" not in observation:
         return together, np.zeros((len(start), 1, width)), np.zeros((len(start), 1), dtype=bool)
+    if task.scenes.shapes != CAPSULES:
+        return together, *_shapes_from_line(observation, axes, len(task.scenes.shapes))
     rows = task.observation.obstacles(observation["obstacles"])
     centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
     half = rows.half_axis @ axes
@@ -376,6 +380,26 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
     if is_replanning(observation):
         seen.append(3.0 * observation["obstacle_velocities"].reshape(centre.shape) @ axes)
     return together, np.concatenate(seen, axis=-1), np.asarray(rows.present > 0.5)
+
+
+def _shapes_from_line(
+    observation: Observation, axes: Numbers, n_shapes: int
+) -> tuple[Numbers, NDArray[np.bool_]]:
+    """Return rows of shape, centre, rotation and half lengths in the frame of the line, and their presence."""
+    rows, (number, d, _) = observation["obstacles"], axes.shape
+    frame, middle = np.tile(np.eye(3, dtype=axes.dtype), (number, 1, 1)), np.zeros((number, 3), axes.dtype)
+    frame[:, :d, :d], middle[:, :d] = axes, 0.5 * (observation["hand"] + observation["goal"])
+    pose = rows[..., n_shapes:]
+    turned = [pose[..., first : first + 3] @ frame for first in (3, 6)]
+    seen = [
+        rows[..., :n_shapes],
+        5.0 * (pose[..., :3] - middle[:, None]) @ frame,
+        *turned,
+        5.0 * pose[..., 9:12],
+    ]
+    if is_replanning(observation):
+        seen.append(3.0 * observation["obstacle_velocities"].reshape(*rows.shape[:2], d) @ axes)
+    return np.concatenate(seen, axis=-1), np.asarray(rows[..., -1] > 0.5)
 
 
 def instants_of(number: int) -> NDArray[np.float32]:
