@@ -84,15 +84,16 @@ class EnvConfig:
         arm = arm_of(self.arm)
         if not isinstance(self.whole_arm, bool | np.bool_):
             raise TypeError(f"whole_arm must be True or False, got {self.whole_arm!r}")
+        distribution = distribution_of(arm)
         return Task(
             arm=arm,
             whole_arm=bool(self.whole_arm),
             action=self._action_layout(arm.dimension),
             weights=self.weights_kind.of(self.reward_weights),
-            scenes=distribution_of(arm)(
+            scenes=distribution(
                 n_obstacles=fewest_and_most(self.n_obstacles),
-                shapes=check_shapes(self.shapes),
                 uniform_share=self.uniform_share,
+                **distribution.for_shapes(check_shapes(self.shapes)),
             ),
             replanning=self.replanning,
             stepwise=self.stepwise,

@@ -34,6 +34,7 @@ from scene_sets.scene_search import (
     redrawn,
     search,
 )
+from viapoint.envs.geometry.rows import CAPSULES
 from viapoint.envs.mdp.task import Task, family_sampler
 from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.families import scene_families
@@ -114,8 +115,12 @@ def lots(task: Task, name: str, size: int) -> list[Lot]:
 
 def hard_families(task: Task) -> dict[str, SceneSampler]:
     """Return samplers of the families of hard scenes of a task, by name."""
-    families = scene_families(task.arm.dimension)
-    return {name: family_sampler(task, name) for name, family in families.items() if family.hard}
+    families, known = scene_families(task.arm.dimension).items(), {*task.scenes.shapes, *CAPSULES}
+    return {
+        name: family_sampler(task, name)
+        for name, family in families
+        if family.hard and set(family.shapes) <= known
+    }
 
 
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from viapoint.envs.common.validation import check_increasing_pair, is_number
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
@@ -53,6 +53,11 @@ class SceneDistribution:
     """Least clearance of the hand at start and goal, [m]."""
     reach_margin: float = 0.03
     """Least distance of start, goal and feasible path from the border of the reach, [m]."""
+
+    @classmethod
+    def for_shapes(cls, shapes: tuple[str, ...]) -> dict[str, Any]:
+        """Return the arguments of a distribution with obstacles of some shapes."""
+        return {"shapes": shapes}
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -103,7 +108,10 @@ class SpaceDistribution(SpatialSizes):
                 f"families must be some of {', '.join(scene_families(3))}, got {self.families!r}"
             )
         if self.n_obstacles[1] and not self.possible:
-            raise ValueError(f"families {self.families!r} take more than {self.n_obstacles[1]} obstacles")
+            raise ValueError(
+                f"families {self.families!r} take more than {self.n_obstacles[1]} obstacles, or others than "
+                f"{self.shapes}"
+            )
         for name in (
             "distance", "sphere_radius", "post_radius", "pillar_radius", "bar_radius", "bar_half_length",
             "board_half_length", "beam_half_length", "gate_half_width",
@@ -114,7 +122,21 @@ class SpaceDistribution(SpatialSizes):
     def possible(self) -> tuple[str, ...]:
         """Families that need no more than the greatest number of obstacles."""
         families = scene_families(3)
-        return tuple(name for name in self.families if families[name].n_obstacles <= self.n_obstacles[1])
+        return tuple(
+            name
+            for name in self.families
+            if families[name].n_obstacles <= self.n_obstacles[1]
+            and set(families[name].shapes) <= {*self.shapes, *CAPSULES}
+        )
+
+    @classmethod
+    def for_shapes(cls, shapes: tuple[str, ...]) -> dict[str, Any]:
+        """Return the arguments of a distribution with obstacles of some shapes: their families are drawn, too."""
+        families = scene_families(3).items()
+        others = tuple(
+            name for name, family in families if family.trained and set(family.shapes) <= set(shapes)
+        )
+        return {"shapes": shapes, "families": TRAINED + others}
 
 
 def check_count(pair: Sequence[int], name: str, limit: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Bool, Float, Index
-from viapoint.envs.geometry.rows import CAPSULES, dimension_of, has_shapes, shape_rows, turn_up_to, widened
+from viapoint.envs.geometry.rows import CAPSULES, dimension_of, shape_columns, shape_rows, turn_up_to, widened
 from viapoint.envs.geometry.shape import TALL
 from viapoint.envs.geometry.shapes import SHAPES
 
@@ -196,22 +196,24 @@ def shuffle_rows(rows: Float, chance: Float) -> Float:
 def reshaped(rows: Float, u: Float, shapes: Sequence[str]) -> Float:
     """Return obstacles as rows with shapes, in which every capsule has become one of some shapes inside it.
 
-    Whatever is clear of a capsule is clear of a shape inside it. Rows that have shapes already stay as they are.
+    Whatever is clear of a capsule is clear of a shape inside it. Obstacles of other shapes stay as they are.
 
     Args:
         rows: Rows of either kind, shape (..., .), [m].
         u: Uniform numbers, shape (..., RESHAPE_NUMBERS).
         shapes: Names of the shapes of scenes; half-spaces fit into no capsule.
     """
-    names = [name for name in shapes if name != "half_space"]
-    if has_shapes(rows) or not names or tuple(shapes) == CAPSULES:
+    names, d = [name for name in shapes if name != "half_space"], dimension_of(rows)
+    if not names or tuple(shapes) == CAPSULES:
         return rows if tuple(shapes) == CAPSULES else widened(rows)
-    found = np.zeros_like(widened(rows))
-    which = np.where(rows[..., -1] > 0.0, (u[..., 0] * len(names)).astype(np.int64), -1)
+    found = widened(rows).copy()
+    capsule = (rows[..., -1] > 0.0) & (shape_columns(rows).kind == list(SHAPES).index("capsule"))
+    which = np.where(capsule, (u[..., 0] * len(names)).astype(np.int64), -1)
     for number, name in enumerate(names):
         some = which == number
-        quaternion, half = _inside(name, rows[some], u[some, 1:])
-        found[some] = shape_rows(name, rows[some][:, : dimension_of(rows)], quaternion, half)
+        axes = np.concatenate((rows[some][:, : 2 * d], rows[some][:, -1:]), axis=-1)
+        quaternion, half = _inside(name, axes, u[some, 1:])
+        found[some] = shape_rows(name, axes[:, :d], quaternion, half)
     return found
 
 

@@ -12,17 +12,24 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import whole_number
+from viapoint.envs.geometry.rows import CAPSULES
 from viapoint.envs.scenes.draws import FeasiblePath, Site, Uniforms, unit
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS, PLANAR_BUILDERS
 from viapoint.envs.scenes.spatial_families import (
     SpatialSite,
     Structures,
+    bin_,
+    cage,
     clutter,
+    cupboard,
     gate,
+    notch,
     pillar,
     shelf,
     slot,
+    table,
     tunnel,
+    wall_window,
     window,
 )
 
@@ -48,8 +55,13 @@ class SceneFamily:
     """Count of obstacles, from the first, that make room together."""
     hard: bool = False
     """Flag: the family is part of the frozen `hard` scenes."""
+    shapes: tuple[str, ...] = CAPSULES
+    """Shapes of the obstacles."""
+    trained: bool = False
+    """Flag: the family is one of those of training by default if scenes may have its shapes."""
 
 
+_TRAINED_BOXES: dict[str, Any] = {"shapes": ("box",), "trained": True, "hard": True}
 _FAMILIES: dict[int, dict[str, SceneFamily]] = {
     2: {
         name: SceneFamily(build=build, n_obstacles=FAMILY_ROWS, hard=True)
@@ -63,6 +75,12 @@ _FAMILIES: dict[int, dict[str, SceneFamily]] = {
         "slot": SceneFamily(build=slot, n_obstacles=4, passes_above=True, rigid=3, hard=True),
         "window": SceneFamily(build=window, n_obstacles=4, hard=True),
         "tunnel": SceneFamily(build=tunnel, n_obstacles=6, hard=True),
+        "table": SceneFamily(build=table, n_obstacles=4, passes_above=True, rigid=4, **_TRAINED_BOXES),
+        "bin": SceneFamily(build=bin_, n_obstacles=5, passes_above=True, **_TRAINED_BOXES),
+        "notch": SceneFamily(build=notch, n_obstacles=3, **_TRAINED_BOXES),
+        "cupboard": SceneFamily(build=cupboard, n_obstacles=3, passes_above=True, rigid=2, **_TRAINED_BOXES),
+        "wall_window": SceneFamily(build=wall_window, n_obstacles=4, hard=True, shapes=("box",)),
+        "cage": SceneFamily(build=cage, n_obstacles=8, passes_above=True, hard=True, shapes=("box",)),
     },
 }
 

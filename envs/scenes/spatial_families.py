@@ -1,4 +1,4 @@
-"""Families of scenes in space: spheres, posts, bars and structures of these.
+"""Families of scenes in space: spheres, posts, bars and boxes, and structures of these.
 
 A family is built at K candidate places of N scenes at once. Each part has a direction of retreat: the sampler moves a
 part that is too close to the arm on the feasible path along it.
@@ -14,10 +14,25 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.draws import Site, Uniforms, between, left, rotate
+from viapoint.envs.scenes.draws import Site, Uniforms, between, box_rows, left, rotate
 
 BUILDER_NUMBERS = 6
 """Uniform numbers that make one structure or one obstacle."""
+THICKNESS = 0.008
+"""Half thickness of panels and bars, [m]."""
+TABLE = (0.12, 0.25)
+"""Half lengths of the sides of tables, [m]."""
+THING_WIDTH, THING_HEIGHT = (0.015, 0.04), (0.02, 0.07)
+"""Half widths and half heights of things on a table, [m]."""
+BIN, RIM = (0.13, 0.20), (0.02, 0.10)
+"""Half width of bins and cages inside, and height of their rims above the hand in them, [m]; a gripper fits in."""
+GAP = (0.07, 0.16)
+"""Distance from the middle of a gap in a wall to each side, [m]; the gripper is 0.21 m wide."""
+PANEL = (0.10, 0.20)
+"""Half length of walls on either side of a gap, and of the boards of cupboards, [m]."""
+ABOVE = (0.02, 0.15)
+"""Height of walls and cupboards above the hand, [m]."""
+DOWN = (0.0, 0.0, -1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +97,7 @@ class Structures(NamedTuple):
     """Structures at K places of N scenes."""
 
     rows: Float
-    """Shape (N, K, n, 7), [m]."""
+    """Rows of either kind, shape (N, K, n, .), [m], see :mod:`viapoint.envs.geometry.rows`."""
     retreat: Float
     """Unit vectors along which parts retreat from the arm, shape (N, K, n, 3)."""
 
@@ -138,6 +153,91 @@ def tunnel(uniforms: Uniforms, site: SpatialSite) -> Structures:
     rows, retreat = (part[:, :, :2].copy() for part in front)
     rows[..., :3] += site.sizes.tunnel_length * site.heading[:, :, None]
     return _together(front, _beam(u, site), Structures(rows, retreat))
+
+
+def table(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a table under the path with three boxes on it, of which one is right under the hand."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    heading = rotate(site.heading, 2.0 * np.pi * u[..., 1])
+    size = between(TABLE, np.stack((u[..., 2], u[..., 3]), axis=-1))
+    first = between(THING_HEIGHT, u[..., 5])
+    surface = site.place[..., 2] - _depth(u, site) - 2.0 * first
+    middle = site.place + 0.1 * (u[..., 4:5] - 0.5) * left(heading)
+    parts = [_box(_at_height(middle, surface - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
+    for thing in range(3):
+        v = _more(u, thing)
+        far = 0.8 * size * (2.0 * v[..., :2] - 1.0)
+        away = far[..., :1] * heading + far[..., 1:] * left(heading)
+        place, half = (middle + away, between(THING_HEIGHT, v[..., 2])) if thing else (site.place, first)
+        wide = between(THING_WIDTH, v[..., 3:5])
+        parts.append(_box(_at_height(place, surface + half), heading, (wide[..., 0], wide[..., 1], half)))
+    return _structures(parts, [DOWN] * 4)
+
+
+def bin_(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return an open box around start or goal: a floor and four walls, which retreat downwards."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    end, heading = _end(u, site), rotate(site.heading, 0.5 * np.pi * u[..., 1])
+    low, rim = end[..., 2] - _depth(u, site), end[..., 2] + between(RIM, u[..., 2])
+    size = between(BIN, u[..., 3:5])
+    parts = [_box(_at_height(end, low - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
+    for sign in (-1.0, 1.0):
+        for axis, wide, along in ((heading, 0, 1), (left(heading), 1, 0)):
+            wall = end + sign * (size[..., wide, None] + THICKNESS) * axis
+            half = (THICKNESS, size[..., along] + THICKNESS * (1.0 + along), 0.5 * (rim - low))
+            parts.append(_box(_at_height(wall, 0.5 * (rim + low)), axis, half))
+    return _structures(parts, [DOWN] * 5)
+
+
+def notch(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a wall across the path with a gap that is open above: two panels and a sill."""
+    return _wall(uniforms.take(BUILDER_NUMBERS), site)
+
+
+def wall_window(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a wall across the path with a window: two panels, a sill, and a lintel over the arm."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    wall, out = _wall(u, site), _outwards(site)
+    half = between(PANEL, u[..., 5])
+    middle = site.place + (half - 0.08)[..., None] * out
+    lintel = _box(
+        _at_height(middle, site.top + site.sizes.link_margin + THICKNESS), out, (half, THICKNESS, THICKNESS)
+    )
+    up = np.broadcast_to((0.0, 0.0, 1.0), (*lintel.shape[:2], 1, 3))
+    return Structures(
+        np.concatenate((wall.rows, lintel[:, :, None]), axis=2), np.concatenate((wall.retreat, up), axis=2)
+    )
+
+
+def cupboard(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a board under the path, and beside the path a side of a cupboard with the board on its top."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    side = _outwards(site)
+    gap, deep = between(GAP, u[..., 2] * (1.0 - site.hardness)), between(PANEL, u[..., 3])
+    low, top = site.place[..., 2] - _depth(u, site), site.place[..., 2] + 0.5 * between(ABOVE, u[..., 4])
+    long, panel = between(PANEL, u[..., 5]), site.place + (gap + THICKNESS)[..., None] * side
+    parts = [
+        _box(_at_height(panel, 0.5 * (low + top)), side, (THICKNESS, long, 0.5 * (top - low))),
+        _box(_at_height(panel + deep[..., None] * side, top + THICKNESS), side, (deep, long, THICKNESS)),
+        _box(_at_height(site.place, low - THICKNESS), side, (gap + THICKNESS, long, THICKNESS)),
+    ]
+    return _structures(parts, [side, side, DOWN])
+
+
+def cage(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a cage of bars around start or goal, open above: four posts and four rails, which retreat downwards."""
+    u = uniforms.take(BUILDER_NUMBERS)
+    end, heading = _end(u, site), rotate(site.heading, 0.5 * np.pi * u[..., 1])
+    rim, size = end[..., 2] + between(RIM, u[..., 2]), between(BIN, u[..., 3:5])
+    parts, sides = [], (heading, left(heading))
+    for first in (-1.0, 1.0):
+        for second in (-1.0, 1.0):
+            corner = end + first * size[..., :1] * sides[0] + second * size[..., 1:] * sides[1]
+            parts.append(_box(_at_height(corner, 0.5 * rim), heading, (THICKNESS, THICKNESS, 0.5 * rim)))
+        for axis, wide, along in ((sides[0], 0, 1), (sides[1], 1, 0)):
+            rail = _at_height(end + first * size[..., wide, None] * axis, rim + THICKNESS)
+            parts.append(_box(rail, axis, (THICKNESS, size[..., along], THICKNESS)))
+    return _structures(parts, [DOWN] * 8)
 
 
 def from_path(rows: Float, site: SpatialSite) -> Structures:
@@ -201,11 +301,16 @@ def _beam(u: Float, site: SpatialSite) -> Structures:
     """Return a bar over the links above the hand, across the path, from near the arm's base outwards."""
     d = site.sizes
     radius, half = between(d.bar_radius, u[..., 5]), between(d.beam_half_length, u[..., 2])
-    out = left(site.heading)
-    out = np.where((out * site.place).sum(axis=-1, keepdims=True) < 0.0, -out, out)
+    out = _outwards(site)
     middle = site.place + (half - d.beam_overlap)[..., None] * out
     row = _row(_at_height(middle, site.top + d.link_margin + radius), half[..., None] * out, radius)
     return Structures(row[:, :, None], np.broadcast_to((0.0, 0.0, 1.0), (*row.shape[:2], 1, 3)))
+
+
+def _outwards(site: SpatialSite) -> Float:
+    """Return horizontal unit vectors across the path, away from the arm's base, shape (N, K, 3)."""
+    out = left(site.heading)
+    return np.where((out * site.place).sum(axis=-1, keepdims=True) < 0.0, -out, out)
 
 
 def _depth(u: Float, site: SpatialSite) -> Float:
@@ -233,3 +338,42 @@ def _post(centre: Float, top: Float, radius: Float) -> Float:
 def _row(centre: Float, axis: Float, radius: Float) -> Float:
     """Return obstacles, shape (..., 7)."""
     return np.concatenate((centre, axis, radius[..., None]), axis=-1)
+
+
+def _more(u: Float, which: int) -> Float:
+    """Return further numbers in [0, 1), which are hashes of uniform numbers: five for each `which`."""
+    return np.asarray((u[..., 1:] * (97.0 + 14.0 * which) + u[..., :1] * (31.0 + 6.0 * which)) % 1.0)
+
+
+def _wall(u: Float, site: SpatialSite) -> Structures:
+    """Return two panels beside a gap, which retreat sideways, and a sill, which retreats downwards."""
+    across = left(site.heading)
+    width = between(GAP, u[..., 3] * (1.0 - site.hardness))
+    middle = site.place + (0.04 * (u[..., 4] - 0.5))[..., None] * across
+    top, sill = site.place[..., 2] + between(ABOVE, u[..., 5]), site.place[..., 2] - _depth(u, site)
+    parts = []
+    for sign, number in ((-1.0, u[..., 1]), (1.0, u[..., 2])):
+        half = between(PANEL, number)
+        panel = middle + (sign * (width + half))[..., None] * across
+        parts.append(_box(_at_height(panel, 0.5 * top), across, (half, THICKNESS, 0.5 * top)))
+    parts.append(_box(_at_height(middle, 0.5 * sill), across, (width, THICKNESS, 0.5 * sill)))
+    return _structures(parts, [-across, across, DOWN])
+
+
+def _end(u: Float, site: SpatialSite) -> Float:
+    """Return start or goal of each scene at each place, shape (N, K, 3), [m]."""
+    start, goal = (np.broadcast_to(end[:, None], site.place.shape) for end in (site.start, site.goal))
+    return np.where(u[..., 5:] < 0.5, start, goal)
+
+
+def _box(centre: Float, heading: Float, half: tuple[Float | float, ...]) -> Float:
+    """Return boxes with half lengths along the heading, to its left and upwards, at least 5 mm."""
+    sizes = np.stack([np.broadcast_to(np.maximum(each, 0.005), centre.shape[:-1]) for each in half], axis=-1)
+    return box_rows(centre, heading, sizes)
+
+
+def _structures(parts: list[Float], retreats: list[Float | tuple[float, ...]]) -> Structures:
+    """Return boxes and the directions of their retreat."""
+    rows = np.stack(parts, axis=-2)
+    each = [np.broadcast_to(retreat, rows[..., 0, :3].shape) for retreat in retreats]
+    return Structures(rows, np.stack(each, axis=-2))

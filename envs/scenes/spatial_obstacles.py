@@ -9,10 +9,11 @@ import numpy as np
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import squared_length
 from viapoint.envs.common.types import Bool, Float, Index, Int
+from viapoint.envs.geometry.rows import has_shapes, row_size, widened
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.draws import FeasiblePath, Uniforms, present_first, shuffle_rows, whole_between
 from viapoint.envs.scenes.families import scene_families
-from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS
+from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS, LARGEST_HALF_LENGTH
 from viapoint.envs.scenes.spatial_families import BUILDER_NUMBERS, SpatialSite, draw_obstacles
 from viapoint.envs.scenes.swept_volume import LinkBodies, SweptVolume
 
@@ -45,6 +46,15 @@ class SpatialObstacles:
         self._rigid = np.array([family.rigid for family in self._families], dtype=np.int64)
 
     @property
+    def _row_size(self) -> int:
+        """Number of values of an obstacle."""
+        return row_size(3, self._distribution.shapes)
+
+    def _as_rows(self, rows: Float) -> Float:
+        """Return obstacles as rows of the distribution's kind."""
+        return rows if rows.shape[-1] == self._row_size else widened(rows)
+
+    @property
     def rows(self) -> int:
         """Greatest number of obstacles in a scene."""
         return self._distribution.n_obstacles[1]
@@ -64,7 +74,7 @@ class SpatialObstacles:
         """Return obstacles and which scenes are good."""
         number, least_most = len(feasible.start), self._distribution.n_obstacles
         if not self.rows:
-            return np.zeros((number, 0, 7)), np.ones(number, dtype=bool)
+            return np.zeros((number, 0, self._row_size)), np.ones(number, dtype=bool)
         general = uniforms.take(GENERAL)
         structures = uniforms.take_table(STRUCTURES, BUILDER_NUMBERS + 1)
         others, order = uniforms.take_table(OTHERS, BUILDER_NUMBERS + 1), uniforms.take(self.rows)
@@ -79,7 +89,7 @@ class SpatialObstacles:
         some = np.flatnonzero(fits.any(axis=-1) | (wanted == 0.0))
         # The links near the base are rarely the nearest ones: only chosen structures are compared with them.
         some = some[self._free(swept.inner.take(some), chosen[some, None])[:, 0]]
-        good, added = np.zeros(number, dtype=bool), np.zeros((number, self.rows, 7))
+        good, added = np.zeros(number, dtype=bool), np.zeros((number, self.rows, self._row_size))
         missing = np.maximum(wanted - (chosen[..., -1] > 0.0).sum(axis=-1), 0.0)
         added[some], good[some] = self._add(
             others[some], feasible.take(some), hardness[some], swept.take(some), missing[some]
@@ -94,15 +104,16 @@ class SpatialObstacles:
         site = self._site(feasible, u[..., -1], hardness, swept)
         used = np.unique(which)
         most = max(self._families[family].n_obstacles for family in used)
-        rows, retreat = np.zeros((*u.shape[:2], most, 7)), np.zeros((*u.shape[:2], most, 3))
+        rows = np.zeros((*u.shape[:2], most, self._row_size))
+        retreat = np.zeros((*u.shape[:2], most, 3))
         for family in used:
             some = which == family
             numbers = Uniforms(u[some, :, :BUILDER_NUMBERS])
             built = self._families[family].build(numbers, site.take(some))
             parts = slice(built.rows.shape[2])
-            rows[some, :, parts], retreat[some, :, parts] = built
+            rows[some, :, parts], retreat[some, :, parts] = self._as_rows(built.rows), built.retreat
         enough = self._distribution.link_margin + 0.002
-        clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, 7), enough)
+        clearance = swept.outer.every_other().clearance(rows.reshape(len(u), -1, self._row_size), enough)
         lacking = np.maximum((enough - clearance).reshape(rows.shape[:3]), 0.0)
         rigid = np.arange(most) < self._rigid[which][:, None, None]
         together = np.where(rigid, lacking, 0.0).max(axis=-1, keepdims=True)
@@ -178,7 +189,7 @@ class SpatialObstacles:
         away = self._distribution.spread * (2.0 * u[..., 3:6] - 1.0)
         centre = np.where(near_line[..., None], site.on_line(u[..., -1]), site.place) + away
         centre[..., 2] = np.maximum(centre[..., 2], 0.02)
-        return draw_obstacles(self._distribution, centre, u[..., [0, 1, 2, 4, 5, 3]])
+        return self._as_rows(draw_obstacles(self._distribution, centre, u[..., [0, 1, 2, 4, 5, 3]]))
 
     def _room(self, bodies: LinkBodies, rows: Float, most: float, **limits: Any) -> Float:
         """Return the clearance that each obstacle has to spare, shape (N, n), [m]; it must be greater at the ends."""
@@ -190,7 +201,7 @@ class SpatialObstacles:
         """Return which of K structures, shape (N, K, n, 7), leave room for the links and are within bounds."""
         number, several, parts = built.shape[:3]
         inside = np.asarray((_within_bounds(built) | (built[..., -1] <= 0.0)).all(axis=-1))
-        rows = np.where(inside[..., None, None], built, 0.0).reshape(number, several * parts, 7)
+        rows = np.where(inside[..., None, None], built, 0.0).reshape(number, several * parts, self._row_size)
         return np.asarray(inside & (self._room(bodies, rows, SOME, floor=0.0, together=parts) > 0.0))
 
     def _keep_blocking(self, fits: Bool, feasible: FeasiblePath, built: Float) -> None:
@@ -215,7 +226,8 @@ class SpatialObstacles:
 def _within_bounds(rows: Float) -> Bool:
     """Return which obstacles are no farther away and no longer than scenes allow."""
     x, y, z = (np.abs(rows[..., axis]) < FARTHEST_CENTRE for axis in range(3))
-    return np.asarray(x & y & z & (squared_length(rows[..., 3:6]) < LARGEST_HALF_AXIS**2))
+    longest = LARGEST_HALF_LENGTH if has_shapes(rows) else LARGEST_HALF_AXIS
+    return np.asarray(x & y & z & (squared_length(rows[..., 3:6]) < longest**2))
 
 
 def _move_towards(rows: Float, place: Float, distance: Float) -> Float:

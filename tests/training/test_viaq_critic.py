@@ -439,7 +439,7 @@ def test_algorithms_of_sb3_learn_with_a_minimum_critic(algorithm, policy):
 
 
 def shape_pairs(count=64):
-    """Bodies near obstacles of all kinds: vectors to the obstacles, axes of the bodies, and columns of the obstacles."""
+    """Bodies near obstacles of all kinds: vectors to the obstacles, axes of the bodies, and obstacles' columns."""
     generator = np.random.default_rng(0)
     rows = np.concatenate([random_obstacles(kind, np.zeros((count, 3)), generator) for kind in KINDS])
     parts = whole_obstacles(rows[:, None], KINDS)
