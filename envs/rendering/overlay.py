@@ -8,8 +8,10 @@ import numpy as np
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, point_distance_squared
+from viapoint.envs.geometry.rows import has_shapes, pair_distance
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
 
@@ -85,5 +87,9 @@ def first_contact(
     body, obstacle = (int(i) for i in np.unravel_index(clearance.argmin(), clearance.shape))
     ends = links[0, 0, body - 1] if body else hand[0]
     points = ends[0] + np.linspace(0.0, 1.0, 200)[:, None] * (ends[-1] - ends[0])
-    nearest = point_distance_squared(points, scene.obstacles[0, obstacle : obstacle + 1]).argmin()
+    row = scene.obstacles[0, obstacle : obstacle + 1]
+    if has_shapes(row):
+        nearest = pair_distance(np.tile(row, (len(points), 1)), in_space(points)).argmin()
+    else:
+        nearest = point_distance_squared(points, row).argmin()
     return FirstContact(step, obstacle, body - 1 if body else None, points[nearest])

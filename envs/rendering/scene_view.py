@@ -11,6 +11,8 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.shapes import GLOWING, ShapeWriter, resampled
 from viapoint.envs.scenes.scene import Scenes
@@ -149,10 +151,14 @@ class SceneView:
             shapes.ball(start, 0.010, PALETTE.start, GLOWING)
 
     def _draw_obstacles(self, shapes: ShapeWriter, scene: Scenes, in_contact: int | None) -> None:
-        """Draw obstacles as capsules, those of the plane as upright posts and walls with the same footprint."""
+        """Draw obstacles; those of the plane are upright, capsules among them posts and walls."""
         dimension, top = self.arm.dimension, TALL if self.whole_arm else LOW
         for row in np.flatnonzero(scene.present[0]):
             numbers = scene.obstacles[0, row]
+            kind, *_ = shape_columns(numbers)
+            if has_shapes(numbers) and kind != list(SHAPES).index("capsule"):
+                self._draw_shape(shapes, numbers, PALETTE.contact if row == in_contact else PALETTE.obstacle)
+                continue
             centre, radius = in_space(numbers[:dimension], self._floor), float(numbers[-1])
             half_axis = in_space(numbers[dimension : 2 * dimension], 0.0)
             colour: Colour = PALETTE.contact if row == in_contact else PALETTE.obstacle
@@ -164,6 +170,19 @@ class SceneView:
                 shapes.wall(centre, half_axis, top, radius, colour)
             else:
                 shapes.post(centre, top, radius, colour)
+
+    def _draw_shape(self, shapes: ShapeWriter, row: Float, colour: Colour) -> None:
+        """Draw an obstacle by its MuJoCo geoms, in the plane from the table up to the height of the others."""
+        kind, centre, quaternion, half = shape_columns(row)
+        shape = list(SHAPES.values())[int(kind)]
+        if self.arm.dimension == 2 and rotation_axes(quaternion)[2][2] ** 2 > 0.5:
+            top = TALL if self.whole_arm else LOW
+            centre = np.array([*centre[:2], 0.5 * (self._floor + top)])
+            half = np.array([*half[:2], 0.5 * (top - self._floor)])
+        for geom in shape.from_box(centre, quaternion, half).geoms():
+            shapes.geom(
+                geom.type, geom.size, geom.position, np.stack(rotation_axes(geom.quaternion), axis=-1), colour
+            )
 
     def _draw_movement(self, shapes: ShapeWriter, movement: Movement, step: int) -> None:
         """Draw the planned path, its via-points, and the executed path up to `step`, red after the first contact."""

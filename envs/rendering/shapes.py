@@ -78,6 +78,10 @@ class ShapeWriter:
         middle = np.array([*foot[:2], (foot[2] + crest) / 2.0])
         self._add(Shape.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
 
+    def geom(self, kind: int, size: tuple[float, ...], centre: Float, turn: Float, colour: Colour) -> None:
+        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; the columns of `turn` (3, 3) are its axes."""
+        self._add(kind, size, centre, colour, MATT, turn)
+
     def _add(
         self,
         kind: int,

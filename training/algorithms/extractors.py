@@ -104,7 +104,7 @@ class SceneExtractor(BaseFeaturesExtractor):
         frame = torch.eye(3, dtype=rows.dtype, device=rows.device).repeat(len(rows), 1, 1, 1)
         frame[:, 0, :d, :d] = axes
         origin = nn.functional.pad(middle, (0, 3 - d)).unsqueeze(1)
-        sizes = (rows.shape[-1] - 13, 3, 3, 3, 3)
+        sizes = [rows.shape[-1] - 13, 3, 3, 3, 3]
         kind, centre, first, second, half = torch.split(rows[..., :-1], sizes, dim=-1)
         place = POSITION_SCALE * _turned(frame, centre - origin)
         turned = (_turned(frame, each) for each in (first, second))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.mjcf import joint_frames
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.rows import dimension_of, has_shapes, obstacles_from_rows, shape_columns
 
 SIDES = 8
 """Sides of a tube."""
@@ -77,14 +78,16 @@ def _tube_faces(number: int) -> NDArray[np.integer[Any]]:
 
 
 def obstacle_mesh(row: Float, floor: float, height: float) -> Triangles:
-    """Return the mesh of an obstacle about its centre: a capsule, in the plane a wall with a capsule's footprint.
+    """Return the mesh of an obstacle about its centre, in the plane a wall with its footprint.
 
     Args:
-        row: Centre (D), half-axis (D) and radius, [m].
+        row: Row of either kind, see :mod:`viapoint.envs.geometry.rows`, [m].
         floor: Height of the table of a planar arm, [m].
         height: Height up to which an obstacle of the plane rises, [m].
     """
-    d = (len(row) - 1) // 2
+    if has_shapes(row):
+        return _shape_mesh(row, floor, height)
+    d = dimension_of(row)
     half, radius = row[d : 2 * d], float(row[-1])
     if d == 3:
         return _capsule(half, radius)
@@ -96,6 +99,22 @@ def obstacle_mesh(row: Float, floor: float, height: float) -> Triangles:
     ahead = np.array([length, 0.0])
     outline = np.concatenate((ahead + arc, -ahead - arc)) @ turn.T
     return _prism(outline, floor, height)
+
+
+def _shape_mesh(row: Float, floor: float, height: float) -> Triangles:
+    """Return the mesh of an obstacle of any shape; of a half-space, that of its box in space."""
+    (shape,) = obstacles_from_rows(row[None])
+    centre, half = shape_columns(row)[1], shape_columns(row)[3]
+    if dimension_of(row) == 2:
+        (outline,) = shape.footprint()
+        return _prism(outline - centre[:2], floor, height)
+    if shape.kind == "half_space":
+        points = half * trimesh.creation.box(extents=(2.0, 2.0, 2.0)).vertices @ shape.rotation.T
+    else:
+        directions = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
+        points = shape._support(directions @ shape.rotation) @ shape.rotation.T
+    hull = trimesh.convex.convex_hull(points)
+    return Triangles(np.asarray(hull.vertices), np.asarray(hull.faces))
 
 
 def _prism(outline: Float, low: float, high: float) -> Triangles:

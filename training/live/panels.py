@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.palette import PALETTE, Colour
+from viapoint.training.live.obstacle_editing import BOX_SIZES
 
 if TYPE_CHECKING:
     import viser
@@ -278,8 +279,9 @@ class Panels:
         gui, actions = self._gui, self._actions
         self._selected = gui.add_html("")
         bounds = {"radius": (0.01, 0.1, 0.001), "half-length": (0.0, 0.3, 0.005)}
+        bounds |= dict.fromkeys(BOX_SIZES, (0.005, 0.5, 0.005))
         bounds |= {"heading": (-90.0, 90.0, 1.0), "elevation": (-90.0, 90.0, 1.0)}
-        units = {"radius": "m", "half-length": "m", "heading": "deg", "elevation": "deg"}
+        units = {**dict.fromkeys(bounds, "m"), "heading": "deg", "elevation": "deg"}
         self._sizes = {
             name: gui.add_slider(f"{name.capitalize()} [{units[name]}]", *limits, limits[0], visible=False)
             for name, limits in bounds.items()

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.rows import (
+    CAPSULES,
+    has_shapes,
+    obstacle_rows,
+    obstacles_from_rows,
+    row_size,
+)
 from viapoint.envs.geometry.shapes import as_obstacle
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
@@ -20,8 +24,6 @@ FORMAT = "viapoint-scene"
 """Value of the key `format` of a scene file."""
 LARGEST_FILE = 1 << 20
 """Greatest size of a scene file, [bytes]."""
-FLAT = 1e-6
-"""Greatest height of an obstacle of a planar arm, [m]."""
 DIGITS = 6
 """Decimal places of coordinates in files and in code, [m]."""
 
@@ -34,7 +36,7 @@ class LiveScene(NamedTuple):
     goal: Float
     """Shape (D,), [m]."""
     obstacles: Float
-    """Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]."""
+    """Rows of either kind, shape (n, .), [m], see :mod:`viapoint.envs.geometry.rows`."""
     courses: Float
     """Rows (velocity D, time, velocity D), shape (n, 2 D + 1), [m/s] and [s]; zero for obstacles at rest."""
     jumps: Float
@@ -71,7 +73,7 @@ class LiveScene(NamedTuple):
 
     def with_obstacle(self, numbers: Float) -> LiveScene:
         """Return the scene with one more obstacle at rest."""
-        course = np.zeros((1, len(numbers)))
+        course = np.zeros((1, self.courses.shape[-1]))
         return self._replace(
             obstacles=np.concatenate((self.obstacles, numbers[None])),
             courses=np.concatenate((self.courses, course)),
@@ -99,7 +101,8 @@ def to_json(scene: LiveScene, env_id: str) -> str:
     record: dict[str, Any] = {"format": FORMAT, "env": env_id}
     record |= {"start": _rounded(scene.start), "goal": _rounded(scene.goal), "obstacles": []}
     for row, course in zip(scene.obstacles, scene.courses, strict=True):
-        one = shape_of(row).to_dict()
+        (shape,) = obstacles_from_rows(row[None])
+        one = shape.to_dict()
         if course.any():
             one["course"] = _rounded(course)
         record["obstacles"].append(one)
@@ -108,12 +111,13 @@ def to_json(scene: LiveScene, env_id: str) -> str:
     return json.dumps(record, indent=1) + "\n"
 
 
-def from_json(text: str | bytes, dimension: int) -> LiveScene:
+def from_json(text: str | bytes, dimension: int, shapes: Sequence[str] = CAPSULES) -> LiveScene:
     """Return the scene of a JSON file; whether a movement can start and end in it is checked later.
 
     Args:
         text: Content of the file.
         dimension: Dimension D of the arm's space.
+        shapes: Names of the shapes that obstacles may have.
 
     Raises:
         ValueError: The text is no scene file, or a value has another shape or is not finite.
@@ -129,10 +133,10 @@ def from_json(text: str | bytes, dimension: int) -> LiveScene:
     obstacles = record.get("obstacles", [])
     if not isinstance(obstacles, list):
         raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
-    size = 2 * dimension + 1
-    rows, courses = np.zeros((len(obstacles), size)), np.zeros((len(obstacles), size))
+    rows = np.zeros((len(obstacles), row_size(dimension, shapes)))
+    courses = np.zeros((len(obstacles), 2 * dimension + 1))
     for i, each in enumerate(obstacles):
-        rows[i], courses[i] = _obstacle(i, each, dimension)
+        rows[i], courses[i] = _obstacle(i, each, dimension, shapes)
     jumps = _numbers("jumps", record.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
     start, goal = (_numbers(name, record.get(name), (dimension,)) for name in ("start", "goal"))
     return LiveScene(start, goal, rows, courses, jumps)
@@ -148,40 +152,25 @@ def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, c
     for name, value in options.items():
         if value.ndim == 1:
             lines.append(f'    "{name}": {_rounded(value)},  # [m]')
+        elif name == "obstacles" and has_shapes(value):
+            each = (shape.to_dict() for shape in obstacles_from_rows(value))
+            lines += [f'    "{name}": [', *(f"        {record}," for record in each), "    ],"]
         else:
             lines += [f'    "{name}": [', *(f"        {_rounded(row)}," for row in value), "    ],"]
     lines += ["}", "observation, info = env.reset(options=options)"]
     return "\n".join(lines) + "\n"
 
 
-def shape_of(row: Float) -> Shape:
-    """Return the shape of an obstacle, from its row of centre (D), half-axis (D) and radius, [m]."""
-    d = (len(row) - 1) // 2
-    centre, half, radius = row[:d], row[d : 2 * d], float(row[-1])
-    if half.any():
-        return Capsule.between(centre - half, centre + half, radius)
-    return Sphere(radius, position=in_space(centre))
-
-
-def _row_of(shape: Shape, dimension: int) -> Float:
-    """Return the row of a shape that environments can have."""
-    half = shape.half_axis if isinstance(shape, Capsule) else np.zeros(3)
-    if not isinstance(shape, Sphere | Capsule):
-        raise ValueError(f"environments have spheres and capsules, got a {shape.kind}")
-    if dimension == 2 and (abs(shape.position[2]) > FLAT or abs(half[2]) > FLAT):
-        raise ValueError(f"obstacles of a planar arm lie in the plane z = 0, got {shape.to_dict()}")
-    return np.array([*shape.position[:dimension], *half[:dimension], shape.radius], dtype=np.float64)
-
-
-def _obstacle(i: int, record: Any, dimension: int) -> tuple[Float, Float]:
+def _obstacle(i: int, record: Any, dimension: int, shapes: Sequence[str]) -> tuple[Float, Float]:
     """Return row and course of an obstacle of a file."""
     course, rest = None, record
     if isinstance(record, Mapping):
         course, rest = record.get("course"), {name: v for name, v in record.items() if name != "course"}
     try:
-        row = _row_of(as_obstacle(rest), dimension)
+        (row,) = obstacle_rows([as_obstacle(rest)], dimension, shapes)
     except ValueError as error:
-        raise ValueError(f"obstacle {i} of the scene file: {error}") from None
+        reason = str(error).removeprefix("obstacle 0: ")
+        raise ValueError(f"obstacle {i} of the scene file: {reason}") from None
     size = 2 * dimension + 1
     return row, _numbers(f"obstacle {i}: course", np.zeros(size) if course is None else course, (size,))
 

@@ -262,7 +262,7 @@ class Session:
         self._set_scene(self._scene.with_row(row, numbers), changed=True)
 
     def _add(self, shape: str) -> None:
-        scene = self._scene.with_obstacle(new_obstacle(self._scene, shape))
+        scene = self._scene.with_obstacle(new_obstacle(self._scene, shape, self._task.scenes.shapes))
         most = self._task.observation.n_rows
         if len(scene.obstacles) > most:
             raise ValueError(f"{self._shared.env_id} has at most {most} obstacles")
@@ -429,7 +429,7 @@ class Session:
     # Files
 
     def _load(self, content: bytes) -> None:
-        scene = from_json(content, self._task.arm.dimension)
+        scene = from_json(content, self._task.arm.dimension, self._task.scenes.shapes)
         for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
             if wrong.any():
                 raise ValueError(f"the scene file is impossible: {reason(0)}")

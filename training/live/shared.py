@@ -14,7 +14,7 @@ from viapoint.training.live.comparison import Comparison
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
-from viapoint.training.live.obstacle_editing import SHAPES
+from viapoint.training.live.obstacle_editing import obstacle_kinds
 from viapoint.training.live.panels import Facts
 from viapoint.training.live.scene_draws import Draw, scene_kinds
 from viapoint.training.rollouts.step_rollout import is_step_wise, whole_task
@@ -87,7 +87,8 @@ class Shared:
         if self.agent is not None:
             who = f"agent: {type(self.agent).__name__}"
         return Facts(
-            title=self.env_id.removeprefix("viapoint/"), subtitle=who, scene_kinds=kinds, shapes=SHAPES,
-            n_via=own, most_vias=own if self.task.replanning else max(MOST_VIAS, own),
+            title=self.env_id.removeprefix("viapoint/"), subtitle=who, scene_kinds=kinds,
+            shapes=obstacle_kinds(self.task.scenes.shapes), n_via=own,
+            most_vias=own if self.task.replanning else max(MOST_VIAS, own),
             duration_range=self.task.action.duration_range, ranks=self.decisions.ranks, spatial=self.task.spatial,
         )  # fmt: skip

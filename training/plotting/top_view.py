@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
+from scipy.spatial import ConvexHull
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.rows import has_shapes, obstacles_from_rows
 from viapoint.envs.rendering.overlay import FirstContact, Movement
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
@@ -78,6 +80,14 @@ def capsule(first: Float, second: Float, radius: float) -> Float:
     return np.concatenate((second[:2] + arc, first[:2] - arc))
 
 
+def widened_outline(outline: Float, distance: float) -> Float:
+    """Return the outline of all points within a distance of a convex outline, shape (K, 2) both, [m]."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
+    circle = distance * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    points = (outline[:, None] + circle).reshape(-1, 2)
+    return np.asarray(points[ConvexHull(points).vertices])
+
+
 def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) -> None:
     axes.set(xlim=view[0], ylim=view[1], xticks=[], yticks=[], aspect="equal", facecolor=PALETTE.table)
     for spine in axes.spines.values():
@@ -94,6 +104,13 @@ def _draw_obstacles(axes: Axes, arm: Arm, scene: Scenes, touched: int | None) ->
         numbers = scene.obstacles[0, row]
         centre, half_axis = numbers[: arm.dimension], numbers[arm.dimension : 2 * arm.dimension]
         colour: Colour = PALETTE.contact if row == touched else PALETTE.obstacle
+        if has_shapes(numbers):
+            (shape,) = obstacles_from_rows(numbers[None])
+            for outline in shape.footprint():
+                rim = widened_outline(outline, arm.hand_radius)
+                axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
+                axes.add_patch(Polygon(outline, facecolor=colour, linewidth=0, zorder=3))
+            continue
         ends = centre - half_axis, centre + half_axis
         rim = capsule(*ends, numbers[-1] + arm.hand_radius)
         axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
