@@ -56,7 +56,8 @@ def new_obstacle(scene: LiveScene, shape: str, shapes: Sequence[str] = CAPSULES)
             half = 0.06 * aside
     if shape not in CAPSULE_KINDS:
         size = np.full((1, 3), 0.03)
-        return shape_rows(shape, centre[None], np.array([[1.0, 0.0, 0.0, 0.0]]), _fitting(shape, size, d))[0]
+        (row,) = shape_rows(shape, centre[None], np.array([[1.0, 0.0, 0.0, 0.0]]), _fitting(shape, size, d))
+        return np.asarray(row)
     row = np.array([*centre, *half, 0.025 if d == 2 else 0.035])
     return row if tuple(shapes) == CAPSULES else widened(row)
 
@@ -112,7 +113,8 @@ def _resized_shape(row: Float, name: str, value: float) -> Float:
         w, x, y, z = quaternion
         c, s = np.cos(turn), np.sin(turn)
         quaternion = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
-    return shape_rows(kind, centre[None, :d], quaternion[None], _fitting(kind, half[None], d))[0]
+    (turned,) = shape_rows(kind, centre[None, :d], quaternion[None], _fitting(kind, half[None], d))
+    return np.asarray(turned)
 
 
 def _fitting(kind: str, half: Float, dimension: int) -> Float:
