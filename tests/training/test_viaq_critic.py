@@ -450,7 +450,7 @@ def shape_pairs(count=64):
 
 
 def test_features_of_shapes_do_not_change_with_the_symmetries_of_their_boxes():
-    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), 8), shape_pairs()
+    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), True), shape_pairs()
     wanted = torch.stack(pairs.features(apart, axis, columns))
     assert wanted.shape == (pairs.inputs, 64 * len(KINDS))
     for flipped in range(3):  # a frame with one axis reversed is that of the same box
@@ -464,7 +464,7 @@ def test_features_of_shapes_do_not_change_with_the_symmetries_of_their_boxes():
 
 
 def test_round_shapes_may_turn_about_their_axis():
-    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), 8), shape_pairs()
+    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), True), shape_pairs()
     first, second = (torch.stack(columns[i : i + 3]) for i in (0, 3))
     other = [*(0.6 * first + 0.8 * second), *(0.6 * second - 0.8 * first), *columns[6:]]
     wanted, again = (torch.stack(pairs.features(apart, axis, each)) for each in (columns, other))
