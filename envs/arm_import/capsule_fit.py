@@ -29,7 +29,7 @@ ROUNDING = 1e-6
 SHORTEST = 1e-3
 """Length of the axis below which a capsule becomes a sphere, [m]."""
 RIM_POINTS = 24
-"""Corners of the prism around a cylinder, and of each ring around an ellipsoid."""
+"""Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder."""
 CUTS = (0.35, 0.5, 0.65)
 """Places of the planes that cut a body, as shares of its length along a principal axis."""
 LEAST_SHARE = 0.3
@@ -64,44 +64,55 @@ def cover_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, tolerance:
         tolerance: Greatest distance of a point of the capsules from the geom, [m].
 
     Raises:
-        ValueError: The geom needs more than MOST_CAPSULES capsules.
+        ValueError: The geom needs more than MOST_CAPSULES capsules, or is flat.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
         half = size[1] * turn[:, 2] if kind == Geom.mjGEOM_CAPSULE else np.zeros(3)
         return [Capsule(np.stack((place - half, place + half)), float(size[0]), 0.0)]
-    corners = corners_of(model, geom)
+    corners, larger = polytope_around(model, geom)
     if not len(corners):
         return []
-    found = cover_points(corners, tolerance)
-    return [each._replace(ends=place + each.ends @ turn.T) for each in found]
+    try:
+        found = cover_points(corners, tolerance - larger)
+    except ValueError as error:
+        raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
+    return [Capsule(place + each.ends @ turn.T, each.radius, each.excess + larger) for each in found]
 
 
-def corners_of(model: mujoco.MjModel, geom: int) -> Float:
-    """Return points whose convex hull contains a geom, in the geom's frame, shape (n, 3), [m].
+def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
+    """Return the corners of a polytope that contains a geom, in the geom's frame, shape (n, 3), and its excess, [m].
 
-    The polytopes around cylinders and ellipsoids are up to 0.9 % and 1.8 % larger. Geoms that are neither boxes,
-    cylinders, ellipsoids nor meshes have no points.
+    The excess is an upper bound of the distance of the corners from the geom. It is 0 for boxes and the convex hulls of
+    meshes. Geoms that are neither these nor cylinders and ellipsoids have no corners.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
-    angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    wide = 1.0 / np.cos(np.pi / RIM_POINTS)
-    rim = np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1) * (wide, wide, 1.0)
     if kind == Geom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
-        return np.asarray(model.mesh_vert[first : first + model.mesh_vertnum[mesh]], np.float64)
+        return np.asarray(model.mesh_vert[first : first + model.mesh_vertnum[mesh]], np.float64), 0.0
     if kind == Geom.mjGEOM_BOX:
-        return np.asarray(size * np.array(list(itertools.product((-1.0, 1.0), repeat=3))))
+        return np.asarray(size * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))), 0.0
     if kind == Geom.mjGEOM_CYLINDER:
-        return np.concatenate([size[0] * rim + (0.0, 0.0, side * size[1]) for side in (-1.0, 1.0)])
+        rim = _rim(2 * RIM_POINTS)
+        corners = np.concatenate([size[0] * rim + (0.0, 0.0, side * size[1]) for side in (-1.0, 1.0)])
+        return corners, float(size[0] * (rim[0, 0] - 1.0))
     if kind == Geom.mjGEOM_ELLIPSOID:
+        rim = _rim(RIM_POINTS)
         heights = np.sin(np.pi * (np.arange(1, RIM_POINTS // 2) / (RIM_POINTS // 2) - 0.5))
         rings = [np.sqrt(1.0 - z * z) * rim + (0.0, 0.0, z) for z in heights]
         poles = np.array([(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
-        return np.asarray(size * wide * np.concatenate((*rings, poles)))
-    return np.empty((0, 3))
+        wide = rim[0, 0]
+        return np.asarray(size * wide * np.concatenate((*rings, poles))), float(size.max() * (wide**2 - 1.0))
+    return np.empty((0, 3)), 0.0
+
+
+def _rim(number: int) -> Float:
+    """Return the corners of a regular polygon around the unit circle, shape (number, 3)."""
+    angle = 2.0 * np.pi * np.arange(number) / number
+    wide = 1.0 / np.cos(np.pi / number)
+    return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
 def cover_points(points: Float, tolerance: float) -> list[Capsule]:

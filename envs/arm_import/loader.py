@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def load_arm(
     torque_limit: ArrayLike | None = None,
     velocity_limit: ArrayLike | None = None,
     hand_radius: float = 0.02,
-    tolerance: float = 0.025,
+    tolerance: float = 0.03,
 ) -> SerialArm:
     """Load an arm from an MJCF file.
 
@@ -146,6 +147,8 @@ def load_arm(
         workspace=as_box(corners),
         may_touch_itself=False,  # the whole reach was checked
     )
+    shape = (written._replace(excess=each.excess) for written, each in zip(arm.shape, capsules, strict=True))
+    arm = replace(arm, shape=tuple(shape))
     check_room(arm, table.box)
     check_strength(parsed, chain, *corner_configurations(arm))
     return arm
@@ -160,9 +163,9 @@ def _link_capsules(
     for index, (joint, frame) in enumerate(zip(parsed.joints, frames, strict=True)):
         moved = np.isin(model.geom_bodyid, bodies_moved_by(model, joint))
         for geom in np.flatnonzero(moved & collides if (moved & collides).any() else moved):
-            for ends, radius, _ in cover_geom(model, data, int(geom), tolerance):
+            for ends, radius, excess in cover_geom(model, data, int(geom), tolerance):
                 first, second = (in_frame(frame, end) for end in ends)
-                capsules.append(LinkCapsule(index, (first, second), radius))
+                capsules.append(LinkCapsule(index, (first, second), radius, excess=excess))
     if not capsules:
         raise ValueError(
             f"no geom moves with any of {', '.join(parsed.joints)}: nothing of the arm can collide"

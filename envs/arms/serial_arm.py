@@ -65,6 +65,8 @@ class LinkCapsule(NamedTuple):
     """Radius, [m]."""
     name: str = ""
     """Name of the geom."""
+    excess: float = 0.0
+    """Greatest distance of a point of the capsule from the geom that it was fitted to, [m]; 0 if it was not fitted."""
 
 
 class JointMotion(NamedTuple):

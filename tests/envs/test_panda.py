@@ -1,6 +1,10 @@
 """Laws of the arm with seven joints."""
 
 import dataclasses
+import itertools
+import json
+from importlib.resources import files
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -8,14 +12,20 @@ import pytest
 import torch
 
 from viapoint.envs.actions.via_points import ActionLayout
-from viapoint.envs.arms import PANDA
+from viapoint.envs.arms import PANDA, PANDA_FINE
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.arms.serial_arm import LIMIT_SHARE
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE, serial_arm
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.envs.single_env import ReachVectorEnv
 
+PANDA_FILE = files("viapoint.envs") / "assets" / "panda.xml"
+CAPSULE, BALL = 'fromto="0 0 -0.06 0 0 0.06" size="0.065"', 'type="sphere" pos="0 0 0.02" size="0.08"'
+WITH_SPHERES = serial_arm(
+    PANDA_FILE.read_text(encoding="utf-8").replace(CAPSULE, BALL), name="with-spheres", ik=PANDA.ik,
+    joint_names=PANDA.joint_names, hand_site="hand", workspace=PANDA.workspace,
+)  # fmt: skip
 LAYOUT = ActionLayout(dimension=3, duration_range=(1.0, 2.0))
 
 
@@ -180,26 +190,29 @@ def test_torque_limits_act():
     assert (greatest[:4] > 86.9).any()
 
 
-def test_contact_exactly_where_a_link_reaches_into_an_obstacle():
+@pytest.mark.parametrize("arm", [PANDA, PANDA_FINE, WITH_SPHERES], ids=lambda arm: arm.name)
+def test_contact_exactly_where_a_link_reaches_into_an_obstacle(arm):
     number, rng = 2000, np.random.default_rng(4)
-    places = rng.uniform(*np.array(PANDA.workspace), (number, 3))
+    places = rng.uniform(*np.array(arm.workspace), (number, 3))
     centre = places[:, None] + rng.uniform(-0.25, 0.25, (number, 3, 3))
     axis = rng.uniform(-0.12, 0.12, (number, 3, 3)) * (rng.random((number, 3, 1)) < 0.6)
     obstacles = np.concatenate((centre, axis, rng.uniform(0.01, 0.05, (number, 3, 1))), axis=-1)
     present = rng.random((number, 3)) < 0.6
-    simulator = Simulator(CollisionModel(PANDA, True), n_obstacles=3, num_envs=number, threads=1)
-    joints = PANDA.inverse_kinematics(places)
+    simulator = Simulator(CollisionModel(arm, True), n_obstacles=3, num_envs=number, threads=1)
+    joints = arm.inverse_kinematics(places)
     simulator.place(np.arange(number), joints, obstacles, present)
     contact = simulator.rollout(np.arange(number), np.zeros((number, 1, 10))).contact[:, 0]
-    clearance = arm_clearance(PANDA.links(joints)[:, None], PANDA.link_radii, obstacles, present).min(axis=-1)
+    clearance = arm_clearance(arm.links(joints)[:, None], arm.link_radii, obstacles, present).min(axis=-1)
+    clearance = np.minimum(clearance, arm.self_clearance(joints))
     np.testing.assert_array_equal(contact, clearance < 0.0)
     assert 0.1 < contact.mean() < 0.9
 
 
-def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itself_is_negative():
-    model, rng = PANDA.compile(0, whole_arm=True), np.random.default_rng(7)
-    data, joints = mujoco.MjData(model), rng.uniform(*np.array(PANDA.joint_range).T, (600, 7))
-    clearance, contact = PANDA.self_clearance(joints), np.zeros(600, dtype=bool)
+@pytest.mark.parametrize("arm", [PANDA, PANDA_FINE, WITH_SPHERES], ids=lambda arm: arm.name)
+def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itself_is_negative(arm):
+    model, rng = arm.compile(0, whole_arm=True), np.random.default_rng(7)
+    data, joints = mujoco.MjData(model), rng.uniform(*np.array(arm.joint_range).T, (600, 7))
+    clearance, contact = arm.self_clearance(joints), np.zeros(600, dtype=bool)
     for i, data.qpos[:] in enumerate(joints):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
@@ -207,15 +220,58 @@ def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itse
     np.testing.assert_array_equal(contact, clearance < 0.0)
     assert 0.2 < contact.mean() < 0.8
     batches = (
-        PANDA.self_clearance(joints.reshape(6, 100, 7)),
-        PANDA.self_clearance(torch.as_tensor(joints)).numpy(),
+        arm.self_clearance(joints.reshape(6, 100, 7)),
+        arm.self_clearance(torch.as_tensor(joints)).numpy(),
     )
     for batch in batches:
         np.testing.assert_allclose(batch.ravel(), clearance, atol=1e-12)
 
 
+def test_the_fine_panda_differs_from_the_other_in_its_geoms_alone():
+    fine, panda = PANDA_FINE.compile(2, True), PANDA.compile(2, True)
+    for name in (
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "body_pos",
+        "body_quat",
+        "jnt_range",
+        "jnt_actfrcrange",
+    ):
+        np.testing.assert_array_equal(getattr(fine, name), getattr(panda, name))
+    joints = np.random.default_rng(3).uniform(*np.array(PANDA.joint_range).T, (20, 7))
+    np.testing.assert_array_equal(PANDA_FINE.hand_position(joints), PANDA.hand_position(joints))
+    assert PANDA_FINE.link_joints == (0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 6, 6, 6, 6)
+
+
+def test_links_of_the_fine_panda_are_compared_unless_they_are_neighbours_or_never_touch():
+    every = (*PANDA_FINE.shape, *PANDA_FINE.base)
+    compared = {tuple(sorted((every[i].joint, every[j].joint))) for i, j in PANDA_FINE.self_pairs}
+    others = {(a, b) for b in range(7) for a in range(-1, b - 1)} - compared
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(every)), 2)
+        if tuple(sorted((every[i].joint, every[j].joint))) in others
+    ]
+    arm = dataclasses.replace(PANDA_FINE, self_pairs=tuple(pairs), off_table=())
+    joints = np.random.default_rng(5).uniform(*np.array(PANDA.joint_range).T, (5000, 7))
+    assert others == {(-1, 1), (-1, 2), (0, 2), (0, 3), (1, 3), (2, 4), (2, 5), (2, 6), (3, 5), (3, 6)}
+    assert arm.self_clearance(joints).min() > 0.0
+
+
+def test_measured_bounds_of_the_fine_panda():
+    """benchmarks/panda_collision.py: Franka's geometry is inside, and the links reach at most 25 mm beyond it."""
+    found = json.loads(
+        (Path(__file__).parents[2] / "docs" / "panda-collision.json").read_text(encoding="utf-8")
+    )
+    joints = [capsule.joint for capsule in (*PANDA_FINE.shape, *PANDA_FINE.base)]
+    assert [row["capsules"] for row in found] == [joints.count(joint) for joint in range(-1, 7)]
+    assert max(row["outside"] for row in found) == 0.0
+    assert max(row["excess"] for row in found[1:]) <= 25.0
+
+
 def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
-    joints = torch.as_tensor(np.random.default_rng(8).uniform(*np.array(PANDA.joint_range).T, (20, 7)))
+    joints = torch.as_tensor(np.random.default_rng(8).uniform(*np.array(PANDA.joint_range).T, (5, 7)))
     assert torch.autograd.gradcheck(PANDA.self_clearance, joints.requires_grad_(), atol=1e-4)
 
 

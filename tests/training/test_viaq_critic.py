@@ -1,6 +1,7 @@
 """Laws of the minimum critics, of what they learn from, and of learning without the geometry of obstacles."""
 
 import copy
+import dataclasses
 import inspect
 import itertools
 import sys
@@ -22,6 +23,7 @@ import viapoint.envs.sim.outcome
 import viapoint.training.search.geometry_search
 import viapoint.training.search.plan_checks
 import viapoint.training.search.planned_clearance
+from viapoint.envs.arms import PANDA, PANDA_FINE
 from viapoint.envs.registration import TASKS
 from viapoint.training.algorithms import pair_networks, viaq_policy
 from viapoint.training.algorithms.obstacle_parts import (
@@ -33,7 +35,7 @@ from viapoint.training.algorithms.obstacle_parts import (
     whole_obstacles,
 )
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.algorithms.pair_networks import PairMinimum
+from viapoint.training.algorithms.pair_networks import PairMinimum, networks_of
 from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
 from viapoint.training.algorithms.viaq import ViaQ
 from viapoint.training.algorithms.viaq_critic import Values, _Saturated
@@ -223,18 +225,40 @@ def test_the_minimum_is_that_of_all_bodies_instants_and_obstacles(networks):
         assert torch.allclose(network(poses, cut_obstacles(rows, present)), whole, atol=1e-5)
 
 
-def test_bodies_that_share_a_network_differ_by_their_size():
-    """Equal bodies have equal values in any order; a body of another size has another value."""
+def test_spheres_have_no_axis_and_arms_of_many_capsules_share_networks():
+    task = gym.make(SPACE).unwrapped.task
+    first, *rest = PANDA.shape
+    ball = first._replace(ends=(first.ends[0],) * 2)
+    round_arm = dataclasses.replace(task, arm=dataclasses.replace(PANDA, shape=(ball, *rest)))
+    path = np.random.default_rng(0).uniform(*np.array(PANDA.workspace), (1, 2, 4, 3))
+    poses = viaq_policy.planned_poses(round_arm, path, np.zeros((1, 2, 4)))
+    assert (poses.axis[0] == 0.0).all()
+    assert poses.half_length[0] == 0.0
+    part = torch.tensor([0.3, 0.4, 0.0])
+    along, away, *_ = pair_features(
+        list(part), list(poses.axis[0, :, 0, 0, 0]), list(torch.zeros(3)), torch.tensor(1.0)
+    )
+    assert along == 0.0
+    assert away == pytest.approx(0.5)
+    assert networks_of(task) == list(range(8))  # a network for each capsule
+    assert networks_of(dataclasses.replace(task, arm=PANDA_FINE)) == list(PANDA_FINE.link_joints)
+    assert networks_of(gym.make(PLANE).unwrapped.task) == []
+
+
+@pytest.mark.parametrize("size", ["half_length", "radius"])
+def test_bodies_that_share_a_network_differ_by_their_size(size):
+    """Of two bodies in one place one is longer or thicker: values differ, and they change places with the bodies."""
     poses, rows, network = scene(networks=(0, 0, 1))
     parts = cut_obstacles(rows, np.ones((4, 3), dtype=bool))
-    same = poses._replace(centre=poses.centre[[0, 0, 2]], axis=poses.axis[[0, 0, 2]])
-    scenes, rest = torch.nonzero(parts.present, as_tuple=True), slice(2, None)
-    values = network._values(same, parts, *scenes)
-    swapped = same._replace(half_length=poses.half_length[[1, 0, 2]], radius=poses.radius[[1, 0, 2]])
-    other = network._values(swapped, parts, *scenes)
+    scenes = torch.nonzero(parts.present, as_tuple=True)
+    same = poses._replace(**{each: getattr(poses, each)[[0, 0, 2]] for each in ("half_length", "radius")})
+    same = same._replace(centre=poses.centre[[0, 0, 2]], axis=poses.axis[[0, 0, 2]])
+    values, swapped = (
+        network._values(same._replace(**{size: getattr(poses, size)[order]}), parts, *scenes)
+        for order in ([0, 1, 2], [1, 0, 2])
+    )
     assert not torch.allclose(values[:, :, 0], values[:, :, 1])
-    assert torch.equal(values[:, :, 0], other[:, :, 1])
-    assert torch.equal(values[:, :, rest], other[:, :, rest])
+    assert torch.equal(values, swapped[:, :, [1, 0, 2]])
 
 
 @pytest.mark.parametrize("networks", [(), (0, 1), (0, 0, 1)])
