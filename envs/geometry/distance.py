@@ -41,7 +41,7 @@ def hand_clearance(points: Array, radius: float, obstacles: Array, present: Arra
     """
     if has_shapes(obstacles):
         return _shape_clearance(points, None, radius, obstacles, present)
-    xp = namespace_of(points)
+    xp = np if isinstance(points, np.ndarray) else namespace_of(points)  # mostly NumPy: without a call
     nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
     return _clearance(xp, nearest, obstacles[..., -1] + radius, present)
 
