@@ -23,8 +23,7 @@ from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_chang
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
 from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
 from viapoint.envs.sim.episode_state import Episodes
-from viapoint.envs.sim.executor import SETTLING
-from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome, straight_jerk_cost
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
 from viapoint.envs.vector_env import METADATA, Decision, ReachVectorEnv

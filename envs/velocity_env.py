@@ -19,8 +19,7 @@ from viapoint.envs.mdp.rewards import StepRewardWeights, step_rewards
 from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.episode_state import Episodes, Segment
-from viapoint.envs.sim.executor import SETTLING
-from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome, straight_jerk_cost
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.simulator import SimulationLog
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
 

@@ -14,6 +14,9 @@ from viapoint.primitives.array_api import Array, namespace_of
 
 N = TypeVar("N", bound=Numbers)
 
+TINY = 1e-12
+"""Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
+
 
 def clamp(values: Array, low: float, high: float) -> Array:
     """Return values limited to [low, high]; NumPy's method is several times as fast as its functions."""

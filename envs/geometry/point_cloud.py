@@ -8,9 +8,9 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import TINY
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array
-from viapoint.envs.geometry.segments import TINY
 from viapoint.envs.geometry.shape import (
     OUTLINE_POINTS,
     Components,

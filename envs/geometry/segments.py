@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from viapoint.envs.common.arrays import clamp, dot
+from viapoint.envs.common.arrays import TINY, clamp, dot
 from viapoint.primitives.array_api import Array, namespace_of
-
-TINY = 1e-12
-"""Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
 
 
 def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:

@@ -27,9 +27,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import clamp, dot, norm
+from viapoint.envs.common.arrays import TINY, clamp, dot, norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.segments import TINY
 from viapoint.primitives.array_api import (
     Array,
     Namespace,

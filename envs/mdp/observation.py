@@ -11,12 +11,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Float, Numbers, Observation
 from viapoint.envs.geometry.rows import CAPSULES, POSE_SIZE, observed_rows, rows_of_observed
-from viapoint.envs.scenes.dynamic_scene import FASTEST, ChangingScenes
 from viapoint.envs.scenes.scene import (
     FARTHEST_SHAPE,
+    FASTEST,
     LARGEST_HALF_AXIS,
     LARGEST_HALF_LENGTH,
     LARGEST_RADIUS,
@@ -26,6 +25,8 @@ from viapoint.primitives.array_api import Array
 
 if TYPE_CHECKING:
     from viapoint.envs.actions.replanning import NominalPlan
+    from viapoint.envs.arms.base import Arm
+    from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 
 FARTHEST = 1.0
 """Bound of every coordinate, [m]."""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.scenes.scene import Problem, Scenes, rest_clearance
+from viapoint.envs.scenes.scene import FASTEST, Problem, Scenes, rest_clearance
+
+if TYPE_CHECKING:
+    from viapoint.envs.arms.base import CollisionModel
 
 MOST_JUMPS = 4
 """Greatest number of jumps in an episode."""
-FASTEST = 1.0
-"""Greatest speed of an obstacle, [m/s]."""
 
 
 class ChangingScenes(NamedTuple):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
@@ -16,10 +15,15 @@ from viapoint.envs.geometry.rows import has_shapes, shape_columns, shape_rows
 from viapoint.envs.geometry.shape import UNIT_TOLERANCE
 from viapoint.envs.geometry.shapes import SHAPES
 
+if TYPE_CHECKING:
+    from viapoint.envs.arms.base import Arm, CollisionModel
+
 LARGEST_HALF_AXIS = 0.3
 """Greatest half length of a bar, [m]."""
 LARGEST_RADIUS = 0.1
 """Greatest radius of an obstacle, [m]."""
+FASTEST = 1.0
+"""Greatest speed of an obstacle, [m/s]."""
 FARTHEST_CENTRE = 1.0
 """Greatest coordinate of an obstacle's centre, [m]."""
 LARGEST_HALF_LENGTH, FARTHEST_SHAPE = 1.0, 2.0

@@ -15,6 +15,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import (
     GOAL_TOLERANCE,
     REST_SPEED,
+    SETTLING,
     Outcome,
     straight_jerk_cost,
     sum_in_order,
@@ -23,8 +24,6 @@ from viapoint.envs.sim.outcome import (
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
 from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
 
-SETTLING = 0.1
-"""Time after the movement in which the hand must come to rest, [s]."""
 GROUP = 64
 """Movements of one group: few enough for the processor's cache, many enough for the engine's threads."""
 

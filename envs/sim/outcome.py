@@ -5,17 +5,21 @@ Clearances come from :class:`~viapoint.envs.arms.base.CollisionModel`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float
+
+if TYPE_CHECKING:
+    from viapoint.envs.arms.base import Arm
 
 GOAL_TOLERANCE = 0.01
 """Greatest distance from the goal that counts as success, [m]."""
 REST_SPEED = 0.02
 """Greatest hand speed at the end that counts as rest, [m/s]."""
+SETTLING = 0.1
+"""Time after the movement in which the hand must come to rest, [s]."""
 LIMIT_TOLERANCE = 1e-3
 """Tolerance of MuJoCo's soft joint limits, [rad]."""
 

@@ -17,7 +17,7 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Int
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import SETTLING
 
 Trigger = Literal["horizon", "target", "course", "clearance"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from revised import DT, GOAL, MOVING, OTHER, events, make, play
 
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import SETTLING
 from viapoint.envs.sim.replan_triggers import FORESIGHT, LOOK, SAMPLED, Event
 
 

@@ -12,9 +12,10 @@ from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.mdp.rewards import ReplanningRewardWeights
 from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.replanning_env import ReplanningVectorEnv
-from viapoint.envs.scenes.dynamic_scene import FASTEST, MOST_JUMPS
+from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.motion import ChangeDistribution
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.scenes.scene import FASTEST
+from viapoint.envs.sim.outcome import SETTLING
 from viapoint.envs.sim.replan_triggers import FORESIGHT, LOOK, SAMPLED, Event
 from viapoint.envs.sim.replanning_executor import SIMILAR, SLACK
 

@@ -10,8 +10,7 @@ import pytest
 
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.envs.sim.executor import SETTLING
-from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING
 from viapoint.envs.velocity_env import VelocityVectorEnv
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments-step.md").read_text(encoding="utf-8")

@@ -14,8 +14,7 @@ from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.mdp.rewards import RewardTerms, RewardWeights, StepRewardWeights, reward_terms
 from viapoint.envs.registration import STEP_TASKS, twin_of
 from viapoint.envs.rendering.renderer import GLUnavailableError
-from viapoint.envs.sim.executor import SETTLING
-from viapoint.envs.sim.outcome import Outcome
+from viapoint.envs.sim.outcome import SETTLING, Outcome
 
 STEP = "viapoint/PlanarObstaclesStep-v0"
 START, GOAL = np.array([-0.3, 0.4]), np.array([0.1, 0.4])

@@ -17,7 +17,7 @@ from viapoint.envs.arms import ARMS
 from viapoint.envs.geometry.rows import CAPSULES, has_shapes
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import SETTLING
 from viapoint.training.algorithms.obstacle_parts import Poses, cut_obstacles, whole_obstacles
 from viapoint.training.algorithms.viaq_critic import (
     Form,

@@ -9,7 +9,7 @@ import numpy as np
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.planar import ADULT, PlanarArm
 from viapoint.envs.common.types import Float
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import SETTLING
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.primitives import Trajectory
 

@@ -13,7 +13,7 @@ from viapoint.envs.common.types import Index, Numbers, Single
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, weighted_terms
-from viapoint.envs.sim.executor import SETTLING
+from viapoint.envs.sim.outcome import SETTLING
 from viapoint.training.search.planned_clearance import (
     FRACTIONS,
     NODES,

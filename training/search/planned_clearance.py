@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import in_space, squared_length
 from viapoint.envs.common.types import Float, Index, Numbers, Single
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, point_distance_squared, segment_distance_squared
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
-from viapoint.training.search.planned_movements import Observation, PlannedMovements
 
 if TYPE_CHECKING:
+    from viapoint.envs.arms.base import Arm
     from viapoint.envs.mdp.task import Task
+    from viapoint.training.search.planned_movements import Observation, PlannedMovements
 
 NODES = 16
 """Instants at which every movement is sampled."""
