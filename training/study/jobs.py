@@ -11,6 +11,7 @@ OUT/<environment>/timings.json                              decision times
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import json
@@ -311,3 +312,30 @@ def stored(path: Path, wanted: Record) -> Record | None:
 def percent(record: Record) -> str:
     """Return the success of a measurement in words."""
     return f"{100.0 * record['summary']['success']['rate']:.1f} %"
+
+
+def path_of_times(env: Environment) -> str:
+    """Return the file of the decision times in an environment, below the folder of the study."""
+    return f"{env.folder}/timings.json"
+
+
+def times_of(study: Study, env: Environment) -> Record:
+    """Return the stored times by row."""
+    path = study.out / path_of_times(env)
+    return read_json(path) if path.is_file() else {}
+
+
+def of_equal_time(study: Study, env: Environment) -> list[Baseline]:
+    """Return the searches of equal time in an environment."""
+    return [each for each in study.baselines if each.time_of is not None and env.name in each.environments]
+
+
+def equal_time_pairs(study: Study) -> list[tuple[Baseline, Environment]]:
+    """Return the searches of equal time with the numbers of checks that were timed, and their environments."""
+    found = []
+    for env in study.environments:
+        times = times_of(study, env)
+        for baseline in of_equal_time(study, env):
+            if "checks" in times.get(baseline.name, {}):
+                found.append((dataclasses.replace(baseline, checks=times[baseline.name]["checks"]), env))
+    return found

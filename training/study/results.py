@@ -23,14 +23,15 @@ from viapoint.training.study.config import Agent, Baseline, Comparison, Environm
 from viapoint.training.study.jobs import (
     Cell,
     baseline_record,
+    equal_time_pairs,
     evaluation_path,
     identity_of,
     sets_of,
     state,
     stored,
+    times_of,
 )
 from viapoint.training.study.methods import Mode, modes
-from viapoint.training.study.timing import equal_time_pairs, times_of
 
 Numbers = dict[str, Any]
 Records = Mapping[str, Sequence[Numbers]]

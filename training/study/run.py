@@ -12,11 +12,11 @@ from viapoint.training.config.configs import StudyConfig
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.study.config import Environment, Study
 from viapoint.training.study.figures import draw_figures
-from viapoint.training.study.jobs import baseline_jobs, measured_files, pairs, training_jobs
+from viapoint.training.study.jobs import baseline_jobs, equal_time_pairs, measured_files, pairs, training_jobs
 from viapoint.training.study.page import write_pages
 from viapoint.training.study.results import Row, gather, rows_in
 from viapoint.training.study.runner import Job, Runner, make_runner
-from viapoint.training.study.timing import equal_time_pairs, remove_times, time_decisions
+from viapoint.training.study.timing import remove_times, time_decisions
 
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
 Report = Callable[[str], object]

@@ -10,13 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.training.algorithms.model_io import load_model
-from viapoint.training.io.files import read_json, write_json
+from viapoint.training.io.files import write_json
 from viapoint.training.planners.baselines import Method
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import one_thread
 from viapoint.training.study.config import Agent, Baseline, Environment, Study
-from viapoint.training.study.jobs import Cell, Record, identity, identity_of, sets_of, state
+from viapoint.training.study.jobs import (
+    Cell,
+    Record,
+    identity,
+    identity_of,
+    of_equal_time,
+    path_of_times,
+    sets_of,
+    state,
+    times_of,
+)
 from viapoint.training.study.methods import method_of, method_of_mode, modes
 
 N_TIMED = 100
@@ -39,17 +49,6 @@ class Timed(NamedTuple):
     """Function without arguments that returns the method."""
 
 
-def path_of_times(env: Environment) -> str:
-    """Return the file of the decision times in an environment, below the folder of the study."""
-    return f"{env.folder}/timings.json"
-
-
-def times_of(study: Study, env: Environment) -> Record:
-    """Return the stored times by row."""
-    path = study.out / path_of_times(env)
-    return read_json(path) if path.is_file() else {}
-
-
 def time_decisions(study: Study) -> Iterator[str]:
     """Time what has no time yet, and yield a line about each; trained agents are those of the first seed."""
     for env in study.environments:
@@ -60,7 +59,7 @@ def time_decisions(study: Study) -> Iterator[str]:
             times[row] = {"source": source, "median": median_time(study, env, make())}
             _write(study, env, times)
             yield f"{env.folder} {row}: {1e3 * times[row]['median']:.2f} ms"
-        for baseline in _of_equal_time(study, env):
+        for baseline in of_equal_time(study, env):
             if baseline.time_of not in times:
                 continue
             source = {"time_of": times[baseline.time_of], **_made(baseline, env)}
@@ -79,17 +78,6 @@ def remove_times(study: Study, env: Environment, row: str) -> bool:
         return False
     _write(study, env, times)
     return True
-
-
-def equal_time_pairs(study: Study) -> list[tuple[Baseline, Environment]]:
-    """Return the searches of equal time with the numbers of checks that were timed, and their environments."""
-    found = []
-    for env in study.environments:
-        times = times_of(study, env)
-        for baseline in _of_equal_time(study, env):
-            if "checks" in times.get(baseline.name, {}):
-                found.append((dataclasses.replace(baseline, checks=times[baseline.name]["checks"]), env))
-    return found
 
 
 def median_time(study: Study, env: Environment, method: Method) -> float:
@@ -134,10 +122,6 @@ def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: f
             return (between, tried) if tried <= seconds else (checks, took)
         checks, took = 2 * checks, longer
     return checks, took
-
-
-def _of_equal_time(study: Study, env: Environment) -> list[Baseline]:
-    return [each for each in study.baselines if each.time_of is not None and env.name in each.environments]
 
 
 def _to_time(study: Study, env: Environment) -> Iterator[Timed]:
