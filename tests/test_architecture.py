@@ -29,7 +29,7 @@ MAY_IMPORT = {
 }
 """`glfw` comes with MuJoCo, which opens its windows with it."""
 LONGEST_FILE, LONGEST_FUNCTION, LONGEST_CHAIN, MOST_MODULES = 500, 60, 20, 15
-"""Imports for type checkers do not count in chains; eight modules of the longest are arms and geometry and three studies."""
+"""Imports for type checkers do not count; eight modules of the longest are arms and geometry, and three studies."""
 
 
 def sources(folder):
