@@ -4,7 +4,9 @@
 
 takes about four minutes on two idle cores. Both nodes are on this machine. A round runs the same study in both ways,
 every other round in the opposite order, and compares weights and evaluations. The time of a run includes the start of
-the processes that train; the start of the nodes is a number of its own. Rounds are added to those in the file.
+the processes that train; the start of the nodes is a number of its own. Processor times are those of the command and
+of all processes that it or the nodes started; other load on the machine hardly changes them. Rounds are added to those
+in the file.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import contextlib
 import hashlib
 import json
 import os
+import resource
 import tempfile
 import time
 from collections.abc import Iterator
@@ -53,8 +56,8 @@ def study_in(folder: Path, trainings: int, decisions: int) -> Study:
 
 
 @contextlib.contextmanager
-def two_nodes() -> Iterator[None]:
-    """Start two nodes of one core each, which listen on 127.0.0.1, and connect to them."""
+def two_nodes() -> Iterator[Any]:
+    """Start two nodes of one core each, which listen on 127.0.0.1, connect to them, and return them."""
     ray = import_ray()
     from ray.cluster_utils import Cluster
 
@@ -63,23 +66,52 @@ def two_nodes() -> Iterator[None]:
     cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")
     ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
-        yield
+        yield cluster
     finally:
         ray.shutdown()
         cluster.shutdown()
 
 
+def processor_time(cluster: Any = None) -> float:
+    """Return the processor time of this process, of its children that have ended, and of the nodes, [s]."""
+    usage = [resource.getrusage(each) for each in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    total = sum(each.ru_utime + each.ru_stime for each in usage)
+    if cluster is None:
+        return total
+    import psutil  # part of Ray
+
+    started = [
+        each.process.pid
+        for node in cluster.list_all_nodes()
+        for some in node.all_processes.values()
+        for each in some
+    ]
+    processes = {
+        child
+        for pid in started
+        for child in [psutil.Process(pid), *psutil.Process(pid).children(recursive=True)]
+    }
+    return total + sum(sum(each.cpu_times()[:4]) for each in processes)
+
+
 def timed(way: str, trainings: int, decisions: int) -> dict[str, Any]:
-    """Run the study once; return its wall time and that of the start of the nodes, [s], and a hash of its results."""
+    """Run the study once; return times and a hash of its results.
+
+    Times are those of the start of the nodes, of the study, and the processor time of the study, [s].
+    """
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         began = time.perf_counter()
-        if way == "ray":
-            stack.enter_context(two_nodes())
-        ready = time.perf_counter()
+        cluster = stack.enter_context(two_nodes()) if way == "ray" else None
+        ready, worked = time.perf_counter(), processor_time(cluster)
         study = study_in(Path(folder), trainings, decisions)
         run_study(study, on=way, workers=2 if way == "local" else None, only=["train", "evaluate"])
-        ended = time.perf_counter()
-        return {"start_s": ready - began, "study_s": ended - ready, "sha256": results_hash(study.out)}
+        ended, done = time.perf_counter(), processor_time(cluster)
+        return {
+            "start_s": ready - began,
+            "study_s": ended - ready,
+            "processor_s": done - worked,
+            "sha256": results_hash(study.out),
+        }
 
 
 def results_hash(folder: Path) -> str:
@@ -90,6 +122,12 @@ def results_hash(folder: Path) -> str:
         if any(part in name for part in RESULTS) and "checkpoints" not in name:
             digest.update(name.encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def ratios(rounds: list[dict[str, Any]], name: str) -> dict[str, float]:
+    """Return the median, least and greatest time of local processes relative to that on Ray."""
+    found = [each["local"][name] / each["ray"][name] for each in rounds]
+    return {"median": float(np.median(found)), "least": min(found), "greatest": max(found)}
 
 
 def main() -> None:
@@ -117,10 +155,10 @@ def main() -> None:
                 flush=True,
             )
         rounds.append(found)
-    ratios = [each["local"]["study_s"] / each["ray"]["study_s"] for each in rounds]
     result = {
         "settings": settings,
-        "efficiency": {"median": float(np.median(ratios)), "least": min(ratios), "greatest": max(ratios)},
+        "efficiency": ratios(rounds, "study_s"),
+        "efficiency_processor": ratios(rounds, "processor_s"),
         "equal_results": len({each[way]["sha256"] for each in rounds for way in WAYS}) == 1,
         "rounds": rounds,
     }

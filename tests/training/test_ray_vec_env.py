@@ -20,13 +20,14 @@ from viapoint.training.io.ray_cluster import connect, import_ray
 from viapoint.training.rollouts import ray_actors
 
 OBSTACLES, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
-pytest.importorskip("ray")
+pytestmark = pytest.mark.usefixtures("no_hang")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def ray():
+def ray(ray_lock):
     """One Ray of two cores for all tests."""
-    connect(cpus=2)
+    with ray_lock:
+        connect(cpus=2)
     yield import_ray()
     import_ray().shutdown()
 

@@ -10,29 +10,29 @@ import pytest
 import runner_jobs
 
 from viapoint.training import Study, run_study
-from viapoint.training.io.ray_cluster import LOOPBACK, check_versions, import_ray
+from viapoint.training.io.ray_cluster import check_versions, import_ray
 from viapoint.training.study.jobs import baseline_jobs, pairs, training_jobs
 from viapoint.training.study.runner import Job, make_runner
 from viapoint.training.study.search_space import SearchSpace
 from viapoint.training.study.tuning import Tuning
 
+pytestmark = pytest.mark.usefixtures("no_hang")
+
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(ray_lock):
     """Two nodes of one core each, which listen on 127.0.0.1."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in LOOPBACK.items():
-            patch.setenv(name, value)
-        patch.setenv(
-            "PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-        )
+        paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(paths))
         ray = import_ray()
         from ray.cluster_utils import Cluster
 
         nodes = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
-        made = Cluster(initialize_head=True, head_node_args=nodes)
-        made.add_node(num_cpus=1, node_ip_address="127.0.0.1")
-        ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
+        with ray_lock:
+            made = Cluster(initialize_head=True, head_node_args=nodes)
+            made.add_node(num_cpus=1, node_ip_address="127.0.0.1")
+            ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
         yield made
         ray.shutdown()
         made.shutdown()
@@ -57,10 +57,6 @@ def results_in(folder):
     return found
 
 
-@pytest.mark.skipif(
-    "PYTEST_XDIST_WORKER" in os.environ,
-    reason="two clusters at once hang: run this file alone, without --numprocesses",
-)
 def test_a_study_has_the_same_results_as_on_this_machine(cluster, tmp_path):
     """One training is killed in the middle, and goes on from the checkpoint that the driver has."""
     agent = {

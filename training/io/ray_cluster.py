@@ -14,7 +14,8 @@ from viapoint.training.io.installed import installed
 SILENCE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_TQDM_PATCH_PRINT": "0"}
 """Environment variables of Ray: it sends nothing to its authors."""
 LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""Environment variable that makes a Ray of this machine listen on 127.0.0.1 alone."""
+"""Environment variable that keeps Ray on 127.0.0.1. Ray reads it when it is imported; without it, Ray replaces
+127.0.0.1 by another address of the machine, and waits there in vain for a cluster that listens on 127.0.0.1 alone."""
 
 
 def import_ray() -> Any:
@@ -39,7 +40,7 @@ def _has_token() -> bool:
 
 
 def connect(address: str | None = None, cpus: int | None = None) -> bool:
-    """Connect this process to a cluster, unless it is connected.
+    """Connect this process to a cluster, unless it is connected. Import Ray afterwards, as it reads settings then.
 
     Args:
         address: `ray://HOST:PORT`; None for the cluster of the environment variable RAY_ADDRESS, or without it for a
@@ -56,9 +57,10 @@ def connect(address: str | None = None, cpus: int | None = None) -> bool:
         return False
     address = address or os.environ.get("RAY_ADDRESS")
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address is None:
+    if address is None or address.startswith(("127.0.0.1:", "localhost:")):
         for name, value in LOOPBACK.items():
             os.environ.setdefault(name, value)
+    if address is None:
         settings |= {"num_cpus": cpus, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
         if address is not None:

@@ -13,7 +13,7 @@ SNAPSHOT_EVERY = 64
 """Commands between two snapshots of an actor's environments."""
 ATTEMPTS = 3
 """Actors that may die at the same point."""
-PATIENCE = 120.0
+PATIENCE = 300.0
 """Time that an actor has to start, [s]."""
 READS = (("get",), ("call", "observe"), ("call", "render"), ("call", "state"))
 """Commands that change nothing, with their first arguments."""
@@ -35,8 +35,8 @@ def join_cluster(on: str, workers: int) -> bool:
     """
     if on != "ray" and not on.startswith("ray://"):
         raise ValueError(f"on must be ray or ray://HOST:PORT, got {on!r}")
-    ray = import_ray()
     connected = connect(None if on == "ray" else on, workers)
+    ray = import_ray()
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))
         if cores < workers:

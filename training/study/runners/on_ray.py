@@ -70,9 +70,9 @@ class RayRunner:
     def __init__(self, root: Path, address: str | None = None, workers: int | None = None) -> None:
         if workers == 0:
             raise ValueError("workers must be 1 or more on a cluster, got 0")
-        self._ray = import_ray()
         self._root, self._workers = root, workers
         self._connected = connect(address, workers)
+        self._ray = import_ray()
         self._excluded: set[str] = set()
         try:
             check_nodes(ONE_THREAD)
