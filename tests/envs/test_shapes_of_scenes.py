@@ -167,7 +167,8 @@ def test_random_scenes_have_all_shapes_and_contact_is_negative_clearance(env_id,
     assert all(space[name].contains(part) for name, part in observation.items())
     *_, info = envs.step(np.zeros(envs.action_space.shape))
     assert info["collision"].mean() > 0.1
-    apart = np.abs(info["min_clearance"]) > 1e-4
+    # Physics sees the last state of a decision in the next one, when a moving obstacle is some millimetres farther.
+    apart = np.abs(info["min_clearance"]) > (2e-3 if "Moving" in env_id else 1e-4)
     assert ((info["min_clearance"] < 0.0) == info["collision"])[apart].all()
     state = envs.state()
     envs.step(np.zeros(envs.action_space.shape))

@@ -1,0 +1,128 @@
+"""Searches, planners and agents in scenes with obstacles of any shape."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+
+from viapoint.envs import Box, Cylinder, obstacles_from_rows
+from viapoint.envs.rendering.overlay import Movement
+from viapoint.training import GeometrySearch, SceneExtractor, ViaQ, ViaVecEnv
+from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy
+from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.plotting.top_view import widened_outline
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.search.candidates import candidate_actions
+from viapoint.training.search.plan_checks import check_plans
+
+PANDA, PLANE, WHOLE, MOVING = (
+    "viapoint/PandaObstacles-v0",
+    "viapoint/PlanarObstacles-v0",
+    "viapoint/PlanarWholeArm-v0",
+    "viapoint/PlanarMovingObstacles-v0",
+)
+SHAPES = ("capsule", "box", "cylinder")
+WALL = Box((0.02, 0.06, 0.2), position=(-0.02, 0.35, 0.0))
+CAN = Cylinder(0.02, 0.1, position=(0.25, 0.5, 0.0))
+ENDS = {"start": (-0.2, 0.35), "goal": (0.15, 0.35)}
+
+
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA])
+def test_computed_clearance_is_that_of_densely_sampled_movements(env_id):
+    envs = gym.make_vec(env_id, num_envs=16, threads=1, shapes=SHAPES).unwrapped
+    observation, _ = envs.reset(seed=0)
+    task, scenes, plans = envs.task, envs.scenes, 8
+    actions = np.broadcast_to(
+        candidate_actions(task, plans, replanning=False), (16, plans, task.action.size)
+    ).astype(np.float64)
+    checks = check_plans(observation, actions, task)
+    for h in range(plans):
+        plan = task.action.decode(actions[:, h], scenes.start, scenes.goal)
+        time = plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, 400)
+        hand = np.asarray(plan.trajectory()(time))
+        dense = task.collision_model.least_clearance(hand, scenes.obstacles, scenes.present)
+        inside = checks.reach_margin[:, h] > 0.0
+        near = inside & (dense > -0.005) & (dense < 0.09)
+        assert np.abs(checks.clearance[:, h] - dense)[near].max(initial=0.0) < 1e-3
+        assert (checks.clearance[:, h][inside & (dense < -0.06)] < -0.05).all()
+        assert (checks.clearance[:, h][inside & (dense > 0.1)] > 0.09).all()
+    envs.close()
+
+
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
+def test_the_search_solves_random_scenes(env_id):
+    envs = gym.make_vec(env_id, num_envs=16, threads=1, shapes=SHAPES).unwrapped
+    observation, _ = envs.reset(seed=1)
+    info = envs.execute_actions(GeometrySearch(envs.task, 512).decide(observation)).info
+    assert info["is_success"].mean() > 0.9
+    envs.close()
+
+
+def test_plans_without_an_environment_are_those_of_an_environment():
+    env = gym.make(PLANE, shapes=SHAPES).unwrapped
+    observation, _ = env.reset(options={**ENDS, "obstacles": [WALL, CAN]})
+    search = GeometrySearch(PLANE, 256, shapes=SHAPES)
+    plan = search.plan(**ENDS, obstacles=[WALL.to_dict(), CAN])
+    action, _ = search.predict(observation)
+    *_, info = env.step(action)
+    assert info["is_success"]
+    np.testing.assert_allclose(env.last_plan.waypoints, plan.waypoints, atol=1e-5)
+    agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANE, 4, seed=0, threads=1, shapes=SHAPES), seed=0)
+    action, _ = agent.predict(observation, deterministic=True)
+    env.reset(options={**ENDS, "obstacles": [WALL, CAN]})
+    env.step(action)
+    np.testing.assert_allclose(
+        agent.plan(**ENDS, obstacles=[WALL, CAN]).waypoints, env.last_plan.waypoints, atol=1e-5
+    )
+    with pytest.raises(
+        ValueError, match="obstacle 0: the scenes of this environment have the shapes capsule"
+    ):
+        GeometrySearch(PLANE, 8).plan(**ENDS, obstacles=[WALL])
+    env.close()
+
+
+def test_planners_solve_a_scene_with_a_box():
+    simulation = SceneSimulation(PLANE, 64, shapes=SHAPES, threads=1)
+    env = gym.make(PLANE, shapes=SHAPES).unwrapped
+    env.reset(options={**ENDS, "obstacles": [WALL, CAN]})
+    scenes = env.batch.scenes
+    found = Planner(simulation, budget=PlannerBudget(first=64, generations=1))(scenes)
+    assert found.success.all()
+    pytest.importorskip("ompl")
+    from viapoint.training.planners.ompl_planner import MotionPlanner
+
+    plan = MotionPlanner(simulation.task)(scenes)
+    assert simulation.execute_plan(scenes, plan).success.all()
+    simulation.close()
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", [PLANE, MOVING])
+def test_algorithms_learn_from_rows_of_shapes(env_id):
+    env = ViaVecEnv(env_id, 8, seed=0, threads=1, shapes=SHAPES)
+    for algorithm, settings in ((SAC, {"learning_starts": 8}), (PPO, {"n_steps": 2, "n_epochs": 1})):
+        extractor = {"features_extractor_class": SceneExtractor}
+        algorithm("MultiInputPolicy", env, batch_size=8, policy_kwargs=extractor, **settings).learn(16)
+    SAC(MinimumCriticSACPolicy, env, learning_starts=8, batch_size=8).learn(16)
+    small = {"candidates": 16, "refinements": 1, "per_refinement": 8, "form": "action", "width": 8}
+    ViaQ("ViaQPolicy", env, learning_starts=8, batch_size=8, policy_kwargs=small).learn(16)
+    env.close()
+
+
+def test_movements_and_outlines_of_shapes_are_drawn():
+    env = gym.make(WHOLE, shapes=SHAPES, render_mode="rgb_array", width=64, height=64).unwrapped
+    env.reset(seed=2)
+    scenes = env.batch.scenes
+    *_, info = env.step(np.zeros(3))
+    rollout = env.batch.last_rollout[0]
+    movement = Movement.of(env.task.collision_model, scenes, env.last_plan, rollout)
+    assert info["collision"]
+    (shape,) = obstacles_from_rows(scenes.obstacles[0, movement.contact.obstacle, None])
+    place = np.array([*movement.contact.position, 0.0])
+    radius = env.task.arm.hand_radius if movement.contact.link is None else 0.03
+    assert abs(float(shape.distance(place))) < radius + 0.01
+    outline = widened_outline(shape.footprint()[0], 0.01)
+    outside = np.concatenate((outline, np.zeros((len(outline), 1))), axis=-1)
+    np.testing.assert_allclose(shape.distance(outside), 0.01, atol=1e-3)
+    assert env.render().std() > 1.0
+    env.close()
