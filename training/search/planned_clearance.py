@@ -150,16 +150,18 @@ def least_clearance(
     drift, elapsed = None, moves.duration[:, None].astype(np.float32) * FRACTIONS[:, None].astype(np.float32)
     if obstacles.velocity is not None:
         drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
-    profiles = []
-    for body in _bodies(hand, task):
-        flat = body.map(lambda ends: ends.reshape(number, instants * plans, -1))
-        squared = flat.distance_squared(obstacles.rows, drift).reshape(number, -1, instants, plans)
-        if until < np.inf:
-            np.copyto(squared, np.float32(np.inf), where=(elapsed > until)[:, None])
-        if obstacles.shapes is not None:
-            every = squared.reshape(number, -1, instants * plans)
-            _sharpen(every, flat, obstacles.rows, obstacles.shapes, drift, least, exact)
+    bodies, profiles = _bodies(hand, task), []
+    flat = [body.map(lambda ends: ends.reshape(number, instants * plans, -1)) for body in bodies]
+    every = [each.distance_squared(obstacles.rows, drift) for each in flat]
+    if until < np.inf:
+        for squared in every:
+            late = np.broadcast_to((elapsed > until)[:, None], (number, 1, instants, plans))
+            np.copyto(squared.reshape(number, -1, instants, plans), np.float32(np.inf), where=late)
+    if obstacles.shapes is not None:
+        every = _sharpened(every, flat, obstacles.rows, obstacles.shapes, drift, least, exact)
+    for body, squared in zip(bodies, every, strict=True):
         radii = (obstacles.rows[..., -1] + np.float32(body.radius))[..., None]
+        squared = squared.reshape(number, -1, instants, plans)
         profile = _DistanceProfile(body, radii, squared, convex=obstacles.shapes is not None)
         profiles.append(profile)
         np.minimum(least, (np.sqrt(profile.lowest) - profile.radii).min(axis=1), out=least)  # (1)
@@ -174,55 +176,65 @@ def least_clearance(
     return least
 
 
-def _sharpen(
-    squared: Numbers,
-    body: _Body,
+def _sharpened(
+    squared: list[Numbers],
+    bodies: list[_Body],
     rows: Numbers,
     shapes: Float,
     drift: Numbers | None,
     least: Single | None = None,
     exact: tuple[float, float] = (-np.inf, np.inf),
-) -> None:
-    """Replace squared distances from the capsules around shapes by those of the shapes, in place, where they matter.
+) -> list[Numbers]:
+    """Return squared distances from the capsules around shapes, or, where they matter, those from the shapes.
 
     What stands for the distance from a capsule's axis is the signed distance from the shape plus the capsule's radius,
     so that the same clearance follows.
 
     Args:
-        squared: Squared distances from the axes of the capsules, shape (B, n, P), [m^2].
-        body: Body with ends of shape (B, P, D).
+        squared: Squared distances of L bodies from the axes of the capsules, shape (B, n, P) each, [m^2].
+        bodies: Bodies with ends of shape (B, P, D).
         rows: Capsules, shape (B, n, 2 D + 1), [m].
         shapes: Rows with shapes, shape (B, n, .), [m].
         drift: Displacements of the obstacles, shape (B, n, P, D), [m]; None if they stand still.
         least: Least clearance of H movements so far, shape (B, H), [m], which is lowered; P is a multiple of H. Without
-            it, all distances are replaced.
+            it, all distances are those from the shapes.
         exact: Range of clearance of interest, [m].
     """
+    found = np.stack(squared, axis=1)
+    first, second = (
+        np.stack([in_space(each) for each in ends], axis=1)
+        for ends in (
+            [body.first for body in bodies],
+            [body.first if body.second is None else body.second for body in bodies],
+        )
+    )
+    radii = np.array([body.radius for body in bodies])
 
-    def clearance(scene: Index, obstacle: Index, place: Index) -> Float:
-        ends = [each[scene, place] for each in (body.first, body.second) if each is not None]
+    def clearance(scene: Index, body: Index, obstacle: Index, place: Index) -> Float:
+        ends: list[Any] = [end[scene, body, place] for end in (first, second)]
         if drift is not None:
-            ends = [end - drift[scene, obstacle, place] for end in ends]
-        found = pair_distance(shapes[scene, obstacle], *(in_space(end.astype(np.float64)) for end in ends))
-        squared[scene, obstacle, place] = np.square(np.maximum(found + rows[scene, obstacle, -1], 0.0))
-        return found - body.radius
+            ends = [end - in_space(drift[scene, obstacle, place]) for end in ends]
+        distance = pair_distance(shapes[scene, obstacle], *ends)
+        found[scene, body, obstacle, place] = np.square(np.maximum(distance + rows[scene, obstacle, -1], 0.0))
+        return np.asarray(distance - radii[body])
 
     if least is None:
-        clearance(*np.nonzero(squared >= 0.0))
-        return
-    radii = (rows[..., -1] + np.float32(body.radius))[..., None]
-    plans = least.shape[1]
-    bound = np.sqrt(squared) - radii
+        clearance(*np.nonzero(found >= 0.0))
+        return list(np.moveaxis(found, 1, 0))
+    plans, instants = least.shape[1], found.shape[3] // least.shape[1]
+    bound = np.sqrt(found) - (rows[:, None, :, -1:] + radii.astype(np.float32)[:, None, None])
     each = bound.reshape(len(bound), -1, plans)
-    first = each.argmin(axis=1)  # the least bound of each movement, whose exact value excludes most others
+    nearest = each.argmin(axis=1)  # the least bound of each movement, whose exact value excludes most others
     scene, plan = np.nonzero(each.min(axis=1) < np.minimum(least, exact[1]))
-    obstacle, instant = np.divmod(first[scene, plan], each.shape[1] // bound.shape[1])
-    np.minimum.at(least, (scene, plan), clearance(scene, obstacle, instant * plans + plan))
+    body, rest = np.divmod(nearest[scene, plan], instants * rows.shape[1])
+    obstacle, instant = np.divmod(rest, instants)
+    np.minimum.at(least, (scene, plan), clearance(scene, body, obstacle, instant * plans + plan))
     limit = np.where(least > exact[0], np.minimum(least, np.float32(exact[1])), -np.inf)
-    some = bound < np.tile(limit, squared.shape[2] // plans)[:, None]
-    some[scene, obstacle, instant * plans + plan] = False
-    scene, obstacle, place = np.nonzero(some)
-    np.minimum.at(least, (scene, place % plans), clearance(scene, obstacle, place))
+    some = bound < np.tile(limit, instants)[:, None, None]
+    some[scene, body, obstacle, instant * plans + plan] = False
+    scene, body, obstacle, place = np.nonzero(some)
+    np.minimum.at(least, (scene, place % plans), clearance(scene, body, obstacle, place))
+    return list(np.moveaxis(found, 1, 0))
 
 
 class _DistanceProfile:
@@ -301,9 +313,8 @@ def _refined_clearance(
         clearance = np.sqrt(squared.min(axis=(1, 2))) - row[:, 0, -1] - np.float32(body.radius)
         near = np.flatnonzero(clearance < limit[scene, movement])
         shapes, some = obstacles.shapes[scene[near], which[near], None], ends.map(lambda end: end[near])
-        exact = squared[near]
-        _sharpen(exact, some, row[near], shapes, None if drift is None else drift[near])
-        squared[near] = exact
+        moved = None if drift is None else drift[near]
+        (squared[near],) = _sharpened([squared[near]], [some], row[near], shapes, moved)
     squared = squared[:, 0]
     each = np.arange(len(squared))
     at = squared[:, 1:-1].argmin(axis=-1)
