@@ -163,6 +163,42 @@ def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevati
     assert obstacle_editing.sizes_of(row) == pytest.approx(values, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "shapes"),
+    [
+        (PLANAR, ("capsule", "box", "cylinder")),
+        (PANDA, ("capsule", "sphere", "box", "cylinder", "half_space")),
+    ],
+)
+def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_id, shapes):
+    env = gym.make_vec(env_id, num_envs=1, threads=1, shapes=shapes).unwrapped
+    env.reset(seed=0)
+    scene = LiveScene.of(env.scenes)
+    number, d = len(scene.obstacles), len(scene.start)
+    for kind in obstacle_editing.obstacle_kinds(shapes):
+        row = obstacle_editing.new_obstacle(scene, kind, shapes)
+        for name, value in (("half-depth", 0.06), ("half-height", 0.09), ("heading", 30.0)):
+            row = obstacle_editing.resized(row, name, value)
+        sizes = obstacle_editing.sizes_of(row)
+        assert sizes["half-depth"] == pytest.approx(0.06)
+        mesh = drawing.obstacle_mesh(row, -0.02, 0.03)
+        (shape,) = ve.obstacles_from_rows(row[None])
+        around = mesh.vertices + np.array([*row[:d], 0.0][:3]) * ([1, 1, 0] if d == 2 else 1)
+        around[:, 2] = 0.0 if d == 2 else around[:, 2]
+        assert np.abs(shape.distance(around)).max() < 2e-3
+        scene = scene.with_obstacle(row)
+    again = from_json(to_json(scene, env_id), d, shapes)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) * ([1, 1, 0] if d == 2 else 1)
+    for mine, theirs in zip(*map(ve.obstacles_from_rows, (again.obstacles, scene.obstacles)), strict=True):
+        np.testing.assert_allclose(mine.distance(points), theirs.distance(points), atol=1e-9)
+    assert len(again.obstacles) > number
+    names = {}
+    drawn = scene._replace(obstacles=scene.obstacles[:number])
+    exec(to_python(drawn, env_id, {"shapes": shapes}, changing=False), names)
+    assert names["env"].observation_space.contains(names["observation"])
+    env.close()
+
+
 @settings(max_examples=20)
 @given(st.integers(2, 3), st.floats(0.01, 0.1), st.floats(0.0, 0.2), st.floats(-3.0, 3.0))
 def test_obstacles_are_drawn_where_they_are(d, radius, length, angle):
@@ -245,8 +281,8 @@ def test_python_code_sets_the_scene_up(env_id, shared):
         ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
         ({"obstacles": [{"shape": "sphere", "radius": "x"}]}, "obstacle 0 of the scene file"),
         ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
-        ({"obstacles": [{"shape": "box", "size": [0.1, 0.1, 0.1]}]}, "spheres and capsules, got a box"),
-        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane z = 0"),
+        ({"obstacles": [{"shape": "box", "size": [0.1, 0.1, 0.1]}]}, "shapes capsule, sphere, not box"),
+        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane, with z = 0"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "obstacle 0: course"),
         ({"jumps": [[1.0]]}, "jumps"),
     ],

@@ -113,6 +113,8 @@ def _resized_shape(row: Float, name: str, value: float) -> Float:
         w, x, y, z = quaternion
         c, s = np.cos(turn), np.sin(turn)
         quaternion = np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+    if d == 2 and kind == "capsule" and rotation_axes(quaternion)[2][2] > 0.5:
+        half[2] = half[0]  # a post
     (turned,) = shape_rows(kind, centre[None, :d], quaternion[None], _fitting(kind, half[None], d))
     return np.asarray(turned)
 
