@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.types import Float, Numbers
+from viapoint.envs.common.types import Numbers
 from viapoint.primitives.array_api import Array, namespace_of
 
 N = TypeVar("N", bound=Numbers)
@@ -57,8 +57,9 @@ def norm(vectors: N) -> N:
     return length
 
 
-def in_space(points: Float, height: float = 0.0) -> Float:
+def in_space(points: N, height: float = 0.0) -> N:
     """Return vectors (..., D) in three dimensions: those of the plane at a height, others unchanged."""
     if points.shape[-1] == 3:
         return points
-    return np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)
+    raised: N = np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)  # type: ignore[assignment]
+    return raised
