@@ -50,17 +50,7 @@ def entries_of(env, number):
         scene = scenes_of(env, 1, seed)
         env.reset(options=scene.as_options())
         info = env.step(np.zeros(3, dtype=np.float32))[-1]
-        inner = env.unwrapped
-        entries.append(
-            Entry(
-                arm=inner.task.arm,
-                scene=scene,
-                plan=inner.last_plan,
-                rollout=inner.last_rollout,
-                title=f"scene {seed}",
-                success=info["is_success"],
-            )
-        )
+        entries.append(Entry.of_last(env, scene, title=f"scene {seed}", success=info["is_success"]))
     return entries
 
 

@@ -75,7 +75,6 @@ def run(config: DemoConfig) -> None:
 def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
     """Return the agent's movements in scenes of all difficulties for the gallery."""
     env = gym.make(agent.env_id, **agent.env_kwargs)
-    inner: Any = env.unwrapped
     by_difficulty = np.argsort(-frozen.share, kind="stable")
     result = []
     for row in by_difficulty[evenly_spread(len(by_difficulty), count)]:
@@ -83,17 +82,8 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
         observation, _ = env.reset(options=scene.as_options())
         action, _ = agent.predict(observation, deterministic=True)
         info = env.step(action)[-1]
-        result.append(
-            Entry(
-                arm=inner.task.arm,
-                scene=scene,
-                plan=inner.last_plan,
-                rollout=inner.last_rollout,
-                title=f"share {BANDS[frozen.band[row]]}",
-                success=bool(info["is_success"]),
-                whole_arm=inner.task.whole_arm,
-            )
-        )
+        title = f"share {BANDS[frozen.band[row]]}"
+        result.append(Entry.of_last(env, scene, title=title, success=bool(info["is_success"])))
     env.close()
     return result
 

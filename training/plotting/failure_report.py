@@ -199,23 +199,12 @@ def _entries(
 ) -> list[Entry]:
     """Simulate some of the failures again and return them as entries of a gallery."""
     env = gym.make(env_id, **env_kwargs)
-    inner: Any = env.unwrapped
     entries = []
     for index in chosen:
         scene = failures.frozen.scenes.take([failures.rows[index]])
         env.reset(options=scene.as_options())
         env.step(failures.actions[index].astype(np.float32))
-        entries.append(
-            Entry(
-                arm=inner.task.arm,
-                scene=scene,
-                plan=inner.last_plan,
-                rollout=inner.last_rollout,
-                title=_title(failures, index),
-                success=False,
-                whole_arm=inner.task.whole_arm,
-            )
-        )
+        entries.append(Entry.of_last(env, scene, title=_title(failures, index), success=False))
     env.close()
     return entries
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -40,6 +42,15 @@ class Entry:
     success: bool
     whole_arm: bool = False
     """True where the links can touch obstacles, too."""
+
+    @classmethod
+    def of_last(cls, env: gym.Env[Any, Any], scene: Scenes, *, title: str, success: bool) -> Entry:
+        """Return the last movement of an environment, in the scene that it was reset to."""
+        inner: Any = env.unwrapped
+        return cls(
+            arm=inner.task.arm, scene=scene, plan=inner.last_plan, rollout=inner.last_rollout, title=title,
+            success=success, whole_arm=inner.task.whole_arm,
+        )  # fmt: skip
 
     @property
     def outcome(self) -> str:
