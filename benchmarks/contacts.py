@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs import SHAPES
-from viapoint.envs.arms import ADULT, PANDA
+from viapoint.envs.arms import ADULT, ARMS, PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.rows import shape_rows
 from viapoint.envs.scenes.scene import Scenes, rest_clearance
@@ -24,6 +24,7 @@ BATCH = 2000
 KINDS = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 MODELS = {
     "panda": CollisionModel(PANDA, whole_arm=True),
+    "panda-fine": CollisionModel(ARMS["panda-fine"], whole_arm=True),
     "planar": CollisionModel(ADULT, whole_arm=True),
     "planar hand": CollisionModel(ADULT, whole_arm=False),
 }
@@ -36,8 +37,8 @@ class Contacts(NamedTuple):
     contacts: int
     wrong: int
     """Poses whose clearance is farther from 0 than TOLERANCE and has the wrong sign."""
-    shallowest: float
-    """Least depth of these, [m]; infinite if there are none."""
+    shallowest: float | None
+    """Least depth of these, [m]; None if there are none."""
 
 
 def random_obstacles(kind, places, generator):
@@ -97,9 +98,8 @@ def contacts(name, kind, number, seed=0):
         touched.append(simulator.rollout(sims, still).contact[:, 0])
     contact = np.concatenate(touched)
     wrong = (contact != (clearance < 0.0)) & (np.abs(clearance) > TOLERANCE)
-    return Contacts(
-        len(hand), int(contact.sum()), int(wrong.sum()), float((-clearance[wrong]).min(initial=np.inf))
-    )
+    shallowest = float((-clearance[wrong]).min()) if wrong.any() else None
+    return Contacts(len(hand), int(contact.sum()), int(wrong.sum()), shallowest)
 
 
 def main():
@@ -113,9 +113,9 @@ def main():
         for kind in KINDS:
             each = contacts(name, kind, arguments.poses)
             found.setdefault(name, {})[kind] = each._asdict()
+            depth = "" if each.shallowest is None else f", the shallowest {each.shallowest:.3f} m deep"
             print(
-                f"{name:12} {kind:12} {each.poses} poses, {each.contacts} contacts, {each.wrong} wrong, the "
-                f"shallowest {each.shallowest:.3f} m deep"
+                f"{name:12} {kind:12} {each.poses} poses, {each.contacts} contacts, {each.wrong} wrong{depth}"
             )
     if arguments.out:
         arguments.out.write_text(json.dumps(found, indent=1) + "\n")
