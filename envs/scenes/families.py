@@ -61,7 +61,7 @@ class SceneFamily:
     """Flag: the family is one of those of training by default if scenes may have its shapes."""
 
 
-_TRAINED_BOXES: dict[str, Any] = {"shapes": ("box",), "trained": True, "hard": True}
+_TRAINED_BOXES: dict[str, Any] = {"shapes": ("box",), "trained": True}
 _FAMILIES: dict[int, dict[str, SceneFamily]] = {
     2: {
         name: SceneFamily(build=build, n_obstacles=FAMILY_ROWS, hard=True)

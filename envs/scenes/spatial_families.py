@@ -25,7 +25,9 @@ TABLE = (0.12, 0.25)
 THING_WIDTH, THING_HEIGHT = (0.015, 0.04), (0.02, 0.07)
 """Half widths and half heights of things on a table, [m]."""
 BIN, RIM = (0.13, 0.20), (0.02, 0.10)
-"""Half width of bins and cages inside, and height of their rims above the hand in them, [m]; a gripper fits in."""
+"""Half width of bins and cages inside, and height of the rims of bins above the hand, [m]; a gripper fits in."""
+DEEP = (0.10, 0.18)
+"""Height of the rails of cages above the hand in them, [m]."""
 GAP = (0.07, 0.16)
 """Distance from the middle of a gap in a wall to each side, [m]; the gripper is 0.21 m wide."""
 PANEL = (0.10, 0.20)
@@ -228,7 +230,7 @@ def cage(uniforms: Uniforms, site: SpatialSite) -> Structures:
     """Return a cage of bars around start or goal, open above: four posts and four rails, which retreat downwards."""
     u = uniforms.take(BUILDER_NUMBERS)
     end, heading = _end(u, site), rotate(site.heading, 0.5 * np.pi * u[..., 1])
-    rim, size = end[..., 2] + between(RIM, u[..., 2]), between(BIN, u[..., 3:5])
+    rim, size = end[..., 2] + between(DEEP, u[..., 2]), between(BIN, u[..., 3:5])
     parts, sides = [], (heading, left(heading))
     for first in (-1.0, 1.0):
         for second in (-1.0, 1.0):

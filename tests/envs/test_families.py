@@ -13,6 +13,8 @@ import pytest
 from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import segment_distance_squared
+from viapoint.envs.geometry.rows import shape_columns
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.mdp.task import family_sampler
 from viapoint.envs.scenes import families
 from viapoint.envs.scenes.config import SpaceDistribution
@@ -25,7 +27,9 @@ PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encodi
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
 SPACE = "viapoint/PandaObstacles-v0"
 FAMILIES = tuple(scene_families(2))
-SPACE_FAMILIES = {name: family.n_obstacles for name, family in scene_families(3).items()}
+IN_SPACE = scene_families(3).items()
+SPACE_FAMILIES = {name: family.n_obstacles for name, family in IN_SPACE if family.shapes == ("capsule",)}
+BOX_FAMILIES = {name: family.n_obstacles for name, family in IN_SPACE if family.shapes == ("box",)}
 NUMBER = {HAND: 40, WHOLE_ARM: 4}
 
 
@@ -157,7 +161,9 @@ def test_what_has_no_families_is_refused(tasks):
         family_sampler(tasks[HAND], "maze")
     with pytest.raises(ValueError, match="up to 5 obstacles"):
         family_sampler(task_of(HAND, n_obstacles=2), "gate")
-    with pytest.raises(ValueError, match="clutter, pillar, shelf, gate, slot, window, tunnel, got 'ring'"):
+    with pytest.raises(
+        ValueError, match=r"clutter, pillar, shelf, gate, slot, window, tunnel, table.*, got 'ring'"
+    ):
         family_sampler(task_of(SPACE), "ring")
     with pytest.raises(ValueError, match="tunnel needs a task with up to 6 obstacles, this one has 5"):
         family_sampler(task_of(SPACE, n_obstacles=5), "tunnel")
@@ -176,6 +182,33 @@ def test_each_family_of_space_is_drawn_by_its_name(name):
     )
     assert (lying.sum(axis=-1) >= bars).all()
     assert (standing.sum(axis=-1) >= posts).all()
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    envs = gym.make_vec(SPACE, num_envs=3, threads=1, shapes=("capsule", "box"), n_obstacles=(1, 8)).unwrapped
+    yield envs
+    envs.close()
+
+
+@pytest.mark.parametrize("name", BOX_FAMILIES)
+def test_each_family_of_boxes_is_in_the_way(name, boxes):
+    scenes = family_sampler(boxes.task, name)([np.random.default_rng(i) for i in range(3)])
+    box = shape_columns(scenes.obstacles).kind == list(SHAPES).index("box")
+    assert ((box & scenes.present).sum(axis=-1) >= BOX_FAMILIES[name]).all()
+    boxes.reset(options=scenes.as_options())
+    info = boxes.execute_actions(np.zeros(boxes.action_space.shape)).info
+    assert (info["collision"] | ~info["reachable"]).all()
+    with pytest.raises(ValueError, match=f"{name} needs a task with the shapes box, this one has capsule"):
+        family_sampler(task_of(SPACE, n_obstacles=8), name)
+
+
+def test_families_of_boxes_are_trained_or_held_out(boxes):
+    families = scene_families(3)
+    trained = set(boxes.task.scenes.families)
+    assert {name for name in BOX_FAMILIES if name in trained} == {"table", "bin", "notch", "cupboard"}
+    assert all(families[name].hard != families[name].trained for name in BOX_FAMILIES)
+    assert trained - set(BOX_FAMILIES) == set(task_of(SPACE).scenes.families)
 
 
 @pytest.fixture
