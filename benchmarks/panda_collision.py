@@ -71,6 +71,19 @@ HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
 SAMPLES = 100_000
 """Random configurations; links that touch in none of them are not compared."""
 
+FIRST_DARK = 5
+"""First joint whose link has the darker colour."""
+COMMENT = """\
+  Collision: capsules that contain Franka's collision meshes and the boxes of the closed fingers (franka_description of
+  franka_ros, Apache-2.0), written by benchmarks/panda_collision.py. Joints are frictionless, as an inner torque loop
+  makes them.
+
+  The base stands at the origin, x points forwards, z up, and the table top is the plane z = 0.
+  Contact bits: 1 links against obstacles, 4 links against the table, 16 the base and twice as much for each link after
+  it, against the links that must not touch it. Neighbours and links that never touch are not compared.
+-->"""
+"""Words on collisions in the model file."""
+
 Bodies = dict[int, list[ConvexMesh]]
 """Convex bodies of each link, by its joint, in the frame of the joint."""
 
@@ -180,8 +193,11 @@ def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[int, i
         capsules: Capsules of each body, in its frame.
         skipped: Pairs of links, by their joints.
     """
+    whole = (ASSETS / "panda.xml").read_text(encoding="utf-8")
+    whole = re.sub(r"  Collision: .*?-->", COMMENT, whole, flags=re.DOTALL)
+    whole = re.sub(r'    <default class="near">.*\n  </default>', "  </default>", whole, flags=re.DOTALL)
     lines, body = [], "link0"
-    for line in (ASSETS / "panda.xml").read_text(encoding="utf-8").splitlines():
+    for line in whole.splitlines():
         name = re.search(r'<body name="(\w+)"', line)
         body = name.group(1) if name else body
         if "<geom name=" not in line or "table" in line:
@@ -198,12 +214,13 @@ def geom_lines(body: str, capsules: list[LinkCapsule], skipped: set[tuple[int, i
     contype = 1 << (SELF_BITS + joint + 1) | (joint >= 0) | (TABLE_BIT if joint >= FIRST_OFF_TABLE else 0)
     others = [other for other in range(-1, joint - 1) if (other, joint) not in skipped]
     conaffinity = sum(1 << (SELF_BITS + other + 1) for other in others)
+    shown = ' rgba="0.66 0.71 0.78 1"' if joint >= FIRST_DARK else ""
     bits = f'contype="{contype}" conaffinity="{conaffinity}"'
     found = []
     for number, capsule in enumerate(capsules):
         ends = " ".join(f"{x:g}" for end in capsule.ends for x in end)
         name = body if len(capsules) == 1 else f"{body}_{number}"
-        found.append(f'<geom name="{name}" fromto="{ends}" size="{capsule.radius:g}" {bits}/>')
+        found.append(f'<geom name="{name}" fromto="{ends}" size="{capsule.radius:g}" {bits}{shown}/>')
     if body == "gripper":
         place, radius = " ".join(f"{x:g}" for x in TIP), f"{capsules[-1].radius:g}"
         shown = f'rgba="0.16 0.20 0.28 1" {bits}'
