@@ -8,10 +8,13 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Box, Float, Numbers
+from viapoint.envs.common.types import Bool, Box, Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.primitives.array_api import Array
+
+SELF_MARGIN = 0.002
+"""Distance of links from one another and the table below which a plan touches, [m]: the error of tracking it."""
 
 
 class Arm(Protocol):
@@ -54,7 +57,7 @@ class Arm(Protocol):
     def may_touch_itself(self) -> bool:
         """True if a configuration within reach may touch the arm itself or the table.
 
-        Then clearances of plans include :meth:`self_clearance`.
+        Then clearances of plans are negative where it does.
         """
 
     @property
@@ -114,6 +117,15 @@ class Arm(Protocol):
             joints: Joint angles, shape (..., J), [rad].
         """
 
+    def planned_self_clearance(self, links: Array) -> Array:
+        """Return :meth:`self_clearance` of links whose configurations the inverse kinematics gave, shape (...,), [m].
+
+        Pairs of capsules that stay 5 cm apart within reach are left out, so clearances beyond that may be too large.
+
+        Args:
+            links: Axes of the capsules by :meth:`links`, shape (..., L, 2, D), [m].
+        """
+
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return the joint angles that put the hand at a position, shape (..., J), [rad].
 
@@ -160,12 +172,17 @@ class CollisionModel:
     whole_arm: bool
     """True if the links must clear the obstacles, too; False for the hand alone."""
 
+    @property
+    def may_touch_itself(self) -> bool:
+        """True if links count, and plans within reach may touch the arm itself or the table."""
+        return self.whole_arm and self.arm.may_touch_itself
+
     def least_clearance(
         self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
     ) -> Float:
         """Return the least clearance over time and obstacles, shape (N,).
 
-        Without joint angles, as for a plan, :meth:`with_self_clearance` applies.
+        Without joint angles, as for a plan, :meth:`with_self_clearance` applies to arms that may touch themselves.
 
         Args:
             hand: Hand positions, shape (N, T, D), [m].
@@ -173,34 +190,35 @@ class CollisionModel:
             present: True for rows that are obstacles, shape (N, n).
             joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
         """
-        least = np.full(len(hand), MAX_CLEARANCE)
+        least, checks_itself = np.full(len(hand), MAX_CLEARANCE), self.may_touch_itself and joints is None
+        links = self._links(hand, joints) if obstacles.shape[1] or checks_itself else None
         if obstacles.shape[1]:
-            links = self._links(hand, joints)
             if links is not None and self.arm.traced:
                 least = nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present)
             else:
                 least = self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1)
-        return np.asarray(self.with_self_clearance(least, hand, time_axis=1) if joints is None else least)
+        return np.asarray(self.with_self_clearance(least, links, time_axis=1) if checks_itself else least)
 
-    def with_self_clearance(self, least: Any, hand: Numbers, time_axis: int | None = None) -> Any:
-        """Return the minimum of clearances and a planned arm's clearance from itself, if links count and may touch.
+    def with_self_clearance(self, least: Any, links: Any, time_axis: int | None = None) -> Any:
+        """Return clearances from obstacles, negative where a planned arm comes closer than SELF_MARGIN to itself.
+
+        Elsewhere the clearance from itself does not count: it is small in many configurations that are safe.
 
         Args:
             least: Clearances from obstacles, with the shape of the result.
-            hand: Planned hand positions, shape (..., D), [m].
+            links: Planned axes of the capsules, shape (..., L, 2, D), [m].
             time_axis: Axis of time over which the minimum is taken; None for the clearance at each time.
         """
-        if not (self.whole_arm and self.arm.may_touch_itself):
-            return least
-        found = np.asarray(self.arm.self_clearance(self.arm.inverse_kinematics(hand)))
-        return np.minimum(least, found if time_axis is None else found.min(axis=time_axis))
+        found = np.asarray(self.arm.planned_self_clearance(links)) - SELF_MARGIN
+        found = found if time_axis is None else found.min(axis=time_axis)
+        return np.where(found < 0.0, np.minimum(least, found), least)
 
     def clearance_profile(
         self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
     ) -> Float:
         """Return the clearance from each obstacle, which may move, at each time, shape (N, T, n).
 
-        Without joint angles, as for a plan, :meth:`with_self_clearance` applies.
+        Without joint angles, as for a plan, :meth:`with_self_clearance` applies to arms that may touch themselves.
 
         Args:
             hand: Hand positions, shape (N, T, D), [m].
@@ -215,12 +233,12 @@ class CollisionModel:
         if links is not None:
             # The last link of a traced arm ends in the hand.
             radius = self.arm.link_radii[-1] if self.arm.traced else radius
-            links = links.reshape(-1, 1, *links.shape[2:])
+            every, links = links, links.reshape(-1, 1, *links.shape[2:])
         rows, shown = obstacles.reshape(-1, *obstacles.shape[2:]), np.repeat(present, times, axis=0)
         profile = self._clearance(hand.reshape(-1, 1, hand.shape[-1]), radius, links, rows, shown)
         profile = profile.reshape(number, times, most)
-        if joints is None:
-            profile = np.moveaxis(self.with_self_clearance(np.moveaxis(profile, -1, 0), hand), 0, -1)
+        if self.may_touch_itself and joints is None:
+            profile = np.moveaxis(self.with_self_clearance(np.moveaxis(profile, -1, 0), every), 0, -1)
         return profile
 
     def _links(self, hand: Float, joints: Float | None) -> Float | None:

@@ -139,6 +139,10 @@ class PlanarArm:
         ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
         return _batch_first(xp, xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
+    def planned_self_clearance(self, links: Array) -> Array:
+        """Return MAX_CLEARANCE; see :meth:`viapoint.envs.arms.base.Arm.planned_self_clearance`."""
+        return namespace_of(links).full_like(links[..., 0, 0, 0], MAX_CLEARANCE)
+
     def self_clearance(self, joints: Array) -> Array:
         """Return MAX_CLEARANCE: adjacent links may touch; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
         return namespace_of(joints).full_like(joints[..., 0], MAX_CLEARANCE)

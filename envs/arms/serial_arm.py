@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import mujoco
@@ -15,6 +16,7 @@ from viapoint.envs.arms.mjcf import (
     Pose,
     add_obstacles,
     bodies_moved_by,
+    grid,
     in_frame,
     joint_frames,
     kinematic_chain,
@@ -40,6 +42,8 @@ HAND_BANDWIDTH, HAND_DAMPING_RATIO = 50.0, 0.75
 """Natural frequency of the hand's servo, [rad/s], and its damping ratio."""
 ORIGIN = "origin"
 """Name of the site at the world's origin, from which the hand's actuators measure."""
+NEAR, REACH_GRID = 0.05, np.linspace(-1.0, 1.0, 41)
+"""Clearance below which pairs of capsules are near, and coordinates of the grid on which these are searched, [m]."""
 MARKER: dict[str, Any] = {"size": (0.001, 0.0, 0.0), "group": 5}
 """Attributes of an invisible site that only marks a point."""
 
@@ -162,18 +166,36 @@ class SerialArm:
 
     def self_clearance(self, joints: Array) -> Array:
         """Return the clearance of the arm from itself; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
-        xp, links = namespace_of(joints), self.links(joints)
-        base = xp.asarray(np.array([c.ends for c in self.base]).reshape(-1, 2, 3), dtype=joints.dtype)
-        ends = xp.concat((links, xp.broadcast_to(base, (*joints.shape[:-1], *base.shape))), axis=-3)
+        return self._clearance_of_pairs(self.links(joints), self.self_pairs)
+
+    def planned_self_clearance(self, links: Array) -> Array:
+        """Return the clearance of links; see :meth:`viapoint.envs.arms.base.Arm.planned_self_clearance`."""
+        return self._clearance_of_pairs(links, self._pairs_within_reach)
+
+    def _clearance_of_pairs(self, links: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+        """Return the least clearance of pairs of capsules and of capsules from the table, shape (...,), [m]."""
+        xp, ends = namespace_of(links), links
+        if any(second >= len(self.shape) for _, second in pairs):  # of the base
+            base = xp.asarray(np.array([c.ends for c in self.base]), dtype=links.dtype)
+            ends = xp.concat((links, xp.broadcast_to(base, (*links.shape[:-3], *base.shape))), axis=-3)
         radii = np.array([capsule.radius for capsule in (*self.shape, *self.base)])
-        found = [xp.full_like(joints[..., :1], MAX_CLEARANCE)]
-        if self.self_pairs:
-            found.append(capsule_pair_clearance(ends, radii, self.self_pairs))
+        found = [xp.full_like(links[..., 0, 0, :1], MAX_CLEARANCE)]
+        if pairs:
+            found.append(capsule_pair_clearance(ends, radii, pairs))
         if self.off_table:
             some = list(self.off_table)
-            lowest = xp.min(ends[..., some, :, :][..., 2], axis=-1)
-            found.append(lowest - xp.asarray(radii[some], dtype=joints.dtype))
-        return xp.min(xp.concat(found, axis=-1), axis=-1)
+            lowest = xp.min(links[..., 2][..., some, :], axis=-1)
+            found.append(lowest - xp.asarray(radii[some], dtype=links.dtype))
+        return functools.reduce(xp.minimum, [xp.min(each, axis=-1) for each in found])
+
+    @functools.cached_property
+    def _pairs_within_reach(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of capsules that come closer than NEAR to one another in some configuration within reach."""
+        hand = grid([REACH_GRID, REACH_GRID, REACH_GRID[REACH_GRID >= 0.0]]).reshape(-1, 3)
+        joints = self.ik(hand[np.asarray(self.ik.margin(hand)) >= 0.0])
+        alone = (replace(self, self_pairs=(pair,), off_table=()) for pair in self.self_pairs)
+        near = [bool((arm.self_clearance(joints) < NEAR).any()) for arm in alone]
+        return tuple(itertools.compress(self.self_pairs, near))
 
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`."""
@@ -262,11 +284,14 @@ def capsule_pair_clearance(ends: Array, radii: Float, pairs: Sequence[tuple[int,
     """
     xp = namespace_of(ends)
     first, second = (list(each) for each in zip(*pairs, strict=True))
-    here, there = ends[..., first, :, :], ends[..., second, :, :]
-    parts = here[..., 0, :] - there[..., 0, :], *(each[..., 1, :] - each[..., 0, :] for each in (here, there))
-    squared = segment_axis_squared(*([part[..., i] for i in range(3)] for part in parts))
+    # Each component is an array (capsules, ...): the operations are passes over contiguous memory.
+    start = [xp.moveaxis(ends[..., 0, i], -1, 0) for i in range(3)]
+    axis = [xp.moveaxis(ends[..., 1, i], -1, 0) - part for i, part in enumerate(start)]
+    gap = [part[first] - part[second] for part in start]
+    squared = segment_axis_squared(gap, *([part[some] for part in axis] for some in (first, second)))
     # The small summand keeps gradients of capsules whose axes meet finite.
-    return xp.sqrt(squared + 1e-24) - xp.asarray(radii[first] + radii[second], dtype=ends.dtype)
+    distance = xp.moveaxis(xp.sqrt(squared + 1e-24), 0, -1)
+    return distance - xp.asarray(radii[first] + radii[second], dtype=ends.dtype)
 
 
 def serial_arm(

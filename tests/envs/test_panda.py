@@ -13,8 +13,8 @@ import torch
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import PANDA, PANDA_FINE
-from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.arms.serial_arm import LIMIT_SHARE, serial_arm
+from viapoint.envs.arms.base import SELF_MARGIN, CollisionModel
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE, NEAR, serial_arm
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
 from viapoint.envs.sim.simulator import Simulator
@@ -270,32 +270,48 @@ def test_measured_bounds_of_the_fine_panda():
     assert max(row["excess"] for row in found[1:]) <= 25.0
 
 
+def test_within_reach_a_few_pairs_of_links_suffice():
+    hand = np.random.default_rng(6).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (20_000, 3))
+    joints = PANDA_FINE.inverse_kinematics(hand[PANDA_FINE.reach_margin(hand) >= 0.0])
+    every, some = (
+        PANDA_FINE.self_clearance(joints),
+        PANDA_FINE.planned_self_clearance(PANDA_FINE.links(joints)),
+    )
+    near = every < NEAR
+    np.testing.assert_array_equal(some[near], every[near])
+    assert (some[~near] >= NEAR).all()
+    assert len(PANDA_FINE._pairs_within_reach) < len(PANDA_FINE.self_pairs) / 2
+
+
 def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
     joints = torch.as_tensor(np.random.default_rng(8).uniform(*np.array(PANDA.joint_range).T, (5, 7)))
     assert torch.autograd.gradcheck(PANDA.self_clearance, joints.requires_grad_(), atol=1e-4)
 
 
-def test_plans_of_an_arm_that_may_touch_itself_have_no_more_than_its_own_clearance():
-    """Where no obstacle is near; executed movements and other arms are compared with obstacles alone."""
-    arm = dataclasses.replace(PANDA, may_touch_itself=True)
-    hand = np.random.default_rng(9).uniform(*np.array(PANDA.workspace), (30, 4, 3))
+def test_plans_of_an_arm_that_touches_itself_have_a_negative_clearance():
+    """Executed movements, other arms and the hand alone are compared with obstacles only."""
+    places = np.random.default_rng(9).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (4000, 3))
+    hand = places[PANDA_FINE.reach_margin(places) >= 0.0][:400].reshape(100, 4, 3)
     far = np.concatenate(
-        (np.full((30, 1, 3), 0.95), np.zeros((30, 1, 3)), np.full((30, 1, 1), 0.01)), axis=-1
+        (np.full((100, 1, 3), 0.95), np.zeros((100, 1, 3)), np.full((100, 1, 1), 0.01)), axis=-1
     )
-    joints, present = arm.inverse_kinematics(hand), np.ones((30, 1), dtype=bool)
-    own, there = arm.self_clearance(joints), np.repeat(far[:, None], 4, axis=1)
-    for whole_arm, joints_given in ((True, None), (True, joints), (False, None)):
-        model, other = CollisionModel(arm, whole_arm), CollisionModel(PANDA, whole_arm)
-        least = other.least_clearance(hand, far, present)
-        profile = other.clearance_profile(hand, there, present)
-        if whole_arm and joints_given is None:
-            least, profile = np.minimum(least, own.min(axis=1)), np.minimum(profile, own[..., None])
-            np.testing.assert_array_equal(
-                model.least_clearance(hand, far[:, :0], present[:, :0]), own.min(axis=1)
-            )
-        np.testing.assert_array_equal(model.least_clearance(hand, far, present, joints_given), least)
-        np.testing.assert_array_equal(model.clearance_profile(hand, there, present, joints_given), profile)
-    assert (own < 0.2).all()
+    joints, present = PANDA_FINE.inverse_kinematics(hand), np.ones((100, 1), dtype=bool)
+    own, there = PANDA_FINE.self_clearance(joints) - SELF_MARGIN, np.repeat(far[:, None], 4, axis=1)
+    without = dataclasses.replace(PANDA_FINE, may_touch_itself=False)
+    for whole_arm, given in ((True, None), (True, joints), (False, None)):
+        model, other = CollisionModel(PANDA_FINE, whole_arm), CollisionModel(without, whole_arm)
+        least, profile = (
+            other.least_clearance(hand, far, present),
+            other.clearance_profile(hand, there, present),
+        )
+        if whole_arm and given is None:
+            least = np.where(own.min(axis=1) < 0.0, own.min(axis=1), least)
+            profile = np.where(own < 0.0, own, profile[..., 0])[..., None]
+            nothing = model.least_clearance(hand, far[:, :0], present[:, :0])
+            np.testing.assert_array_equal(nothing < 0.0, own.min(axis=1) < 0.0)
+        np.testing.assert_allclose(model.least_clearance(hand, far, present, given), least, atol=1e-12)
+        np.testing.assert_allclose(model.clearance_profile(hand, there, present, given), profile, atol=1e-12)
+    assert 0.01 < (own.min(axis=1) < 0.0).mean() < 0.5
 
 
 def test_the_arm_collides_with_itself_and_with_the_table():

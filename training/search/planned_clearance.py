@@ -144,13 +144,19 @@ def least_clearance(
     hand = np.asarray(moves.path, np.float32).swapaxes(1, 2)
     number, instants, plans, _ = hand.shape
     least: Single = np.full((number, plans), MAX_CLEARANCE, np.float32)
-    least = task.collision_model.with_self_clearance(least, hand, time_axis=1)
+    bodies = _bodies(hand, task)
+    if task.collision_model.may_touch_itself:
+        parts = [(each.first, each.second) for each in bodies if each.second is not None]
+        # Components stay contiguous in memory.
+        ends = np.stack([[np.moveaxis(end, -1, 0) for end in part] for part in parts])
+        links = np.moveaxis(ends, (0, 1, 2), (-3, -2, -1))
+        least = task.collision_model.with_self_clearance(least, links, time_axis=1)
     if not obstacles.rows.shape[1]:
         return least
     drift, elapsed = None, moves.duration[:, None].astype(np.float32) * FRACTIONS[:, None].astype(np.float32)
     if obstacles.velocity is not None:
         drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
-    bodies, profiles = _bodies(hand, task), []
+    profiles = []
     flat = [body.map(lambda ends: ends.reshape(number, instants * plans, -1)) for body in bodies]
     every = [each.distance_squared(obstacles.rows, drift) for each in flat]
     if until < np.inf:
