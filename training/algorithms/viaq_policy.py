@@ -55,7 +55,7 @@ PROPOSALS = 32
 LOCAL_ROUNDS = 4
 """Rounds of checks around the best checked plans."""
 CHECKED_INSTANTS = 16
-"""Number of instants at which plans are evaluated if the best of them are checked exactly."""
+"""Number of instants, for each via-point, at which plans are evaluated if the best of them are checked exactly."""
 SHORTEST_AXIS = 1e-9
 """Length below which the axis of a capsule is that of a sphere, [m]."""
 POSITIONS = 1 << 16
@@ -209,9 +209,10 @@ class ViaQPolicy(BasePolicy):
             observation: Parts of B observations, shape (B, .) each.
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
-            coarse: Evaluate the pair networks for near pairs and at most CHECKED_INSTANTS instants only.
+            coarse: Evaluate the pair networks for near pairs and at most CHECKED_INSTANTS instants a via-point only.
         """
-        shares = self.shares[:: max(self.instants // CHECKED_INSTANTS, 1)] if coarse else self.shares
+        fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
+        shares = self.shares[::fewer] if coarse else self.shares
         inputs = self.inputs(observation, actions, scene, shares)
         values: Numbers = self.critic.merit(self.critic(inputs, near=coarse)).numpy()
         if self.replanning:
