@@ -129,7 +129,7 @@ def test_it_takes_the_candidate_of_the_greatest_value(simulation):
     np.testing.assert_array_equal(policy.decide(observation), actions[np.arange(16), values.argmax(axis=1)])
 
 
-@pytest.mark.parametrize("checks", [1, 12, 1_000])
+@pytest.mark.parametrize("checks", [1, 12, viaq_policy.PROPOSALS])
 def test_of_the_candidates_that_are_checked_it_takes_the_best(simulation, checks, monkeypatch):
     policy, observation = policy_for(simulation, checks=checks), simulation.observe(scenes_of(simulation))
     every, values = policy.propose(observation)
