@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<version>[0-9.]+)")
-EXTRAS = ("training", "cluster", "tuning")
+EXTRAS = ("training", "tuning")
 TOOLS = [
     "pytest",
     "pytest-xdist",
