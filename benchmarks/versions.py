@@ -35,6 +35,7 @@ TOOLS = [
     "ruff",
     "mypy",
     "coal",
+    "ray",
 ]
 
 
