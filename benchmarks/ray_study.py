@@ -1,6 +1,6 @@
 """Wall time of a study on two Ray nodes of one core each, relative to two local processes, in alternating runs.
 
-    python benchmarks/ray_study.py --json docs/studies.json
+    python benchmarks/ray_study.py --json runs/ray_study.json
 
 takes about four minutes on two idle cores. Both nodes are on this machine. A round runs the same study in both ways,
 every other round in the opposite order, and compares weights and evaluations. The time of a run includes the start of
@@ -146,6 +146,7 @@ def main() -> None:
     if options.json and options.json.is_file():
         before = json.loads(options.json.read_text())
         rounds = before["rounds"] if before["settings"] == settings else []
+    result: dict[str, Any] = {}
     for _ in range(options.rounds):
         found: dict[str, Any] = {"free_cores": free_cores()}
         for way in WAYS if len(rounds) % 2 else WAYS[::-1]:
@@ -155,16 +156,17 @@ def main() -> None:
                 flush=True,
             )
         rounds.append(found)
-    result = {
-        "settings": settings,
-        "efficiency": ratios(rounds, "study_s"),
-        "efficiency_processor": ratios(rounds, "processor_s"),
-        "equal_results": len({each[way]["sha256"] for each in rounds for way in WAYS}) == 1,
-        "rounds": rounds,
-    }
+        result = {
+            "settings": settings,
+            "efficiency": ratios(rounds, "study_s"),
+            "efficiency_processor": ratios(rounds, "processor_s"),
+            "equal_results": len({each[way]["sha256"] for each in rounds for way in WAYS}) == 1,
+            "rounds": rounds,
+        }
+        if options.json:
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+            options.json.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps({name: each for name, each in result.items() if name != "rounds"}, indent=1))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -164,9 +164,20 @@ class RayRunner:
         return found, True
 
     def _collect(self, running: dict[Any, _Task]) -> None:
-        """Write the files that have come from nodes."""
+        """Write the files that have come from nodes.
+
+        Raises:
+            ConnectionError: The cluster is lost.
+        """
         tasks = {task.job.label: task for task in running.values()}
-        for label, attempt, changes in self._ray.get(self._collector.take.remote()):
+        try:
+            collected = self._ray.get(self._collector.take.remote())
+        except self._ray.exceptions.RayError as error:
+            reason = " ".join(str(error).split())[:200]
+            raise ConnectionError(
+                f"the Ray cluster is lost; finished jobs are kept, and the same command goes on ({reason})"
+            ) from error
+        for label, attempt, changes in collected:
             if label in tasks and attempt == tasks[label].attempt:  # a node may seem lost and live on
                 unpack(changes, self._root / tasks[label].job.folder)
 
