@@ -35,7 +35,8 @@ BUDGET = 5.0
 """Wall time after which no further decision of a method is timed, [s]."""
 MOST_CHECKS = 1 << 16
 """Greatest number of checks of a search of equal time."""
-FEWEST_CHECKS = 4
+FEWEST_CHECKS = 64
+"""Checks with which the search of equal time begins. With fewer often no plan is clear, and a decision takes longer."""
 
 
 class Timed(NamedTuple):
