@@ -14,7 +14,8 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.envs.single_env import ReachVectorEnv
 
 NUMBER, WHOLE_PANDA = 60, CollisionModel(PANDA, whole_arm=True)
-FAMILIES = {name: family.n_obstacles for name, family in scene_families(3).items()}
+IN_SPACE = scene_families(3)
+FAMILIES = {name: family.n_obstacles for name, family in IN_SPACE.items()}
 BEAMS = ("slot", "window", "tunnel")
 
 
@@ -30,7 +31,8 @@ def scenes():
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_can_begin_and_end_and_stands_in_the_way_of_the_straight_movement(family):
-    scenes = drawn(24, families=(family,))
+    boxes = {} if IN_SPACE[family].shapes == ("capsule",) else {"shapes": ("box",), "n_obstacles": (1, 8)}
+    scenes = drawn(24, families=(family,), **boxes)
     check_scenes(scenes, WHOLE_PANDA)
     assert (scenes.present.sum(axis=-1) >= FAMILIES[family]).all()
     line = scenes.start[:, None] + (scenes.goal - scenes.start)[:, None] * np.linspace(0, 1, 60)[:, None]
@@ -123,7 +125,7 @@ def test_a_distribution_that_cannot_be_sampled_is_refused(bad, message):
 
 
 def test_an_arm_may_be_named_and_a_task_is_plain_values():
-    with pytest.raises(ValueError, match=r"one of planar, panda, got 'ur5'"):
+    with pytest.raises(ValueError, match=r"one of planar, panda, panda-fine, got 'ur5'"):
         ReachVectorEnv(1, arm="ur5")
     task = ReachVectorEnv(1, arm="panda", whole_arm=True).task
     assert Task.from_dict(task.as_dict(), {"panda": PANDA}) == task
