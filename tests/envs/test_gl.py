@@ -90,7 +90,7 @@ def test_rendering_can_be_forbidden(monkeypatch):
         env.render()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
+@pytest.mark.skipif(sys.platform != "linux", reason="macOS and Windows always have a display")
 def test_a_window_without_a_display_names_the_other_modes(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -108,7 +108,7 @@ def test_a_window_without_a_display_names_the_other_modes(monkeypatch):
         ("", True, ("glfw", "egl")),
     ],
 )
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the choice")
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa can be chosen on Linux only")
 def test_egl_is_chosen_without_a_display_and_a_wish_is_respected(monkeypatch, wish, display, platforms):
     monkeypatch.setattr(gl, "_has_display", lambda: display)
     assert gl._platforms(wish) == platforms

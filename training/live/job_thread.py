@@ -44,7 +44,7 @@ class JobThread(threading.Thread):
             return not self._jobs and not self._busy
 
     def post(self, key: str, job: Job) -> None:
-        """Let the thread do a job; a waiting one of the same key is replaced."""
+        """Hand a job to the thread; a waiting one of the same key is replaced."""
         with self._wake:
             self._jobs.pop(key, None)
             self._jobs[key] = job

@@ -254,7 +254,7 @@ class SceneView:
         self.move_handle(name, point)
 
     def _make_draggable(self, handle: Any, name: str) -> None:
-        """Let a handle be dragged: horizontally, or vertically in space while Shift is held."""
+        """Make a handle draggable: horizontally, or vertically in space while Shift is held."""
 
         async def level(event: Any) -> None:
             self._dragged(event, name, upright=False)

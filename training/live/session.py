@@ -117,7 +117,7 @@ class Session:
         self._jobs.join(timeout)
 
     def post(self, key: str, job: Job) -> None:
-        """Let the thread do a job; a waiting one of the same key is replaced."""
+        """Hand a job to the thread; a waiting one of the same key is replaced."""
         self._jobs.post(key, job)
 
     def load(self, content: bytes) -> None:
