@@ -8,7 +8,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FRAGMENT = re.compile(
-    r"(What|Of|How|Whether|That|Where|They|It|As|The same|Who|Whose|Which|Why|By|Those|Both|Also|For|From|With|In|Let)\b"
+    r"(What|Of|How|Whether|That|Where|They|It|As|The same|Who|Whose|Which|Why|By|Those|Both|Also|For|From|With|In|"
+    r"Let)\b"
 )
 """Beginnings of sentences that depend on something outside the docstring."""
 FILES = sorted(

@@ -96,7 +96,8 @@ class Box(Shape):
             t[inside] = lowest_of_lines(*(xp.stack(each) for each in zip(*lines, strict=True)))
         return t
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         return np.asarray(np.sign(directions) * to_numpy(self.size))
 
 

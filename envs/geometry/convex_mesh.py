@@ -176,7 +176,8 @@ class ConvexMesh(Shape):
         t = best_of(np, at, (beside, within, np.zeros(number), np.ones(number)))
         return like(xp, t.reshape(first.shape), first)
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         return np.asarray(self.vertices[(directions @ self.vertices.T).argmax(axis=1)])
 
 

@@ -89,7 +89,8 @@ class Cylinder(Shape):
             t[inside] = best_of(xp, part.signed, (t[inside], *part.deepest()))
         return t
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         flat = directions * np.array([1.0, 1.0, 0.0])
         size = np.sqrt((flat * flat).sum(axis=-1, keepdims=True))
         side = float(self.radius) * flat / np.where(size > 0.0, size, 1.0)

@@ -112,6 +112,7 @@ class PointCloud(Shape):
             found[some] = t[squared.argmin(axis=0), np.arange(t.shape[1])]
         return like(xp, found.reshape(first.shape), first)
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         farthest = self.points[(directions @ self.points.T).argmax(axis=1)]
         return np.asarray(farthest + float(self.radius) * directions)

@@ -76,7 +76,8 @@ class Sphere(Shape):
     def _nearest(self, start: Components, along: Components) -> Array:
         return nearest_to_origin(start, along)
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         return np.asarray(self.radius * directions)
 
 
@@ -170,6 +171,7 @@ class Capsule(Shape):
         squared = point_axis_squared(points, self._half_axis)
         return namespace_of(squared).sqrt(squared + GUARD) - self.radius
 
-    def _support(self, directions: Float) -> Float:
+    def support(self, directions: Float) -> Float:
+        """Return the farthest points; see :meth:`Shape.support`."""
         ends = np.sign(directions[:, 2:]) * np.array([0.0, 0.0, float(self.half_length)])
         return np.asarray(self.radius * directions + ends)

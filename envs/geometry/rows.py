@@ -19,7 +19,7 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shape import Shape, frame_axes
 from viapoint.envs.geometry.shapes import SHAPES, as_obstacles
 from viapoint.primitives.array_api import Array, to_numpy
 
@@ -44,6 +44,11 @@ class ShapeColumns(NamedTuple):
     """Half lengths, shape (..., 3), [m]."""
 
 
+def shape_number(kind: str) -> int:
+    """Return the index of a shape in SHAPES, which stands for it in rows."""
+    return list(SHAPES).index(kind)
+
+
 def row_size(dimension: int, shapes: Sequence[str] = CAPSULES) -> int:
     """Return the number of values of a row, for scenes of some shapes in D dimensions."""
     return 2 * dimension + 1 + (0 if tuple(shapes) == CAPSULES else SHAPE_SIZE)
@@ -65,7 +70,7 @@ def shape_columns(rows: Float) -> ShapeColumns:
     if not has_shapes(rows):
         axis, radius = in_space(rows[..., d : 2 * d]), rows[..., -1]
         length = norm(axis)
-        kind = np.full(rows.shape[:-1], _number("capsule"))
+        kind = np.full(rows.shape[:-1], shape_number("capsule"))
         half = np.stack((radius, radius, length + radius), axis=-1)
         return ShapeColumns(kind, in_space(rows[..., :d]), turn_up_to(axis, length), half)
     columns = rows[..., 2 * d : -1]
@@ -86,7 +91,7 @@ def shape_rows(kind: str, centre: Float, quaternion: Float, half: Float) -> Floa
     local, radius = SHAPES[kind].bound(half)
     axes = rotation_axes(quaternion)
     half_axis = local[..., :1] * axes[0] + local[..., 1:2] * axes[1] + local[..., 2:] * axes[2]
-    number = np.full_like(half[..., :1], _number(kind))
+    number = np.full_like(half[..., :1], shape_number(kind))
     parts = (centre, half_axis[..., : centre.shape[-1]], number, quaternion, half, radius[..., None])
     return np.concatenate(parts, axis=-1)
 
@@ -103,12 +108,8 @@ def widened(rows: Float) -> Float:
 
 def rotation_axes(quaternion: Float) -> tuple[Float, Float, Float]:
     """Return the axes of frames, shape (..., 3) each, from their quaternions, shape (..., 4)."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
-    return (
-        np.stack((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)), axis=-1),
-        np.stack((2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)), axis=-1),
-        np.stack((2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)), axis=-1),
-    )
+    first, second, third = (np.stack(axis, axis=-1) for axis in frame_axes(quaternion))
+    return first, second, third
 
 
 def turn_up_to(axis: Float, length: Float) -> Float:
@@ -244,7 +245,7 @@ def observed_rows(rows: Float, shapes: Sequence[str]) -> Float:
     """Return rows with shapes, shape (..., n, .), as those of :func:`observation_rows`."""
     kind, centre, quaternion, half = shape_columns(rows)
     present = rows[..., -1:] > 0.0
-    one_hot = kind[..., None] == np.array([_number(name) for name in shapes])
+    one_hot = kind[..., None] == np.array([shape_number(name) for name in shapes])
     first, second, _ = rotation_axes(quaternion)
     found = np.concatenate((one_hot, centre, first, second, half, present), axis=-1)
     return np.where(present, found, 0.0)
@@ -302,10 +303,6 @@ def check_shapes(shapes: Any) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names) or not set(names) <= set(known):
         raise ValueError(f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}")
     return names
-
-
-def _number(kind: str) -> int:
-    return list(SHAPES).index(kind)
 
 
 def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -> Float:

@@ -4,12 +4,13 @@ A shape is a frozen record of its parameters and its pose. All distances are sig
 kind is a subclass with a few methods that work in the shape's own frame, and an entry in
 :data:`~viapoint.envs.geometry.shapes.SHAPES`:
 
-    _signed      signed distance of points
-    _support     farthest point in each direction
-    geoms        MuJoCo geoms
-    _nearest     optional: point of a segment with the least signed distance; a search by default
-    _of_half     optional: parameters from the half lengths of the bounding box; `size` by default
-    bound        optional: capsule around the shape; around its bounding box by default
+    _signed          signed distance of points
+    geoms            MuJoCo geoms
+    bounding_sphere  sphere around the shape
+    support          farthest point in each direction
+    _nearest         optional: point of a segment with the least signed distance; a search by default
+    _of_half         optional: parameters from the half lengths of the bounding box; `size` by default
+    bound            optional: capsule around the shape; around its bounding box by default
 
 The signed distance of a segment is the least of its points'. It is the usual distance of two bodies where they do not
 touch, and negative where they overlap. For a convex shape it is convex along the segment, because the signed distance
@@ -18,6 +19,7 @@ from a convex body is the supremum of affine functions n . x - h(n) over its out
 
 from __future__ import annotations
 
+import abc
 import functools
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
@@ -78,7 +80,7 @@ class Geom(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shape:
+class Shape(abc.ABC):
     """Obstacle of some shape at some pose.
 
     Parameters may have leading axes, which are those of a batch: `Sphere(radius, position)` with shapes (N,) and (N, 3)
@@ -177,13 +179,13 @@ class Shape:
         return (_with_gradient(xp, at, along, least) if follows_gradient(least) else least) - radius
 
     @property
+    @abc.abstractmethod
     def bounding_sphere(self) -> tuple[Array, Array]:
         """Centre, shape (..., 3), and radius, shape (...,), of a sphere that contains the shape, [m]."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def _signed(self, points: Components) -> Array:
         """Return the signed distance of points in the shape's frame."""
-        raise NotImplementedError
 
     def _nearest(self, start: Components, along: Components) -> Array:
         """Return t in [0, 1] for which the signed distance of start + t * along is least, in the shape's frame.
@@ -273,16 +275,16 @@ class Shape:
         turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
         outward = np.stack((np.cos(turn), np.sin(turn), np.zeros_like(turn)), axis=-1)
         matrix = self.rotation
-        points = self._support(outward @ matrix) @ matrix.T + to_numpy(self.position)
+        points = self.support(outward @ matrix) @ matrix.T + to_numpy(self.position)
         return [points[:, :2]]
 
+    @abc.abstractmethod
     def geoms(self) -> list[Geom]:
         """Return the MuJoCo geoms that make up the shape."""
-        raise NotImplementedError
 
     def box(self) -> tuple[Float, Float]:
         """Return the bounding box along the frame's axes: its centre in the world and half lengths, shape (3,), [m]."""
-        reach = self._support(np.concatenate((np.eye(3), -np.eye(3))))
+        reach = self.support(np.concatenate((np.eye(3), -np.eye(3))))
         high, low = np.diagonal(reach[:3]), np.diagonal(reach[3:])
         return to_numpy(self.position) + self.rotation @ (0.5 * (high + low)), 0.5 * (high - low)
 
@@ -299,9 +301,13 @@ class Shape:
         """Axes of the frame as columns of a rotation matrix, shape (..., 3, 3)."""
         return np.stack([np.stack([to_numpy(c) for c in axis], axis=-1) for axis in self._axes], axis=-1)
 
-    def _support(self, directions: Float) -> Float:
-        """Return the point of the shape that is farthest in each direction, in its frame, shape (K, 3), [m]."""
-        raise NotImplementedError
+    def support(self, directions: Float) -> Float:
+        """Return the point of the shape that is farthest in each direction, in its frame, shape (K, 3), [m].
+
+        Raises:
+            TypeError: The shape has no end.
+        """
+        raise TypeError(f"{self.kind} has no farthest points")
 
     def _geom(self, geom: Any, *size: Any) -> list[Geom]:
         """Return one geom at the shape's pose."""
@@ -310,7 +316,7 @@ class Shape:
 
     # Parameters
 
-    def _check(self) -> None:
+    def _check(self) -> None:  # noqa: B027  (most shapes have nothing to check)
         """Check what parameters must fulfil together."""
 
     def _error(self, message: str) -> ValueError:
@@ -338,13 +344,8 @@ class Shape:
 
     @functools.cached_property
     def _axes(self) -> tuple[Components, Components, Components]:
-        """Components of the axes of the shape's frame, from the quaternion."""
-        w, x, y, z = (self.quaternion[..., i] for i in range(4))
-        return (
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
-            [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
-            [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
-        )
+        """Components of the axes of the shape's frame."""
+        return frame_axes(self.quaternion)
 
     def _placed(self, centre: Float, radius: Array) -> tuple[Array, Array]:
         """Return a sphere around a point of the shape's frame, with its centre in the world."""
@@ -380,6 +381,16 @@ def _with_gradient(xp: Namespace, function: Any, t: Array, least: Array) -> Arra
         weight = (behind - least) / xp.where(kink, slopes, 1.0)
     mean = weight * before + (1.0 - weight) * behind
     return xp.where(kink, least.detach() + mean - mean.detach(), least)
+
+
+def frame_axes(quaternion: Array) -> tuple[Components, Components, Components]:
+    """Return the components of the axes of frames from their quaternions, shape (..., 4)."""
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    return (
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
+        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
+        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
+    )
 
 
 def quaternion_to(direction: Any) -> Float:

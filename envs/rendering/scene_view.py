@@ -11,7 +11,7 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns
+from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns, shape_number
 from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.shapes import GLOWING, ShapeWriter, resampled
@@ -156,7 +156,7 @@ class SceneView:
         for row in np.flatnonzero(scene.present[0]):
             numbers = scene.obstacles[0, row]
             kind, *_ = shape_columns(numbers)
-            if has_shapes(numbers) and kind != list(SHAPES).index("capsule"):
+            if has_shapes(numbers) and kind != shape_number("capsule"):
                 self._draw_shape(shapes, numbers, PALETTE.contact if row == in_contact else PALETTE.obstacle)
                 continue
             centre, radius = in_space(numbers[:dimension], self._floor), float(numbers[-1])

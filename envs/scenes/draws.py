@@ -10,7 +10,15 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Bool, Float, Index
-from viapoint.envs.geometry.rows import CAPSULES, dimension_of, shape_columns, shape_rows, turn_up_to, widened
+from viapoint.envs.geometry.rows import (
+    CAPSULES,
+    dimension_of,
+    shape_columns,
+    shape_number,
+    shape_rows,
+    turn_up_to,
+    widened,
+)
 from viapoint.envs.geometry.shape import TALL
 from viapoint.envs.geometry.shapes import SHAPES
 
@@ -207,7 +215,7 @@ def reshaped(rows: Float, u: Float, shapes: Sequence[str]) -> Float:
     if not names or tuple(shapes) == CAPSULES:
         return rows if tuple(shapes) == CAPSULES else widened(rows)
     found = widened(rows).copy()
-    capsule = (rows[..., -1] > 0.0) & (shape_columns(rows).kind == list(SHAPES).index("capsule"))
+    capsule = (rows[..., -1] > 0.0) & (shape_columns(rows).kind == shape_number("capsule"))
     which = np.where(capsule, (u[..., 0] * len(names)).astype(np.int64), -1)
     for number, name in enumerate(names):
         some = which == number

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from viapoint.envs.geometry.rows import rotation_axes, shape_columns
+from viapoint.envs.geometry.rows import rotation_axes, shape_columns, shape_number
 from viapoint.envs.geometry.shapes import SHAPES
 
 PART = {2: 0.0625, 3: 0.15}
@@ -102,8 +102,7 @@ def whole_obstacles(
     """
     scene, obstacle = np.nonzero(rows[..., -1] > 0.0)
     kind, centre, quaternion, half = shape_columns(rows[scene, obstacle])
-    known = list(SHAPES)
-    one_hot = kind[:, None] == np.array([known.index(name) for name in shapes])
+    one_hot = kind[:, None] == np.array([shape_number(name) for name in shapes])
     turned = np.isin(kind, [number for number, shape in enumerate(SHAPES.values()) if shape.round])
     space = np.zeros((len(scene), 3))
     if velocity is not None:

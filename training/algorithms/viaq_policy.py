@@ -254,18 +254,18 @@ class ViaQPolicy(BasePolicy):
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m)."""
         actions, values = self.propose(observation)
-        rows = np.arange(len(actions))
+        every = np.arange(len(actions))
         if not self.checks:
-            return np.asarray(actions[rows, values.argmax(axis=1)])
+            return np.asarray(actions[every, values.argmax(axis=1)])
         count = min(self.checks, values.shape[1])
         local = max(count - PROPOSALS, 0)
         checked = np.take_along_axis(actions, self._promising(values, count - local)[..., None], axis=1)
         worth = self._score(observation, checked)
-        best: Numbers = checked[rows, worth.argmax(axis=1)]
-        if not self.replanning:
-            rows = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
-        if local and len(rows):
-            best[rows] = self._improved(take_rows(observation, rows), checked[rows], worth[rows], local)
+        best: Numbers = checked[every, worth.argmax(axis=1)]
+        unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
+        some = every if self.replanning else unsolved
+        if local and len(some):
+            best[some] = self._improved(take_rows(observation, some), checked[some], worth[some], local)
         return np.asarray(best)
 
     def _improved(self, observation: Observation, checked: Numbers, worth: Numbers, count: int) -> Numbers:

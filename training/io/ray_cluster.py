@@ -65,9 +65,7 @@ def connect(address: str | None = None, cpus: int | None = None) -> bool:
     try:
         if address is not None:
             _check_listens(address)
-            if (
-                _has_token()
-            ):  # without this mode, which Ray reads when it is imported, a driver sends no token
+            if _has_token():  # a driver sends it only in this mode, which Ray reads when it is imported
                 os.environ.setdefault("RAY_AUTH_MODE", "token")
         import_ray().init(address=address or "local", **settings)
     except ImportError:

@@ -112,7 +112,7 @@ def _shape_mesh(row: Float, floor: float, height: float) -> Triangles:
         points = half * trimesh.creation.box(extents=(2.0, 2.0, 2.0)).vertices @ shape.rotation.T
     else:
         directions = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
-        points = shape._support(directions @ shape.rotation) @ shape.rotation.T
+        points = shape.support(directions @ shape.rotation) @ shape.rotation.T
     hull = trimesh.convex.convex_hull(points)
     return Triangles(np.asarray(hull.vertices), np.asarray(hull.faces))
 
