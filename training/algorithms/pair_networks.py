@@ -167,24 +167,28 @@ class PairMinimum(nn.Module):
         distance = self.geometry.gap(apart, axis, columns, poses)
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
         flat = (distance <= (nearest + NEAR)[:, None]).flatten().nonzero()[:, 0]
-        _, rows, _, instants = distance.shape
-        pose = flat % (plans * instants)  # index of plan and instant
-        plan, of_body = pose // instants, flat // (plans * instants)
-        body, row = of_body // rows, of_body % rows
-        along = body * (plans * instants) + pose
+        bodies, rows, _, instants = distance.shape
+        of_body, pose = flat // (plans * instants), flat % (plans * instants)
+        plan = pose // instants
+        body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(flat), of_body)
+        along = None if axis is None else body * (plans * instants) + pose
         features = self.geometry.features(
             [each.expand_as(distance).flatten()[flat] for each in apart],
             None if axis is None else [each.flatten()[along] for each in axis],
             [each[:, 0, 0][row] for each in columns],
         )
         features += self._sizes(poses, body)
-        # Pairs are in the order of their bodies, and so of their networks.
-        network = torch.tensor(self.network_of)[body]
-        counts = torch.bincount(network, minlength=len(self.networks.nearness)).tolist()
-        pieces = zip(*(torch.split(each, counts) for each in features), strict=True)
-        values = [self._evaluate([each[None] for each in piece], h)[0] for h, piece in enumerate(pieces)]
+        if len(self.networks.nearness) == 1:
+            values = self._evaluate([each[None] for each in features])[0]
+        else:  # pairs are in the order of their bodies, and so of their networks
+            network = torch.tensor(self.network_of)[body]
+            counts = torch.bincount(network, minlength=len(self.networks.nearness)).tolist()
+            pieces = zip(*(torch.split(each, counts) for each in features), strict=True)
+            values = torch.cat(
+                [self._evaluate([each[None] for each in piece], h)[0] for h, piece in enumerate(pieces)]
+            )
         least = torch.full((plans,), torch.inf)
-        return least.scatter_reduce_(0, plan, torch.cat(values), "amin") * UNIT
+        return least.scatter_reduce_(0, plan, values, "amin") * UNIT
 
     def _least(self, poses: Poses, parts: Parts, late: Tensor | None) -> Tensor:
         """Return the least value of each plan, shape (B, H)."""

@@ -78,7 +78,8 @@ class ViaQPolicy(BasePolicy):
         instants: Instants of a plan at which the pair networks are evaluated. The default is 16 if every link must
             clear obstacles, and 32 if only the hand must.
         candidates: Number of Sobol points in the action space.
-        refinements: Rounds of candidates around the best ones.
+        refinements: Rounds of candidates around the best ones. If plans of single movements are checked and only the
+            hand must clear obstacles, one round has the candidates of all.
         per_refinement: Candidates of each round.
         checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
     """
@@ -192,7 +193,7 @@ class ViaQPolicy(BasePolicy):
         scene = scene or self.scene(observation)
         return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def values(
         self,
         observation: Observation,
@@ -220,7 +221,10 @@ class ViaQPolicy(BasePolicy):
         return values
 
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
-        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero."""
+        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero.
+
+        In single movements of which only the hand must clear obstacles, checks make up for a second round.
+        """
         block = max(POSITIONS // (self.candidates * self.instants), 1)
         number = len(observation["hand"])
         if number > block:
@@ -231,24 +235,26 @@ class ViaQPolicy(BasePolicy):
             return actions, values
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
         actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
-        coarse = self.checks > 0
+        coarse, rounds, size = self.checks > 0, self.refinements, self.per_refinement
+        if coarse and rounds and not (self.task.whole_arm or self.replanning):
+            rounds, size = 1, rounds * size
         values = self.values(observation, actions, scene, coarse=coarse)
-        for each in range(self.refinements):
-            near = self._near(actions, values, each)
+        for each in range(rounds):
+            near = self._near(actions, values, each, size)
             actions = np.concatenate((actions, near), axis=1)
             values = np.concatenate((values, self.values(observation, near, scene, coarse=coarse)), axis=1)
         return actions, values
 
-    def _near(self, actions: Numbers, values: Numbers, each: int) -> Numbers:
-        """Return candidates around the best ones, shape (B, per_refinement, m)."""
+    def _near(self, actions: Numbers, values: Numbers, each: int, size: int) -> Numbers:
+        """Return `size` candidates around the best ones, shape (B, size, m)."""
         best = min(N_ELITES, actions.shape[1])
         top = np.argpartition(-values, best - 1, axis=1)[:, :best]
-        return self._around(np.take_along_axis(actions, top[..., None], axis=1), each)
+        return self._around(np.take_along_axis(actions, top[..., None], axis=1), each, size)
 
-    def _around(self, centres: Numbers, each: int) -> Numbers:
-        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
-        steps = normal_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
-        around = centres[:, np.arange(self.per_refinement) % centres.shape[1]]
+    def _around(self, centres: Numbers, each: int, size: int) -> Numbers:
+        """Return `size` candidates of a round around some of shape (B, ., m), shape (B, size, m)."""
+        steps = normal_steps(size, self.task.action.size, each) * (SPREAD * 0.5**each)
+        around = centres[:, np.arange(size) % centres.shape[1]]
         return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
     def decide(self, observation: Observation) -> Numbers:
@@ -277,7 +283,7 @@ class ViaQPolicy(BasePolicy):
         for each in range(LOCAL_ROUNDS):
             share = (count + each) // LOCAL_ROUNDS
             if share:
-                near = self._around(best_actions(checked, worth)[0], each)
+                near = self._around(best_actions(checked, worth)[0], each, self.per_refinement)
                 _, bound = reward_bounds(observation, near, self.task, REACH_MARGIN)
                 clear = worth.max(axis=1, keepdims=True) > 0.5 * INFEASIBLE
                 top = np.argsort(np.where(clear, -bound, 0.0), axis=1, kind="stable")[:, :share]
