@@ -129,6 +129,26 @@ def test_it_takes_the_candidate_of_the_greatest_value(simulation):
     np.testing.assert_array_equal(policy.decide(observation), actions[np.arange(16), values.argmax(axis=1)])
 
 
+@pytest.mark.parametrize("checks", [0, 8])
+def test_rounds_of_refinement_merge_where_only_the_hand_must_clear_and_plans_are_checked(
+    simulation, checks, monkeypatch
+):
+    policy, observation = (
+        policy_for(simulation, checks=checks, refinements=2),
+        simulation.observe(scenes_of(simulation)),
+    )
+    sizes, values = [], policy.values
+
+    def observed(observation, actions, *rest, **kwargs):
+        sizes.append(actions.shape[1])
+        return values(observation, actions, *rest, **kwargs)
+
+    monkeypatch.setattr(policy, "values", observed)
+    assert policy.propose(observation)[0].shape[1] == 32 + 2 * 16
+    merged = checks > 0 and not simulation.task.whole_arm and not policy.replanning
+    assert sizes == ([32, 32] if merged else [32, 16, 16])
+
+
 @pytest.mark.parametrize("checks", [1, 12, viaq_policy.PROPOSALS])
 def test_of_the_candidates_that_are_checked_it_takes_the_best(simulation, checks, monkeypatch):
     policy, observation = policy_for(simulation, checks=checks), simulation.observe(scenes_of(simulation))
