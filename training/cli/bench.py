@@ -7,7 +7,7 @@ beside them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -62,14 +62,12 @@ def run(config: BenchConfig, console: Console | None = None) -> None:
     """Measure and print all ratios, and write them to a file if asked to."""
     ratios = bench(config)
     table = Table("what", "measured", "floor", "unit", "ratio")
-    for ratio in ratios:
-        table.add_row(
-            ratio.name, _shown(ratio.measured), _shown(ratio.floor), ratio.unit, f"{ratio.ratio:.2f}"
-        )
+    for name, measured, floor, unit, ratio in ratios:
+        table.add_row(name, _shown(measured), _shown(floor), unit, f"{ratio:.2f}")
     (console or Console()).print(table)
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
-        write_json(config.json, {ratio.name: ratio._asdict() for ratio in ratios})
+        write_json(config.json, {each.name: each._asdict() for each in ratios})
 
 
 def fastest(repeats: int, *calls: Callable[[], Any]) -> list[float]:
@@ -158,12 +156,8 @@ def _engine(
 ) -> Callable[[], Any]:
     """Return a rollout of the engine alone with the same controls, scenes and records as in the environment."""
     number = len(actions)
-    simulator = Simulator(
-        task.collision_model,
-        n_obstacles=task.observation.n_rows,
-        num_envs=number,
-        threads=threads,
-    )
+    rows = task.observation.n_rows
+    simulator = Simulator(task.collision_model, n_obstacles=rows, num_envs=number, threads=threads)
     joints = np.asarray(task.arm.inverse_kinematics(scenes.start))
     simulator.place(np.arange(number), joints, scenes.obstacles, scenes.present)
     movement = task.action.decode(actions.astype(np.float64), scenes.start, scenes.goal).trajectory()
@@ -206,17 +200,8 @@ def _sampling(shared: bool, repeats: int) -> Ratio:
 def _make_vec_env(env_id: str, num_envs: int, repeats: int) -> Ratio:
     """Return decisions per second of `make_vec_env` of Stable-Baselines3 and of ViaVecEnv, each on its defaults."""
     envs: list[VecEnv] = [make_vec_env(env_id, num_envs), ViaVecEnv(env_id, num_envs)]
-    for env in envs:
-        env.reset()
     actions = _actions(envs[0].action_space, num_envs)
-    theirs, mine = (
-        num_envs / each for each in fastest(repeats, *(partial(env.step, actions) for env in envs))
-    )
-    for env in envs:
-        env.close()
-    return Ratio(
-        f"make_vec_env against ViaVecEnv, {num_envs} environments", theirs, mine, "decisions/s", theirs / mine
-    )
+    return _decisions(f"make_vec_env against ViaVecEnv, {num_envs} environments", envs, actions, repeats)
 
 
 def _workers(env_id: str, num_envs: int, workers: int, repeats: int) -> Ratio:
@@ -225,16 +210,20 @@ def _workers(env_id: str, num_envs: int, workers: int, repeats: int) -> Ratio:
         gym.make_vec(env_id, num_envs=num_envs, workers=workers, threads=1),
         gym.make_vec(env_id, num_envs=num_envs, threads=workers),
     ]
-    for env in envs:
-        env.reset(seed=0)
     actions = _actions(envs[0].single_action_space, num_envs)
-    mine, threads = (
-        num_envs / each for each in fastest(repeats, *(partial(env.step, actions) for env in envs))
-    )
+    name = f"make_vec, {num_envs} environments, {workers} workers against {workers} threads"
+    return _decisions(name, envs, actions, repeats)
+
+
+def _decisions(name: str, envs: Sequence[Any], actions: NDArray[np.float32], repeats: int) -> Ratio:
+    """Return decisions per second of two vector environments."""
+    for env in envs:
+        env.reset()
+    times = fastest(repeats, *(partial(env.step, actions) for env in envs))
     for env in envs:
         env.close()
-    name = f"make_vec, {num_envs} environments, {workers} workers against {workers} threads"
-    return Ratio(name, mine, threads, "decisions/s", mine / threads)
+    first, second = (len(actions) / each for each in times)
+    return Ratio(name, first, second, "decisions/s", first / second)
 
 
 def _shown(value: float) -> str:

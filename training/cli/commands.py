@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
-from viapoint.training.algorithms.agent import Agent, load_agent
+from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.cli.progress import progress_bar
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
@@ -47,21 +48,16 @@ def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     agent = None if config.agent is None else load_agent(config.agent)
     run = Run(str(config.agent)) if config.agent and (Path(config.agent) / "config.json").is_file() else None
-    if config.failures is not None:
-        _check_failures(agent)
+    mine = agent.env_id if config.failures is not None and agent is not None else ""
+    if mine in STEP_TASKS or mine in REPLANNING_TASKS:
+        raise ValueError(f"failures are sorted where one action is a whole movement; in {mine} it is not")
     env_id, env_kwargs = task_of(agent, config.env, None)
     check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
     scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
     with progress_bar() as progress:
-        result = measure(
-            agent,
-            env=config.env,
-            scenes=scenes,
-            checks=config.checks,
-            baselines=config.baselines,
-            progress=progress,
-        )
+        given: Any = {"checks": config.checks, "baselines": config.baselines, "progress": progress}
+        result = measure(agent, env=config.env, scenes=scenes, **given)
     record = result.to_dict()
     report.show(record)
     if run is not None:
@@ -88,17 +84,6 @@ def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: 
     name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
     name += "" if number == len(whole.share) else f".first-{number}"
     return name + (".partial" if partial else "")
-
-
-def _check_failures(agent: Agent | None) -> None:
-    """Check that an agent's actions are whole movements.
-
-    Raises:
-        ValueError: Its actions are something else.
-    """
-    env_id = "" if agent is None else agent.env_id
-    if env_id in STEP_TASKS or env_id in REPLANNING_TASKS:
-        raise ValueError(f"failures are sorted where one action is a whole movement; in {env_id} it is not")
 
 
 def play(config: PlayConfig) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -56,8 +55,11 @@ def run(config: DemoConfig) -> None:
         ),
         "movements.mp4": lambda path: _film(path, agent, frozen),
     }
+    weights = model_folder / "weights.safetensors"
     for name, draw in pictures.items():
-        _once(folder / name, model_folder / "weights.safetensors", draw)
+        path = folder / name
+        if not path.exists() or path.stat().st_mtime < weights.stat().st_mtime:
+            draw(path)
     report.show(record)
     for name, what in (
         ("table.md", "the table"),
@@ -115,9 +117,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     path = config.out / "table.json"
     identity = {
         "sha256": frozen.sha256,
-        "weights_sha256": hashlib.sha256(
-            (find_model(config.out) / "weights.safetensors").read_bytes()
-        ).hexdigest(),
+        "weights_sha256": read_json(find_model(config.out) / "model.json")["weights_sha256"],
         "checks": config.checks,
     }
     if path.exists():
@@ -129,8 +129,6 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         agent_method("agent", agent, 0),
         agent_method(f"agent, {config.checks} checks", agent, config.checks),
         agent_method("untrained", untrained(agent), 0),
-    ]
-    methods += [
         *(make_method(name, config.env) for name in BASELINES),
         StoredSolutions(frozen),
     ]
@@ -145,16 +143,6 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    record_video(
-        path,
-        env,
-        frozen.scenes.take(evenly_spread(len(frozen.share), MOVEMENTS)),
-        agent_method("agent", agent, 0).decide,
-    )
+    scenes = frozen.scenes.take(evenly_spread(len(frozen.share), MOVEMENTS))
+    record_video(path, env, scenes, agent_method("agent", agent, 0).decide)
     env.close()
-
-
-def _once(path: Path, source: Path, draw: Callable[[Path], Any]) -> None:
-    """Draw a file unless it exists and is newer than its source."""
-    if not path.exists() or path.stat().st_mtime < source.stat().st_mtime:
-        draw(path)

@@ -97,11 +97,8 @@ def run(config: Any) -> None:
     """Check everything and print it; exit code 1 where something that is needed does not work."""
     findings = list(examine(config.out))
     if config.json:
-        print(
-            json.dumps(
-                {"works": all_works(findings), "findings": [asdict(each) for each in findings]}, indent=1
-            )
-        )
+        record = {"works": all_works(findings), "findings": [asdict(each) for each in findings]}
+        print(json.dumps(record, indent=1))
     else:
         for finding in findings:
             state = "ok" if finding.works else "MISSING" if finding.needed else "without"
@@ -244,11 +241,8 @@ def mujoco_files() -> Finding:
             if "__pycache__" not in file.parts:
                 there += 1
                 gone += [] if Path(str(file.locate())).exists() else [str(file)]
-    found = (
-        f"{there} files of its package are there"
-        if not gone
-        else f"{len(gone)} of {there} are gone, as {gone[0]}"
-    )
+    lost = f"{len(gone)} of {there} are gone, as {gone[0]}" if gone else ""
+    found = lost or f"{there} files of its package are there"
     return Finding(
         name="MuJoCo's files", works=there > 0 and not gone, needed=True, found=found,
         remedy=f"an older version was upgraded in place, which breaks it; mend it with: {REINSTALL}",
@@ -265,10 +259,8 @@ def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) ->
         found = f"no answer within {PATIENCE:.0f} s"
         return Finding(name=name, works=False, needed=needed, found=found, remedy=remedy)
     works = done.returncode == 0
-    said = (done.stdout if works else done.stderr).strip().splitlines() or [
-        f"ended with code {done.returncode}"
-    ]
-    return Finding(name=name, works=works, needed=needed, found=said[-1], remedy=remedy)
+    said = (done.stdout if works else done.stderr).strip() or f"ended with code {done.returncode}"
+    return Finding(name=name, works=works, needed=needed, found=said.splitlines()[-1], remedy=remedy)
 
 
 def attempt(name: str, check: Callable[[], str], remedy: str) -> Finding:

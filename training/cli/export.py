@@ -45,9 +45,8 @@ def run(config: ExportConfig) -> None:
     measured = [*_stored_evaluations(folder, record), *_measured(agent, config.scenes)]
     archive.parent.mkdir(parents=True, exist_ok=True)
     write_archive(agent, archive, record["hyperparameters"])
-    text = model_card(
-        record, archive.name, measured, command=_command(folder, record), license_=_license(config, folder)
-    )
+    license_ = "mit" if config.license is None and folder.parent == SHIPPED else config.license
+    text = model_card(record, archive.name, measured, command=_command(folder, record), license_=license_)
     write_bytes(card, text.encode())
     print(f"{record['algorithm']} on {record['env']['id']}: {archive}, card: {card}")
     if not measured:
@@ -115,11 +114,8 @@ def model_card(
         *_table(evaluations),
         "## Training",
         "",
-        *(
-            ["```sh", command, "```", ""]
-            if command
-            else ["The command that trained the agent is not known.", ""]
-        ),
+        f"```sh\n{command}\n```" if command else "The command that trained the agent is not known.",
+        "",
         f"SHA-256 of the weights (`weights.safetensors` of the model folder): `{record['weights_sha256']}`",
         "",
         f"Written by {', '.join(f'{package} {version}' for package, version in versions().items())}.",
@@ -203,7 +199,3 @@ def _command(folder: Path, record: Mapping[str, Any]) -> str | None:
     if (folder.parent / "config.json").is_file():
         return Run(folder.parent).config.command
     return None
-
-
-def _license(config: ExportConfig, folder: Path) -> str | None:
-    return "mit" if config.license is None and folder.parent == SHIPPED else config.license

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def run(config: ImportConfig) -> None:
     check_env(env_id)
     check_env_arguments(env_kwargs)
     print(WARNING.format(file=config.file), file=sys.stderr)
-    if not (config.trust or _answered_yes()):
+    asks = not config.trust and sys.stdin.isatty()
+    if not (config.trust or (asks and input("open it? [yes/no] ").strip().lower() == "yes")):
         raise NotTrustedError(f"{config.file} was not opened; --trust says that it may be")
     model = convert(config.file, algo, env_id, config.out, **env_kwargs)
     print(f"{algo} of {model.num_timesteps} decisions on {env_id}: {config.out}")
@@ -55,18 +57,12 @@ def convert(path: Path, algo: str, env_id: str, out: Path, **env_kwargs: Any) ->
     Raises:
         BadFileError: The archive cannot be opened, is for another environment, or holds objects of other packages.
     """
-    env = ViaVecEnv(env_id, 1, **env_kwargs)
-    try:
-        model = open_archive(path, ALGORITHMS[algo], env)
-        write_folder(out, lambda temporary: save_model(model, temporary))
-    except (ValueError, KeyError) as error:
-        if isinstance(error, BadFileError):
+    with closing(ViaVecEnv(env_id, 1, **env_kwargs)) as env:
+        try:
+            model = open_archive(path, ALGORITHMS[algo], env)
+            write_folder(out, lambda temporary: save_model(model, temporary))
+        except BadFileError:
             raise
-        raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
-    finally:
-        env.close()
+        except (ValueError, KeyError) as error:
+            raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
     return load_agent(out)
-
-
-def _answered_yes() -> bool:
-    return sys.stdin.isatty() and input("open it? [yes/no] ").strip().lower() == "yes"

@@ -22,13 +22,13 @@ from viapoint.training.config.configs import (
     EvaluateConfig,
     ExportConfig,
     ImportConfig,
+    LiveConfig,
     PaperConfig,
     PlayConfig,
     StudyConfig,
     TrainConfig,
     TuneConfig,
 )
-from viapoint.training.config.live_config import LiveConfig
 
 
 class UsageError(ValueError):
@@ -57,7 +57,7 @@ COMMANDS: dict[str, Command] = {
     "study": Command(StudyConfig, "viapoint.training.study.run", "run"),
     "live": Command(LiveConfig, "viapoint.training.live.page", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
-    "tune": Command(TuneConfig, "viapoint.training.study.tuning", "run"),
+    "tune": Command(TuneConfig, "viapoint.training.study.tuning_report", "run"),
     "export": Command(ExportConfig, "viapoint.training.cli.export", "run"),
     "import-sb3": Command(ImportConfig, "viapoint.training.cli.import_sb3", "run"),
 }
@@ -99,26 +99,16 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         SystemExit: Help was asked for; code 0.
         UsageError: A word is not understood or not allowed.
     """
-    kinds = [
-        Annotated[
-            command.config,
-            tyro.conf.subcommand(name=name, default=usual)
-            if isinstance(usual, command.config)
-            else tyro.conf.subcommand(name=name),
-        ]
-        for name, command in COMMANDS.items()
-    ]
+    kinds = []
+    for name, (kind, *_) in COMMANDS.items():
+        default = {"default": usual} if isinstance(usual, kind) else {}
+        kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, **default)])
     union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(
-                union,
-                prog="viapoint",
-                description=DESCRIPTION,
-                args=list(words),
-                config=(tyro.conf.OmitArgPrefixes,),
-            )
+            config = (tyro.conf.OmitArgPrefixes,)
+            return tyro.cli(union, prog="viapoint", description=DESCRIPTION, args=words, config=config)
     except SystemExit as end:
         if not end.code:
             raise

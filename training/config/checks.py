@@ -176,12 +176,6 @@ def _whole(least: int) -> Allowed:
     return Allowed(f"a whole number, {least} or more", lambda value: _is_whole(value, least))
 
 
-def _between(low: float, high: float) -> Allowed:
-    return Allowed(
-        f"a number from {low:g} to {high:g}", lambda value: _is_number(value) and low <= value <= high
-    )
-
-
 def _or(one: Allowed, other: Allowed) -> Allowed:
     return Allowed(f"{one.words}, or {other.words}", lambda value: one.fits(value) or other.fits(value))
 
@@ -226,7 +220,7 @@ AUTOMATIC = Allowed('"auto" or "auto_START"', _is_automatic)
 AUTO = Allowed('"auto"', lambda value: value == "auto")
 STEPS = Allowed('a whole number, 1 or more, or [N,"step"]', _is_steps)
 SETTINGS = Allowed('settings by name, {"net_arch":[256,256]}', lambda value: isinstance(value, Mapping))
-SHARE = _between(0, 1)
+SHARE = Allowed("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1)
 
 HYPERPARAMETERS: dict[str, Allowed] = {
     "learning_rate": _or(POSITIVE, LINEAR),

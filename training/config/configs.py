@@ -62,17 +62,9 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 40000)
     """
 
-    least: ClassVar = {
-        "seed": 0,
-        "eval_scenes": 1,
-        "n_timesteps": 1,
-        "min_timesteps": 1,
-        "n_envs": 1,
-        "eval_every": 0,
-        "observe_candidates": 0,
-        "checkpoint_every": 1,
-        "rollout_workers": 0,
-    }
+    least: ClassVar = dict.fromkeys(
+        ("seed", "eval_every", "observe_candidates", "rollout_workers"), 0
+    ) | dict.fromkeys(("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1)
 
     env: EnvId = DEFAULT_ENV
     """Id of the environment."""
@@ -183,11 +175,8 @@ class TrainConfig(Config):
     @property
     def folder(self) -> Path:
         """Run folder."""
-        return (
-            Path(self.out)
-            if self.out
-            else Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
-        )
+        usual = Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
+        return Path(self.out) if self.out else usual
 
 
 def take_pretrained(config: Any) -> None:
@@ -280,6 +269,34 @@ class PlayConfig(Config):
         if self.agent is None:
             raise ValueError("name an agent: run folder, model folder or id")
         check_file("video", self.video, ".mp4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveConfig(Config):
+    """Serve a page in the browser on which scenes are changed by hand and the agent decides anew.
+
+    Example: viapoint live --pretrained viapoint/PandaObstacles-v0
+    """
+
+    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
+    """Run folder, model folder, or id of an environment with a shipped agent."""
+    pretrained: Annotated[str | None, PRETRAINED] = None
+    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
+    env: Annotated[str | None, ENV] = None
+    """Id of the environment; where no agent is shipped for it, the geometry search decides."""
+    host: str = "127.0.0.1"
+    """Address to listen on; other machines reach any but 127.0.0.1."""
+    port: int = 8080
+    """Port to listen on; 0 for a free one."""
+    seed: int | None = None
+    """Seed of the random scenes."""
+
+    least: ClassVar = {"port": 0, "seed": 0}
+
+    def _check(self) -> None:
+        take_pretrained(self)
+        if self.env is not None:
+            check_env(self.env)
 
 
 @dataclass(frozen=True, kw_only=True)

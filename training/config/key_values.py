@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from viapoint.training.io.files import refuse_constant
+
 
 def from_words(words: list[str]) -> dict[str, Any]:
     """Return NAME=VALUE words as a dictionary; values are JSON if possible, otherwise words.
@@ -43,7 +45,7 @@ def _text(value: Any) -> str:
 
 def _value(name: str, text: str) -> Any:
     try:
-        return json.loads(text, parse_constant=_refused)
+        return json.loads(text, parse_constant=refuse_constant)
     except ValueError:
         suggestion = _as_json(text)
         if suggestion is None and text[:1] not in tuple("[{(\"'") and not _is_number(text):
@@ -67,10 +69,6 @@ def _as_json(text: str) -> str | None:
         return json.dumps(ast.literal_eval(text), allow_nan=False, separators=(",", ":"))
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return None
-
-
-def _refused(constant: str) -> Any:
-    raise ValueError(f"{constant} is no JSON number")
 
 
 _NAMED_VALUES = tyro.constructors.PrimitiveConstructorSpec(

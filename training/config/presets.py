@@ -18,7 +18,7 @@ class Preset:
 
     policy: str
     """Name of the policy."""
-    n_envs: int
+    n_envs: int = 64
     """Environments that are stepped together."""
     n_timesteps: int
     """Decisions in total."""
@@ -36,32 +36,16 @@ class Preset:
         return copy.deepcopy(dict(self.hyperparameters))
 
 
-def _preset(
-    n_envs: int,
-    n_timesteps: int,
-    policy: str = "MultiInputPolicy",
-    *,
-    eval_every: int = 1_000,
-    checkpoint_every: int = 5_000,
-    discount_unit: float | None = None,
-    **hyperparameters: Any,
-) -> Preset:
-    return Preset(
-        policy=policy,
-        n_envs=n_envs,
-        n_timesteps=n_timesteps,
-        eval_every=eval_every,
-        checkpoint_every=checkpoint_every,
-        discount_unit=discount_unit,
-        hyperparameters=tuple(hyperparameters.items()),
-    )
+def _preset(n_timesteps: int, policy: str = "MultiInputPolicy", **values: Any) -> Preset:
+    """Return a preset from its fields and hyperparameters."""
+    fields = {name: values.pop(name) for name in ("eval_every", "checkpoint_every") if name in values}
+    return Preset(policy=policy, n_timesteps=n_timesteps, **fields, hyperparameters=tuple(values.items()))
 
 
 _NETWORK: dict[str, Any] = {
     "features_extractor_class": {"kind": "extractor", "name": "SceneExtractor"},
     "net_arch": [256, 256],
 }
-_FALLING: dict[str, Any] = {"kind": "linear", "start": 1e-3, "end": 2e-5, "end_fraction": 1.0}
 _OFF_POLICY: dict[str, Any] = {
     "learning_rate": 1e-3,
     "buffer_size": 200_000,
@@ -79,18 +63,16 @@ _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
 PRESETS: dict[str, Preset] = {
     "viaq": _preset(
-        64,
         40_000,
         "ViaQPolicy",  # its defaults are its settings
         eval_every=5_000,
         checkpoint_every=20_000,
         learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
     ),
-    "sac": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
-    "td3": _preset(64, 40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(64, 40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
+    "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
+    "td3": _preset(40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
     "ppo": _preset(
-        64,
         400_000,
         **_SELDOM,
         learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
@@ -104,11 +86,10 @@ PRESETS: dict[str, Preset] = {
 """Presets by the names of algorithms on the command line."""
 
 STEP_PRESETS: dict[str, Preset] = {
-    "sac": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
-    "td3": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(64, 200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
+    "sac": _preset(200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
+    "td3": _preset(200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
+    "tqc": _preset(200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
     "ppo": _preset(
-        64,
         2_000_000,
         eval_every=50_000,
         checkpoint_every=200_000,
@@ -123,9 +104,7 @@ STEP_PRESETS: dict[str, Preset] = {
 }
 """Presets of tasks in which an action lasts one control step, which counts as a decision."""
 
-REACH_PRESETS: dict[str, Preset] = {
-    "viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000),
-}
+REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000)}
 """Presets of tasks without obstacles, which need fewer decisions."""
 
 REPLANNING_PRESETS: dict[str, Preset] = {
@@ -133,11 +112,7 @@ REPLANNING_PRESETS: dict[str, Preset] = {
 } | {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
-        hyperparameters=(
-            *PRESETS["viaq"].hyperparameters,
-            ("gradient_steps", 6),
-            ("next_candidates", 4),
-        ),
+        hyperparameters=(*PRESETS["viaq"].hyperparameters, ("gradient_steps", 6), ("next_candidates", 4)),
     ),
 }
 """Presets of replanning tasks, in which discounts follow time; viaq does not discount, as episodes end in seconds."""

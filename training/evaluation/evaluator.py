@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from viapoint.envs.common.types import Float, Int
 from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.outcome import Outcome
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.evaluation import report
@@ -328,7 +329,8 @@ def evaluate_methods(
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
-    with one_thread(), _simulation(env_id, min(batch, len(frozen.share)), env_kwargs or {}) as simulation:
+    opened = new_simulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
+    with one_thread(), closing(opened) as simulation:
         for method in methods:
             result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
             results.append(result)
@@ -369,10 +371,10 @@ def _evaluate_one(
         interrupted = True
     actions = [piece[""] for piece in pieces]  # kept with their outcomes, so that Ctrl-C parts none of them
     done = sum(len(piece) for piece in actions)
-    names = [name for name in pieces[0] if name] if pieces else ()
+    names = [name for name in pieces[0] if name] if pieces else Outcome._fields
     return MethodResult(
         name=method.name,
-        outcomes={name: np.concatenate([piece[name] for piece in pieces]) for name in names} or _nothing(),
+        outcomes={name: np.concatenate([piece[name] for piece in pieces] or [np.zeros(0)]) for name in names},
         actions=np.concatenate(actions) if actions else np.zeros((0, simulation.task.action.size)),
         decision_times=times,
         band=frozen.band[:done],
@@ -417,20 +419,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def _simulation(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Iterator[SceneSimulation]:
-    simulation = new_simulation(env_id, num_envs, **kwargs)
-    try:
-        yield simulation
-    finally:
-        simulation.close()
-
-
-def _nothing() -> dict[str, NDArray[Any]]:
-    names = ("is_success", "collision", "reachable", "min_clearance", "goal_error", "tracking_error")
-    return {name: np.zeros(0) for name in (*names, "jerk_ratio", "duration", "path_length")}
 
 
 def _compare(first: MethodResult, second: MethodResult) -> dict[str, Any] | None:

@@ -42,18 +42,14 @@ def _number(name: str, scale: float, digits: int) -> Callable[[Summary], str]:
     return cell
 
 
-def _in_band(name: str) -> Callable[[Summary], str]:
-    return lambda summary: _percent(summary["success_by_band"].get(name))
-
-
-def _in_family(name: str) -> Callable[[Summary], str]:
-    return lambda summary: _percent(summary.get("success_by_family", {}).get(name))
+def _within(part: str, name: str) -> Callable[[Summary], str]:
+    return lambda summary: _percent(summary.get(part, {}).get(name))
 
 
 COLUMNS = (
     Column("success", lambda summary: _percent(summary["success"])),
     Column("95 % interval", lambda summary: _interval(summary["success"])),
-    *(Column(f"share {band}", _in_band(band)) for band in BANDS),
+    *(Column(f"share {band}", _within("success_by_band", band)) for band in BANDS),
     Column("collision", lambda summary: _percent(summary["collision"])),
     Column("clearance [mm]", _number("min_clearance", 1e3, 1)),
     Column("goal error [mm]", _number("goal_error", 1e3, 2)),
@@ -95,7 +91,8 @@ def _columns(record: Record) -> list[Column]:
     summaries = record["methods"].values()
     names = dict.fromkeys(name for summary in summaries for name in summary.get("success_by_family", {}))
     behind = 2 + len(BANDS)
-    return [*COLUMNS[:behind], *(Column(name, _in_family(name)) for name in names), *COLUMNS[behind:]]
+    families = (Column(name, _within("success_by_family", name)) for name in names)
+    return [*COLUMNS[:behind], *families, *COLUMNS[behind:]]
 
 
 def title(record: Record) -> str:

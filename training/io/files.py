@@ -89,7 +89,10 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
     content = read_bytes(path, largest)
     try:
         value = json.loads(
-            content, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_without_repetition
+            content,
+            parse_constant=refuse_constant,
+            parse_float=_finite,
+            object_pairs_hook=_without_repetition,
         )
     except (ValueError, RecursionError) as error:
         raise BadFileError(path, f"cannot be read as JSON ({error})") from None
@@ -137,7 +140,8 @@ def read_arrays(path: Path, largest: int | None = None) -> Arrays:
         raise BadFileError(path, f"is no whole safetensors file ({error})") from None
 
 
-def _refused(constant: str) -> Any:
+def refuse_constant(constant: str) -> Any:
+    """Raise ValueError for NaN or Infinity, which Python's JSON allows."""
     raise ValueError(f"{constant} is no JSON number")
 
 

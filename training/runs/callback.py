@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -79,24 +79,17 @@ class RunCallback(BaseCallback):
         """Learning curve: one record for each evaluation so far."""
         self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
-        self._next = {"log": LOG_EVERY, "checkpoint": self.config.checkpoint_interval, "evaluation": 0}
-        self._every = {
-            "log": LOG_EVERY,
-            "checkpoint": self.config.checkpoint_interval,
-            "evaluation": self.config.evaluation_interval,
-        }
-        self._validation = validation_scenes(run) if self.config.evaluation_interval else None
+        checkpoint, evaluation = self.config.checkpoint_interval, self.config.evaluation_interval
+        self._every = {"log": LOG_EVERY, "checkpoint": checkpoint, "evaluation": evaluation}
+        self._next = {**self._every, "evaluation": 0}
+        self._validation = validation_scenes(run) if evaluation else None
         self._recent: list[dict[str, float]] = []
         self._stop = False
 
     def state(self) -> dict[str, Any]:
         """Return the state as plain values for :meth:`restore`."""
-        return {
-            "curve": self.curve,
-            "best": list(self._best),
-            "seconds": self.seconds,
-            "next": dict(self._next),
-        }
+        best, following = list(self._best), dict(self._next)
+        return {"curve": self.curve, "best": best, "seconds": self.seconds, "next": following}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a state that :meth:`state` returned."""
@@ -150,9 +143,7 @@ class RunCallback(BaseCallback):
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._listens:
             signal.signal(signal.SIGINT, self._handler)
         self._bar.close()

@@ -161,7 +161,11 @@ def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
     if buffer is None:
         return {}
     size = buffer.size()
-    arrays = {name: _cut(value, size) for name, value in vars(buffer).items() if _is_storage(value)}
+    arrays = {
+        name: {key: array[:size] for key, array in value.items()} if isinstance(value, dict) else value[:size]
+        for name, value in vars(buffer).items()
+        if _is_storage(value)
+    }
     return {"pos": buffer.pos, "full": buffer.full, "arrays": arrays}
 
 
@@ -188,10 +192,6 @@ def _is_storage(value: Any) -> bool:
     return isinstance(value, np.ndarray) or (
         isinstance(value, dict) and bool(value) and all(isinstance(v, np.ndarray) for v in value.values())
     )
-
-
-def _cut(value: Any, size: int) -> Any:
-    return {key: array[:size] for key, array in value.items()} if isinstance(value, dict) else value[:size]
 
 
 def _random_state(model: BaseAlgorithm) -> dict[str, Any]:

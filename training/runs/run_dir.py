@@ -87,12 +87,10 @@ class Run:
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
-        success = (
-            f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
-        )
+        rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
-            f"{self.decisions} of {config.total_timesteps} decisions{success})"
+            f"{self.decisions} of {config.total_timesteps} decisions{rate})"
         )
 
     @classmethod
@@ -108,7 +106,7 @@ class Run:
         with _lock(folder):
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
-            _write_config(folder, config)
+            write_config(folder, config)
         return cls(folder)
 
     @property
@@ -118,10 +116,6 @@ class Run:
             return read_json(self.folder / "versions.json")
         except BadFileError:
             return {}
-
-    def write_config(self) -> None:
-        """Write the current configuration."""
-        _write_config(self.folder, self.config)
 
     @property
     def curve(self) -> list[dict[str, Any]]:
@@ -265,7 +259,7 @@ def check_free(folder: Path) -> None:
         raise BadFileError(folder, "is not empty and is no run folder")
 
 
-def _write_config(folder: Path, config: TrainConfig) -> None:
+def write_config(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, which makes a folder a run, without the arguments of one call."""
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -23,12 +23,8 @@ from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError
 from viapoint.training.io.installed import versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.callback import RunCallback, TrainingStalledError, TrainingStoppedError
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged
-
-__all__ = [
-    "TrainingFailedError", "TrainingStoppedError", "new_model", "one_thread", "resolved", "train",
-]  # fmt: skip
+from viapoint.training.runs.callback import RunCallback, TrainingStalledError
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
@@ -112,13 +108,9 @@ def resolved(config: TrainConfig) -> TrainConfig:
 
 def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
     """Return the untrained model of a resolved configuration."""
+    unit, seed = config.discount_unit, config.seed
     return build(
-        config.algo,
-        config.preset.policy,
-        env,
-        config.hyperparameters,
-        discount_unit=config.discount_unit,
-        seed=config.seed,
+        config.algo, config.preset.policy, env, config.hyperparameters, discount_unit=unit, seed=seed
     )
 
 
@@ -150,33 +142,25 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         env = training_env(config)
     except TypeError as error:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
-    try:
+    with closing(env):
         try:
             model = new_model(config, env)
         except UNFIT as error:
             usual, asked = config.preset.arguments(), config.hyperparameters
-            given = [
-                f"{name}={json.dumps(asked[name], default=str)}"
-                for name in asked
-                if usual.get(name) != asked[name]
-            ]
-            made = f"made with {', '.join(given)}" if given else f"made for {config.env}"
+            other = {name: value for name, value in asked.items() if usual.get(name) != value}
+            given = ", ".join(f"{name}={json.dumps(value, default=str)}" for name, value in other.items())
+            made = f"made with {given}" if given else f"made for {config.env}"
             raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
         yield model
-    finally:
-        env.close()
 
 
 def _check_reports_duration(config: TrainConfig) -> None:
     """Check that decisions report their duration if discounts depend on time."""
     if config.discount_unit is None:
         return
-    env = ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)
-    try:
+    with closing(ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)) as env:
         env.reset()
         *_, infos = env.step(np.zeros((1, *(env.action_space.shape or ())), dtype=np.float32))
-    finally:
-        env.close()
     if ELAPSED not in infos[0]:
         raise ValueError(
             f"discount_unit must be left out for {config.env}: its info does not tell as {ELAPSED!r} how long a "
@@ -215,7 +199,7 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
                 f"got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-        run.write_config()
+        write_config(run.folder, run.config)
     run.config = dataclasses.replace(
         run.config, progress=config.progress, rollout_workers=config.rollout_workers, on=config.on
     )
@@ -249,13 +233,8 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
                 each.on_training_end()
     run.save("final", model)
     best = monitor.best_record["decisions"] if monitor.curve else None
-    run.write_end(
-        {
-            "stopped": "stalled" if monitor.stalled else "budget",
-            "decisions": model.num_timesteps,
-            "best_decisions": best,
-        }
-    )
+    stopped = "stalled" if monitor.stalled else "budget"
+    run.write_end({"stopped": stopped, "decisions": model.num_timesteps, "best_decisions": best})
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_args
+from typing import Any, Self, get_args
 
 from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.model_io import ALGORITHMS, argument_names
@@ -160,13 +160,6 @@ class Page:
     """Rows in figures; those of all agents if not given."""
 
 
-class Comparison(NamedTuple):
-    """Two rows that are compared."""
-
-    first: str
-    second: str
-
-
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """Environments, agents and baselines, as a YAML file describes them.
@@ -203,8 +196,8 @@ class Study:
     environments: tuple[Environment, ...]
     agents: tuple[Agent, ...]
     baselines: tuple[Baseline, ...]
-    compare: tuple[Comparison, ...]
-    """Rows that are compared scene by scene, or run by run."""
+    compare: tuple[tuple[str, str], ...]
+    """Pairs of rows that are compared scene by scene, or run by run."""
     page: Page
 
     @classmethod
@@ -246,7 +239,10 @@ class Study:
             _baseline(*each, known, agents)
             for each in expanded("baselines", given.get("baselines", {}), BASELINE_FIELDS)
         )
-        _check_different([*agents, *baselines])
+        names = [each.name for each in (*agents, *baselines)]
+        for each in names:
+            if names.count(each) > 1:
+                raise ValueError(f"agents and baselines must have different names, {each} is there twice")
         rows = [row for agent in agents for row in rows_of(agent)] + [each.name for each in baselines]
         compare = tuple(_compared(pair, rows) for pair in listed("compare", given.get("compare", [])))
         page = _page(given.get("page", {}), out, folder, rows)
@@ -302,12 +298,10 @@ def _environments(given: Any, scenes: Any, folder: Path) -> Iterator[Environment
             )
         kwargs = mapping(f"{where}.env_kwargs", fields.get("env_kwargs", {}))
         check_env_kwargs(kwargs)
-        asked = fields.get("scenes", scenes)
-        sets = _sets(f"{where}.scenes", asked, env_id, folder)
-        check_number(f"{where}.n_scenes", fields.get("n_scenes"))
-        yield Environment(
-            name=name, id=env_id, env_kwargs=kwargs, scenes=sets, n_scenes=fields.get("n_scenes")
-        )
+        sets = _sets(f"{where}.scenes", fields.get("scenes", scenes), env_id, folder)
+        n_scenes = fields.get("n_scenes")
+        check_number(f"{where}.n_scenes", n_scenes)
+        yield Environment(name=name, id=env_id, env_kwargs=kwargs, scenes=sets, n_scenes=n_scenes)
 
 
 def _sets(where: str, given: Any, env_id: str, folder: Path) -> tuple[str, ...]:
@@ -449,17 +443,10 @@ def _page(given: Any, out: Path, folder: Path, rows: Sequence[str]) -> Page:
     return Page(**found)
 
 
-def _compared(pair: Any, rows: Sequence[str]) -> Comparison:
+def _compared(pair: Any, rows: Sequence[str]) -> tuple[str, str]:
     if not isinstance(pair, list) or len(pair) != 2:
         raise ValueError(f"compare must hold pairs of rows, such as [viaq, sac], got {pair!r}")
     for row in pair:
         if row not in rows:
             raise ValueError(unknown("compare", row, rows))
-    return Comparison(*pair)
-
-
-def _check_different(entries: Sequence[Entry]) -> None:
-    names = [each.name for each in entries]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"agents and baselines must have different names, {name} is there twice")
+    return pair[0], pair[1]

@@ -158,7 +158,8 @@ def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:
             first = next(iter(numbers["sets"]))
             here = [each for each in rows if first in each["sets"]]
             checks = [max(each["checks"], 0.5) for each in here]
-            failures = [_failures(each["sets"][first]) for each in here]
+            rates = [float(np.mean(each["sets"][first]["each"])) for each in here]
+            failures = [max(100.0 * (1.0 - rate), LEAST_FAILURE) for rate in rates]
             jerk = [each["sets"][first].get("jerk_ratio") or np.nan for each in here]
             times = [1e3 * (each["decision_time"] or np.nan) for each in here]
             label = series.replace("_", " ").replace("sobol", "Sobol order")
@@ -173,10 +174,6 @@ def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:
     axes[0, 0].legend(fontsize=8, frameon=False)
     _save(figure, path)
     return path
-
-
-def _failures(numbers: Numbers) -> float:
-    return max(100.0 * (1.0 - float(np.mean(numbers["each"]))), LEAST_FAILURE)
 
 
 def _style_checks(axes: Any) -> None:

@@ -23,13 +23,14 @@ from typing import Any
 
 import numpy as np
 
+from viapoint.envs.worker_env import n_cores
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
+from viapoint.training.evaluation.evaluator import evaluate_methods, one_thread
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import Method
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import one_thread, resolved, train
+from viapoint.training.runs.trainer import resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 from viapoint.training.study.config import Agent, Baseline, Environment, Study
 from viapoint.training.study.methods import Mode, method_of, method_of_mode, modes
@@ -145,7 +146,7 @@ def train_and_evaluate(root: Path, cell: Cell, steps: Sequence[str], sets: Sets)
     if "train" in steps and status != "trained":
         resume = TrainConfig(out=config.folder, resume=True, progress=False)
         run = train(config if status == "absent" else resume)
-        write_json(run.folder / "cores.json", {"cores": cores(), "of": os.cpu_count()})
+        write_json(run.folder / "cores.json", {"cores": n_cores(), "of": os.cpu_count()})
         status = "trained"
     if "evaluate" not in steps or status != "trained":
         return status
@@ -167,7 +168,7 @@ def state(cell: Cell, root: Path) -> str:
     other = [name for name in dict.fromkeys([*IDENTIFYING, *named]) if asked[name] != found[name]]
     if other:
         return f"was trained with other settings ({', '.join(other)}): move it away, or give the study another folder"
-    ended = run.decisions >= run.config.total_timesteps or (run.folder / "end.json").is_file()
+    ended = run.decisions >= run.config.total_timesteps or run.stopped is not None
     return "trained" if ended and run.final.is_dir() else "unfinished"
 
 
@@ -224,11 +225,6 @@ def measure(method: Method, frozen: FrozenScenes, env: Environment, kwargs: Mapp
     (result,) = evaluation.results
     if result.interrupted:
         raise KeyboardInterrupt
-    return compact(result)
-
-
-def compact(result: MethodResult) -> Record:
-    """Return the metrics of a result and its outcomes in every scene."""
     outcomes = {
         name: np.round(np.asarray(result.outcomes[name], float), 6).tolist() for name in STORED_OUTCOMES
     }
@@ -294,11 +290,6 @@ def measured_files(
             for seed in entry.seeds:
                 folder = Cell(env=env, agent=entry, seed=seed).folder
                 yield study.out / folder / evaluation_path(name, mode or Mode())
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def stored(path: Path, wanted: Record) -> Record | None:

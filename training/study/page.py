@@ -7,6 +7,7 @@ macro NAME of the template of tables returns.
 
 from __future__ import annotations
 
+import os
 import re
 import statistics
 from collections.abc import Mapping, Sequence
@@ -45,7 +46,7 @@ def render_page(record: Numbers, page: Page) -> str:
     """Return the page of a record as Markdown."""
     default = Path(str(files("viapoint.training.study") / "templates" / "page.md.j2"))
     template = _template(record, page.template or default)
-    figures = Path("." if page.figures == page.file.parent else _relative(page.figures, page.file.parent))
+    figures = Path(os.path.relpath(page.figures, page.file.parent))
     try:
         text = template.render(figures=figures.as_posix())
     except jinja2.TemplateError as error:
@@ -91,12 +92,6 @@ def _template(record: Numbers, path: Path) -> jinja2.Template:
         return environment.get_template(path.name)
     except jinja2.TemplateError as error:
         raise BadFileError(path, f"is no template ({error})") from error
-
-
-def _relative(path: Path, start: Path) -> str:
-    import os
-
-    return os.path.relpath(path, start)
 
 
 def figure_name(environment: str) -> str:

@@ -19,7 +19,7 @@ from viapoint.training.io.files import read_json
 from viapoint.training.io.installed import versions
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
-from viapoint.training.study.config import Agent, Baseline, Comparison, Environment, Study
+from viapoint.training.study.config import Agent, Baseline, Environment, Study
 from viapoint.training.study.jobs import (
     Cell,
     baseline_record,
@@ -101,15 +101,12 @@ def gather(study: Study, before: Numbers | None = None) -> Numbers:
         "study": study.name,
         "versions": versions(),
         "environments": {
-            env.name: _environment(study, env, _known(before, env)) for env in study.environments
+            env.name: _environment(study, env, (before or {}).get("environments", {}).get(env.name, {}))
+            for env in study.environments
         },
     }
     plain: Numbers = _rounded(record)
     return plain
-
-
-def _known(before: Numbers | None, env: Environment) -> Numbers:
-    return dict((before or {}).get("environments", {}).get(env.name, {}))
 
 
 def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
@@ -222,7 +219,6 @@ def _training(cells: Sequence[Cell], study: Study) -> Numbers:
     runs = [Run(study.out / cell.folder) for cell in cells]
     last = [run.curve[-1] for run in runs if run.curve]
     cores = [run.folder / "cores.json" for run in runs]
-    ends = [run.folder / "end.json" for run in runs]
     if not last:
         return {}
     return {
@@ -230,7 +226,7 @@ def _training(cells: Sequence[Cell], study: Study) -> Numbers:
         "simulated_seconds": float(np.median([each["simulated_seconds"] for each in last])),
         "seconds": [each["seconds"] for each in last],
         "cores": sorted({read_json(path)["cores"] for path in cores if path.is_file()}),
-        "stopped": sorted({read_json(path)["stopped"] for path in ends if path.is_file()}),
+        "stopped": sorted({run.stopped for run in runs if run.stopped is not None}),
     }
 
 
@@ -332,7 +328,7 @@ def _covers(new: Numbers, old: Numbers) -> bool:
 
 
 def _comparisons(
-    wanted: Sequence[Comparison],
+    wanted: Sequence[tuple[str, str]],
     rows: Sequence[Numbers],
     records: Mapping[str, Records],
     old: Sequence[Numbers],
@@ -344,10 +340,8 @@ def _comparisons(
         if not all(row in by_id for row in pair):
             continue
         first, second = (by_id[row] for row in pair)
-        entry: Numbers = {"first": pair.first, "second": pair.second, "sets": {}}
-        kept = next(
-            (each for each in old if each["first"] == pair.first and each["second"] == pair.second), None
-        )
+        entry: Numbers = {"first": pair[0], "second": pair[1], "sets": {}}
+        kept = next((each for each in old if (each["first"], each["second"]) == pair), None)
         for name in (each for each in first["sets"] if each in second["sets"]):
             if second["kind"] == "agent":
                 entry["sets"][name] = _improvement(first["sets"][name]["each"], second["sets"][name]["each"])

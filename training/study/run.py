@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -37,13 +38,9 @@ def run(config: StudyConfig) -> None:
         ValueError: The file describes no study, or names something unknown.
         StudyFailedError: A job failed.
     """
+    report = functools.partial(print, flush=True)
     run_study(
-        config.file,
-        on=config.on,
-        workers=config.workers,
-        only=config.only,
-        redo=config.redo,
-        report=_print,
+        config.file, on=config.on, workers=config.workers, only=config.only, redo=config.redo, report=report
     )
 
 
@@ -91,7 +88,7 @@ def run_study(
         if step not in STEPS:
             raise ValueError(f"only must be some of {', '.join(STEPS)}, got {step!r}")
     study = study if isinstance(study, Study) else Study.from_yaml(study)
-    report = report or _ignore
+    report = report or (lambda line: None)
     steps = set(only)
     before = read_json(study.page.record) if study.page.record.is_file() else None
     if redo:
@@ -173,11 +170,3 @@ def _run(runner: Runner, jobs: Iterable[Job], report: Report) -> list[str]:
         if answer.error:
             failed.append(f"{job.label}: {answer.error}")
     return failed
-
-
-def _print(line: str) -> None:
-    print(line, flush=True)
-
-
-def _ignore(line: str) -> None:
-    """Report nothing."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Iterator
@@ -10,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import write_json
 from viapoint.training.planners.baselines import Method
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import one_thread
 from viapoint.training.study.config import Agent, Baseline, Environment, Study
 from viapoint.training.study.jobs import (
     Cell,
@@ -84,21 +85,18 @@ def remove_times(study: Study, env: Environment, row: str) -> bool:
 def median_time(study: Study, env: Environment, method: Method) -> float:
     """Return the median wall time of single decisions on one thread, without the first one, [s]."""
     frozen = next(iter(sets_of(env).values()))
-    simulation = new_simulation(env.id, 2, **{**env.env_kwargs, "threads": 1})
     times: list[float] = []
     began = time.perf_counter()
-    try:
-        with one_thread():
-            for row in range(min(N_TIMED, len(frozen.share))):
-                scene = frozen.scenes.take(slice(row, row + 1))
-                observation = simulation.observe(scene)
-                before = time.perf_counter()
-                method.decide(observation, scene)
-                times.append(time.perf_counter() - before)
-                if time.perf_counter() - began > BUDGET:
-                    break
-    finally:
-        simulation.close()
+    opened = new_simulation(env.id, 2, **{**env.env_kwargs, "threads": 1})
+    with one_thread(), contextlib.closing(opened) as simulation:
+        for row in range(min(N_TIMED, len(frozen.share))):
+            scene = frozen.scenes.take(slice(row, row + 1))
+            observation = simulation.observe(scene)
+            before = time.perf_counter()
+            method.decide(observation, scene)
+            times.append(time.perf_counter() - before)
+            if time.perf_counter() - began > BUDGET:
+                break
     return float(np.median(times[1:] or times))
 
 

@@ -29,7 +29,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 from stable_baselines3.common.callbacks import BaseCallback
 
-from viapoint.training.config.configs import TrainConfig, TuneConfig
+from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import BadFileError, read_json, write_json
 from viapoint.training.io.installed import versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -37,7 +37,6 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import new_model, resolved, train
 from viapoint.training.study.runner import Job, make_runner
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace, stored
-from viapoint.training.study.tuning_report import best_training, write_report
 
 SAVING_TIME = 60.0
 """Time that an abandoned training has to write its checkpoint and end, [s]."""
@@ -147,10 +146,15 @@ class Tuning:
         return len([each for each in self.trials if each.state.is_finished()])
 
     @property
+    def ranked(self) -> list[FrozenTrial]:
+        """Finished trials, best first."""
+        complete = [each for each in self.trials if each.state == TrialState.COMPLETE]
+        return sorted(complete, key=lambda each: (-(each.value or 0.0), each.number))
+
+    @property
     def best(self) -> FrozenTrial | None:
         """Finished trial with the highest score; None if there is none."""
-        complete = [each for each in self.trials if each.state == TrialState.COMPLETE]
-        return max(complete, key=lambda each: each.value or 0.0, default=None)
+        return next(iter(self.ranked), None)
 
     def folder_of(self, trial: Trial | FrozenTrial) -> str:
         """Return the folder of a trial below that of the search; a repeated trial has that of the first attempt."""
@@ -393,42 +397,13 @@ def check_models(search: SearchSpace) -> None:
     """
     for values in search.extremes():
         config = resolved(search.training(values, search.seeds[0]))
-        with _environment(config.env, config.env_kwargs) as env:
+        try:
+            opened = ViaVecEnv(config.env, 1, **config.env_kwargs)
+        except TypeError as error:
+            raise ValueError(f"env_kwargs of {config.env}: {error}") from None
+        with contextlib.closing(opened) as env:
             try:
                 new_model(config, env)
             except Exception as error:
                 shown = ", ".join(f"{name}={value}" for name, value in values.items())
                 raise ValueError(f"{config.algo} cannot be made with {shown}: {error}") from None
-
-
-@contextlib.contextmanager
-def _environment(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[ViaVecEnv]:
-    try:
-        env = ViaVecEnv(env_id, 1, **env_kwargs)
-    except TypeError as error:
-        raise ValueError(f"env_kwargs of {env_id}: {error}") from None
-    try:
-        yield env
-    finally:
-        env.close()
-
-
-def run(config: TuneConfig) -> None:
-    """Search for hyperparameters, and write the report: the command `tune`.
-
-    Raises:
-        ValueError: The file or the folder holds something else, or a model cannot be built.
-        TuningStoppedError: A trial ended without a result.
-    """
-    search = SearchSpace.read(config.file)
-    trials = config.trials or search.trials
-    tuning = Tuning.create(config.folder, search)
-    print(f"{config.folder}: {tuning.finished} of {trials} trials are finished", flush=True)
-    try:
-        tuning.work(trials, on=config.on, workers=config.workers, told=lambda line: print(line, flush=True))
-    finally:
-        if tuning.finished:
-            print(f"report: {write_report(tuning)}")
-    best = tuning.best
-    if best is not None:
-        print(f"best, trial {best.number}: {best_training(tuning, best).command}")

@@ -5,17 +5,21 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import optuna
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from optuna.trial import FrozenTrial, TrialState
 
-from viapoint.training.config.configs import TrainConfig
+from viapoint.training.config.configs import TrainConfig, TuneConfig
 from viapoint.training.io.files import write_bytes, write_json
 from viapoint.training.io.installed import versions
+from viapoint.training.plotting.plots import style_axes
 from viapoint.training.runs.callback import validation_scenes
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace, plain
+from viapoint.training.study.tuning import Tuning
 
 SHOWN = 10
 """Greatest number of trials in the table."""
@@ -23,26 +27,28 @@ FEWEST = 4
 """Least number of finished trials for which the importance of parameters is estimated."""
 
 
-class Results(Protocol):
-    """Trials of a search, as :class:`~viapoint.training.study.tuning.Tuning` has them."""
+def run(config: TuneConfig) -> None:
+    """Search for hyperparameters, and write the report: the command `tune`.
 
-    folder: Path
-    search: SearchSpace
-    study: optuna.Study
+    Raises:
+        ValueError: The file or the folder holds something else, or a model cannot be built.
+        TuningStoppedError: A trial ended without a result.
+    """
+    search = SearchSpace.read(config.file)
+    trials = config.trials or search.trials
+    tuning = Tuning.create(config.folder, search)
+    print(f"{config.folder}: {tuning.finished} of {trials} trials are finished", flush=True)
+    try:
+        tuning.work(trials, on=config.on, workers=config.workers, told=lambda line: print(line, flush=True))
+    finally:
+        if tuning.finished:
+            print(f"report: {write_report(tuning)}")
+    best = tuning.best
+    if best is not None:
+        print(f"best, trial {best.number}: {best_training(tuning, best).command}")
 
-    @property
-    def trials(self) -> list[FrozenTrial]:
-        """Trials that count."""
 
-    @property
-    def best(self) -> FrozenTrial | None:
-        """Finished trial with the highest score."""
-
-    def folder_of(self, trial: FrozenTrial) -> str:
-        """Return the folder of a trial below that of the search."""
-
-
-def write_report(tuning: Results) -> Path:
+def write_report(tuning: Tuning) -> Path:
     """Write `report.md`, `trials.json`, `curves.png` and, if a trial is finished, `best.json`; return the first."""
     best = tuning.best
     if best is not None:
@@ -67,12 +73,12 @@ def _record(trial: FrozenTrial) -> dict[str, Any]:
     }
 
 
-def best_training(tuning: Results, best: FrozenTrial) -> TrainConfig:
+def best_training(tuning: Tuning, best: FrozenTrial) -> TrainConfig:
     """Return the configuration of the best trial, as `viapoint train` uses it."""
     return tuning.search.training(best.params, tuning.search.seeds[0], progress=True)
 
 
-def report(tuning: Results) -> str:
+def report(tuning: Tuning) -> str:
     """Return the report as Markdown."""
     search, trials = tuning.search, tuning.trials
     states = Counter(each.state for each in trials)
@@ -109,31 +115,22 @@ def _scenes(folder: Path | None) -> str:
     return f" in the same {len(scenes.share)} {kind} validation scenes (sha256 {scenes.sha256[:12]})"
 
 
-def ranked(tuning: Results) -> list[FrozenTrial]:
-    """Return the finished trials, best first."""
-    complete = [each for each in tuning.trials if each.state == TrialState.COMPLETE]
-    return sorted(complete, key=lambda each: (-(each.value or 0.0), each.number))
-
-
-def _table(tuning: Results) -> list[str]:
+def _table(tuning: Tuning) -> list[str]:
     names = list(tuning.search.parameters)
     rows = [
         f"| {each.number}{' (given)' if 'fixed_params' in each.system_attrs else ''} "
-        f"| {100.0 * (each.value or 0.0):.1f} % | {_minutes(each)} "
+        f"| {100.0 * (each.value or 0.0):.1f} % "
+        f"| {f'{each.duration.total_seconds() / 60.0:.1f}' if each.duration else '-'} "
         f"| {' | '.join(_shown(each.params[name]) for name in names)} |"
-        for each in ranked(tuning)[:SHOWN]
+        for each in tuning.ranked[:SHOWN]
     ]
     head = f"| trial | score | minutes | {' | '.join(f'`{name}`' for name in names)} |"
     return ["## Best trials", "", head, "|" + "---|" * (3 + len(names)), *rows, ""] if rows else []
 
 
-def _minutes(trial: FrozenTrial) -> str:
-    return f"{trial.duration.total_seconds() / 60.0:.1f}" if trial.duration else "-"
-
-
-def importance(tuning: Results) -> dict[str, float]:
+def importance(tuning: Tuning) -> dict[str, float]:
     """Return the importance of each parameter by PED-ANOVA, with sum 1; empty where there are too few trials."""
-    if len(ranked(tuning)) < FEWEST or len({each.value for each in ranked(tuning)}) < 2:
+    if len(tuning.ranked) < FEWEST or len({each.value for each in tuning.ranked}) < 2:
         return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -141,7 +138,7 @@ def importance(tuning: Results) -> dict[str, float]:
         return optuna.importance.get_param_importances(tuning.study, evaluator=evaluator)
 
 
-def _importance(tuning: Results) -> list[str]:
+def _importance(tuning: Tuning) -> list[str]:
     values = importance(tuning)
     if not values:
         return []
@@ -153,7 +150,7 @@ def _importance(tuning: Results) -> list[str]:
     ]  # fmt: skip
 
 
-def _pruned(tuning: Results) -> list[str]:
+def _pruned(tuning: Tuning) -> list[str]:
     pruned = Counter(each.last_step or 0 for each in tuning.trials if each.state == TrialState.PRUNED)
     rows = [f"| {step} | {number} |" for step, number in sorted(pruned.items())]
     return ["## Pruned trials", "", "| decisions | trials |", "|---|---|", *rows, ""] if rows else []
@@ -174,11 +171,8 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else f"{value}"
 
 
-def draw_curves(tuning: Results, path: Path) -> None:
+def draw_curves(tuning: Tuning, path: Path) -> None:
     """Draw the success rate of every trial in validation against decisions."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(6.0, 3.4), layout="constrained")
     axes = FigureCanvasAgg(figure).figure.subplots()
     best = tuning.best
@@ -197,5 +191,5 @@ def draw_curves(tuning: Results, path: Path) -> None:
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if handles:
         axes.legend(handles.values(), handles.keys(), frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
+    style_axes(axes)
     figure.savefig(path, dpi=110)
