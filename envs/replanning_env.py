@@ -22,6 +22,7 @@ from viapoint.envs.rendering.renderer import EpisodeRenderer, History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
 from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
+from viapoint.envs.scenes.scene import refuse
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
@@ -50,27 +51,15 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
     observation is returned, the last of the old is in `info["final_obs"]`, its info in `info["final_info"]` and, as
     that of the other environments, at the top level.
 
+    The arguments are those of :class:`ReachVectorEnv`, of which `timing` must be `optimal`, and these.
+
     Args:
-        num_envs: Number of environments N.
-        arm: Arm that moves, a record or its name.
-        whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
-        n_via: Number of via-points of an action.
-        n_obstacles: Number of obstacles, or the fewest and the most.
-        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         moving_obstacles: True if the obstacles move.
         n_jumps: Number of jumps of the target, or the fewest and the most.
         decide_at: Events that end a decision: some of `horizon`, `target`, `course`, `clearance`.
         horizon: Time after which a decision ends, [s].
         margin: Predicted clearance below which a decision ends, [m].
-        timing: `optimal` passage times; there are no others here.
-        duration_range: Shortest and longest movement, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.ReplanningRewardWeights`.
-        render_mode: `human`, `rgb_array` or `rgb_array_list`.
-        width: Width of a rendered frame, [pixels].
-        height: Height of a rendered frame, [pixels].
-        threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
-        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
-            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -314,17 +303,10 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         except RuntimeError as error:
             raise ValueError(f"{error}; give the jumps, too") from None
         if jumps is not None or courses is not None:
-            self._check_changes(changing)
+            refuse(problems_of_changes(changing, self.task.collision_model, time_limit=self.time_limit))
         for i in rows:
             generators[i] = tried[i]
         return changing
-
-    def _check_changes(self, scenes: ChangingScenes) -> None:
-        for wrong, reason in problems_of_changes(
-            scenes, self.task.collision_model, time_limit=self.time_limit
-        ):
-            if wrong.any():
-                raise ValueError(f"scene {int(wrong.argmax())}: {reason(int(wrong.argmax()))}")
 
     def _start(self, rows: Int, scenes: ChangingScenes) -> None:  # type: ignore[override]
         """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""

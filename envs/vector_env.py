@@ -149,11 +149,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
         threads = whole_number("threads", config.threads, 0)
-        self.arm, self.action_layout, self.observation_layout = (
-            self.task.arm,
-            self.task.action,
-            self.task.observation,
-        )
+        self.arm, self.action_layout = self.task.arm, self.task.action
+        self.observation_layout = self.task.observation
         self._sampler = self.task.sampler()
         self._simulator = Simulator(
             self.task.collision_model,
@@ -260,9 +257,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         d, n = self.arm.dimension, self.task.observation.n_rows
         shapes = self.task.scenes.shapes
-        empty = Scenes(
-            np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, n, row_size(d, shapes)))
-        )
+        empty = Scenes(*np.zeros((2, number, d)), np.zeros((number, n, row_size(d, shapes))))
         given = given_scenes(options, empty, self.arm, shapes)._asdict()
         return {name: given[name] for name in options}
 
@@ -377,17 +372,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.scenes = None
         terms = reward_terms(execution.outcome, self.action_layout.centre_duration, self.task.weights)
         reward, info = terms.total(), {**execution.outcome._asdict(), **terms.as_info()}
-        observation = self._observe_end(execution)
+        hand = np.asarray(self.arm.hand_position(execution.joints))
+        observation = self.observation_layout.observe(execution.joints, hand, execution.scenes)
         if self.render_mode == "human":
             self.render()
         return Decision(observation, reward, info), following
-
-    def _observe_end(self, execution: Execution) -> Observation:
-        """Stage 7: return the observations after a movement."""
-        joints = execution.joints
-        return self.observation_layout.observe(
-            joints, np.asarray(self.arm.hand_position(joints)), execution.scenes
-        )
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:

@@ -87,21 +87,12 @@ class VelocityVectorEnv(MultiStepVectorEnv):
     begins (same-step autoreset): its first observation is returned, the last of the old is in `info["final_obs"]`,
     its info in `info["final_info"]` and, as that of the other environments, at the top level.
 
+    The arguments are those of :class:`ReachVectorEnv` without `n_via` and `timing`, and these.
+
     Args:
-        num_envs: Number of environments N.
-        arm: Arm that moves, a record or its name.
-        whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
-        n_obstacles: Number of obstacles, or the fewest and the most.
-        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         control_step: Time for which an action holds, [s].
         duration_range: Shortest and longest movement of the twin, [s]; the longest and the settling time are the limit.
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.StepRewardWeights`.
-        render_mode: `human`, `rgb_array` or `rgb_array_list`.
-        width: Width of a rendered frame, [pixels].
-        height: Height of a rendered frame, [pixels].
-        threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
-        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
-            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -207,20 +198,15 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         hand = np.asarray(self.arm.hand_position(log.joints))
         obstacles, present = scenes.obstacles, scenes.present
         model = self.task.collision_model
+        clearance = model.least_clearance(hand, obstacles, present, log.joints)
+        planned_clearance = model.least_clearance(planned, obstacles, present)
         moved = self._episodes.add(
             Segment(
-                rows=rows,
-                steps=np.full(len(rows), number),
-                planned=planned,
-                joints=log.joints,
-                hand=hand,
-                contact=log.contact,
-                unstable=log.unstable,
-                min_clearance=model.least_clearance(hand, obstacles, present, log.joints),
-                planned_clearance=model.least_clearance(planned, obstacles, present),
-                jerk_cost=cost,
+                rows=rows, steps=np.full(len(rows), number), planned=planned, joints=log.joints, hand=hand,
+                contact=log.contact, unstable=log.unstable, min_clearance=clearance,
+                planned_clearance=planned_clearance, jerk_cost=cost,
             )
-        )
+        )  # fmt: skip
         resting = moved < REST_SPEED * self._simulator.timestep
         at_goal = resting & (norm(hand - scenes.goal[:, None]) < GOAL_TOLERANCE)
         trailing = np.where(at_goal.all(axis=-1), number, np.argmin(at_goal[:, ::-1], axis=-1))

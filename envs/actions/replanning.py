@@ -122,15 +122,8 @@ class ReplanningDecoder:
         )(centre[:, None] * shares)
         vias = np.where(changed[:, None, None], anew, rest)
         remaining = np.where(changed | ~begun, centre, np.maximum(end - time, 0.0))
-        return NominalPlan(
-            begun,
-            changed & begun,
-            state,
-            start,
-            goal,
-            np.where(begun[:, None, None], vias, straight),
-            remaining,
-        )
+        vias = np.where(begun[:, None, None], vias, straight)
+        return NominalPlan(begun, changed & begun, state, start, goal, vias, remaining)
 
     def _passages(self, plan: MovingPlan, time: Float) -> Float:
         """Return passage times of the remaining via-points, and times on the last segment for those passed.
@@ -169,19 +162,11 @@ class ReplanningDecoder:
 
     def _revised(self, default: NominalPlan, actions: Float) -> MovingPlan:
         layout, state = self.layout, default.state
-        points, duration = revised_waypoints(
-            layout,
-            self._line(default),
-            state.position,
-            default.vias,
-            default.goal,
-            default.remaining,
-            actions,
-        )
+        nominal = default.vias, default.goal, default.remaining
+        points, duration = revised_waypoints(layout, self._line(default), state.position, *nominal, actions)
         plan = timed(points, duration, state)
-        zero = (actions == 0.0).all(axis=-1)[
-            :, None
-        ]  # the default itself: its via-points are evenly spaced in time
+        # The default itself: its via-points are evenly spaced in time.
+        zero = (actions == 0.0).all(axis=-1)[:, None]
         even = np.broadcast_to(duration[:, None] / (layout.n_via + 1), plan.durations.shape)
         return plan._replace(durations=np.where(zero, even, plan.durations))
 

@@ -233,7 +233,7 @@ def _check_convex(vertices: Float, faces: Any) -> None:
         raise ValueError(f"faces must be triangles, integers of shape (F, 3), got shape {corners.shape}")
     if corners.size and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(f"faces must be indices of the {len(vertices)} vertices, got {corners.max()}")
-    enclosed, whole = abs(_volume(vertices, corners)), _hull_volume(vertices, triangles)
+    enclosed, whole = abs(_volumes(vertices, corners).sum()), np.abs(_volumes(vertices, triangles)).sum()
     if abs(enclosed - whole) > 10.0 * DENT * whole:
         raise ValueError(
             f"faces are not those of a convex mesh: they enclose {enclosed:.4g} m^3, their hull "
@@ -241,16 +241,10 @@ def _check_convex(vertices: Float, faces: Any) -> None:
         )
 
 
-def _volume(vertices: Float, triangles: Any) -> float:
-    """Return the signed volume within triangles, [m^3]."""
+def _volumes(vertices: Float, triangles: Any) -> Float:
+    """Return the signed volumes between triangles and the middle of the vertices, shape (F,), [m^3]."""
     a, b, c = (vertices[triangles[:, i]] - vertices.mean(axis=0) for i in range(3))
-    return float((a * np.cross(b, c)).sum() / 6.0)
-
-
-def _hull_volume(vertices: Float, triangles: Index) -> float:
-    """Return the volume of the hull, [m^3]."""
-    a, b, c = (vertices[triangles[:, i]] - vertices.mean(axis=0) for i in range(3))
-    return float(np.abs((a * np.cross(b, c)).sum(axis=1)).sum() / 6.0)
+    return np.asarray((a * np.cross(b, c)).sum(axis=1) / 6.0)
 
 
 def _planes(vertices: Float, triangles: Index) -> tuple[Float, Float]:

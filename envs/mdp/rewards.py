@@ -97,15 +97,8 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
     """
     relative: Any = outcome.duration / centre_duration
     log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5
-    return weighted_terms(
-        outcome.is_success,
-        outcome.collision,
-        outcome.planned_clearance,
-        outcome.goal_error,
-        log_jerk,
-        relative,
-        weights,
-    )
+    success, collision, clearance = outcome.is_success, outcome.collision, outcome.planned_clearance
+    return weighted_terms(success, collision, clearance, outcome.goal_error, log_jerk, relative, weights)
 
 
 def weighted_terms(

@@ -22,6 +22,8 @@ from viapoint.envs.geometry.rows import (
 from viapoint.envs.geometry.shape import TALL
 from viapoint.envs.geometry.shapes import SHAPES
 
+IN_THE_WAY = 0.004
+"""Depth by which the straight movement must cut into an obstacle that is in the way, [m]."""
 RESHAPE_NUMBERS = 3
 """Uniform numbers of an obstacle that decide its shape."""
 

@@ -223,10 +223,8 @@ class ChangeSampler:
         )
 
     def _velocity(self, uniforms: Uniforms, size: int, dimension: int) -> Float:
-        angle, speed = (
-            2.0 * np.pi * uniforms.take(size),
-            between(self.distribution.speed, uniforms.take(size)),
-        )
+        angle = 2.0 * np.pi * uniforms.take(size)
+        speed = between(self.distribution.speed, uniforms.take(size))
         return np.asarray(speed[..., None] * self._direction(angle, uniforms.take(size), dimension))
 
     def _direction(self, angle: Float, height: Float, dimension: int) -> Float:

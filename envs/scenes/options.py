@@ -107,12 +107,8 @@ def given_scenes(
     refuse_unknown_options(options, GIVEN)
     options = _with_rows(options, arm.dimension, shapes)
     fields = sampled._asdict()
-    for name, field in fields.items():
-        if name in options:
-            fields[name] = _parse(name, options[name], field.shape)
-        else:
-            fields[name] = field.copy()
-    return Scenes(**fields)
+    given = {name: _parse(name, options[name], fields[name].shape) for name in options}
+    return Scenes(**{**{name: field.copy() for name, field in fields.items()}, **given})
 
 
 def _with_rows(options: Mapping[str, Any], dimension: int, shapes: Sequence[str]) -> Mapping[str, Any]:

@@ -97,10 +97,8 @@ def ring(uniforms: Uniforms, site: PlanarSite) -> Float:
         towards = np.where(at_goal, path[:, -(path.shape[1] // 4)], path[:, path.shape[1] // 4])
     entry = rotate(unit(towards - centre), _centred(uniforms, 0.3))
     is_post, radius = uniforms.take(1) < 0.4, between(BAR_RADIUS, uniforms.take(1)[:, 0])
-    size, porch = (
-        between((0.042, 0.050), uniforms.take(1)[:, 0]),
-        between((0.03, 0.06), uniforms.take(1)[:, 0]),
-    )
+    size = between((0.042, 0.050), uniforms.take(1)[:, 0])
+    porch = between((0.03, 0.06), uniforms.take(1)[:, 0])
     gap = site.room + between((0.004, 0.012), uniforms.take(1)[:, 0]) * (1.0 + 3.0 * site.whole_arm)
     opening = 2.0 * np.arcsin((gap + radius) / (1.2 * distance))
     sides = 3 if site.whole_arm else 4

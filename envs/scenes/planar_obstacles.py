@@ -19,6 +19,7 @@ from viapoint.envs.common.types import Bool, Float, Int, Single
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, segment_distance_squared
 from viapoint.envs.scenes.config import SceneDistribution
 from viapoint.envs.scenes.draws import (
+    IN_THE_WAY,
     FeasiblePath,
     Uniforms,
     between,
@@ -34,8 +35,6 @@ CANDIDATES = 32
 """Obstacles that are drawn at once where the hand alone must clear."""
 DETOURS_ACROSS, DETOUR_PLACES = 15, 21
 """Lateral positions of the via-points of detours, and places along the line at which detours are stored."""
-IN_THE_WAY = 0.004
-"""Depth by which the straight line must cut into an obstacle that is in the way, [m]."""
 ARM_CANDIDATES, CHOICES, BLOCKING = 56, 24, 4
 """Obstacles that are drawn at once where links count, those of them that are compared with detours, and how many of
 these are in the way if there are as many."""
@@ -73,17 +72,16 @@ class PlanarObstacles:
         """Return which paths must leave room towards the base: all, where links count."""
         return np.full(number, self._whole_arm)
 
-    def _clears_path(self, feasible: FeasiblePath, rows: Float) -> Bool:
-        """Return which obstacles leave room for the hand on its path, shape (N, C)."""
-        radius, present = self._arm.hand_radius, rows[..., -1] > 0.0
-        clearance = hand_clearance(feasible.path, radius, rows, present)
-        return np.asarray(clearance > self._distribution.path_margin)
+    def _clears(self, points: Float, rows: Float, margin: float) -> Bool:
+        """Return which obstacles leave a margin around the hand at some points, shape (N, C)."""
+        return np.asarray(hand_clearance(points, self._arm.hand_radius, rows, rows[..., -1] > 0.0) > margin)
 
-    def _clears_ends(self, feasible: FeasiblePath, rows: Float) -> Bool:
-        """Return which obstacles leave room for the hand at start and goal, shape (N, C)."""
-        radius, present = self._arm.hand_radius, rows[..., -1] > 0.0
-        clearance = hand_clearance(feasible.ends, radius, rows, present)
-        return np.asarray(clearance > self._distribution.end_margin)
+    def _clears_path(self, feasible: FeasiblePath, rows: Float) -> Bool:
+        """Return which obstacles leave room for the hand on its path, with start and goal, shape (N, C)."""
+        d = self._distribution
+        return self._clears(feasible.path, rows, d.path_margin) & self._clears(
+            feasible.ends, rows, d.end_margin
+        )
 
 
 class HandObstacles(PlanarObstacles):
@@ -108,7 +106,7 @@ class HandObstacles(PlanarObstacles):
         rows = self._candidates(uniforms, feasible, hardness)
         candidates = Candidates(
             rows,
-            self._clears_path(feasible, rows) & self._clears_ends(feasible, rows),
+            self._clears_path(feasible, rows),
             in_the_way(feasible, rows, self._arm.hand_radius),
             self._closed_detours(feasible, rows),
         )
@@ -278,7 +276,7 @@ class WholeArmObstacles(PlanarObstacles):
         rows = self._candidates(uniforms, feasible, links)
         gap = d.link_margin + 0.002 + 0.08 * uniforms.take(ARM_CANDIDATES) * (1.0 - hardness)
         rows, clearance = _move_to_gap(rows, links, arm.link_radii, gap)
-        free = (clearance > d.link_margin) & self._clears_ends(feasible, rows)
+        free = (clearance > d.link_margin) & self._clears(feasible.ends, rows, d.end_margin)
         hit = in_the_way(feasible, rows, arm.hand_radius)
         first = free & hit & ((free & hit).cumsum(axis=-1) <= BLOCKING)
         some = np.argsort(2 - free - first.astype(np.int64), axis=-1, kind="stable")[:, :CHOICES]
@@ -371,7 +369,7 @@ class FamilyObstacles(WholeArmObstacles):
         rows = np.zeros((len(built), self.rows, built.shape[-1]))
         count = built.shape[1]
         rows[:, :count] = built
-        free = self._clears_path(feasible, rows) & self._clears_ends(feasible, rows)
+        free = self._clears_path(feasible, rows)
         if self._whole_arm:
             clearance = arm_clearance(links, arm.link_radii, rows, rows[..., -1] > 0.0)
             free &= clearance > self._distribution.link_margin
@@ -394,10 +392,8 @@ def _near_elbow(uniforms: Uniforms, links: Float) -> tuple[Float, Float]:
     nearest = (links[:, :, -1, 1] ** 2).sum(axis=-1).argmin(axis=-1)[:, None]
     number = links.shape[1]
     step = np.round(nearest + 10.0 * (uniforms.take(ARM_CANDIDATES) - 0.5)).astype(np.int64)
-    place, angle = (
-        0.4 + 0.6 * uniforms.take(ARM_CANDIDATES)[..., None],
-        2.4 * (uniforms.take(ARM_CANDIDATES) - 0.5),
-    )
+    place = 0.4 + 0.6 * uniforms.take(ARM_CANDIDATES)[..., None]
+    angle = 2.4 * (uniforms.take(ARM_CANDIDATES) - 0.5)
     forearm = links[np.arange(len(links))[:, None], np.clip(step, 0, number - 1), -1]
     elbow, hand = forearm[..., 0, :], forearm[..., 1, :]
     inwards = left(unit(hand - elbow))

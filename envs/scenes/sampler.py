@@ -56,7 +56,10 @@ class SceneSampler:
         order: DrawOrder | None = None,
     ) -> None:
         self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
-        self._obstacles = obstacles or _obstacle_sampler(collision_model, distribution)
+        if obstacles is None and isinstance(distribution, SpaceDistribution):
+            obstacles = SpatialObstacles(collision_model, distribution)
+        planar = WholeArmObstacles if collision_model.whole_arm else HandObstacles
+        self._obstacles: ObstacleSampler = obstacles or planar(collision_model, distribution)  # type: ignore[arg-type]
         self._order = order or DRAW_ORDER[self.arm.dimension]
 
     def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
@@ -185,12 +188,7 @@ class SceneSampler:
 
 
 class UniformSampler(SceneSampler):
-    """Rejection sampler of scenes that are uniform in the workspace, see :class:`UniformScenes`.
-
-    Args:
-        collision_model: Arm that moves, and the bodies that must clear the obstacles.
-        distribution: Distribution of scenes, of the same dimension.
-    """
+    """Rejection sampler of scenes that are uniform in the workspace, see :class:`UniformScenes`."""
 
     def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
         order = DRAW_ORDER[distribution.dimension]._replace(groups=UNIFORM_GROUPS)
@@ -210,10 +208,6 @@ class MixedSampler(SceneSampler):
     """Sampler of scenes of which a share is uniform in the workspace.
 
     The first random number of each scene says from which of the two samplers it comes.
-
-    Args:
-        collision_model: Arm that moves, and the bodies that must clear the obstacles.
-        distribution: Distribution of scenes, of the same dimension, with the share.
     """
 
     def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
@@ -313,21 +307,14 @@ def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -
     return kind(collision_model, distribution)
 
 
-def _obstacle_sampler(collision_model: CollisionModel, distribution: Distribution) -> ObstacleSampler:
-    """Return the sampler of obstacles of a distribution."""
-    if isinstance(distribution, SpaceDistribution):
-        return SpatialObstacles(collision_model, distribution)
-    return (WholeArmObstacles if collision_model.whole_arm else HandObstacles)(collision_model, distribution)
-
-
 def sampler_of_family(
     collision_model: CollisionModel, distribution: Distribution, family: str
 ) -> SceneSampler:
     """Return a sampler of one family of scenes.
 
     Args:
-        collision_model: Arm that moves, and the bodies that must clear the obstacles.
-        distribution: Distribution of the scenes of a task.
+        collision_model: Arm of a task.
+        distribution: Distribution of the scenes of the task.
         family: Name of a built-in or registered family.
 
     Raises:
@@ -349,9 +336,6 @@ def sampler_of_family(
     if isinstance(distribution, SpaceDistribution):
         return SceneSampler(collision_model, dataclasses.replace(distribution, families=(family,)))
     planar = dataclasses.replace(distribution, n_obstacles=(1, min(FAMILY_ROWS, most)))
-    return SceneSampler(
-        collision_model,
-        planar,
-        obstacles=FamilyObstacles(collision_model, planar, record.build),
-        order=DRAW_ORDER[2]._replace(groups=(1,) * FAMILY_ATTEMPTS),
-    )
+    obstacles = FamilyObstacles(collision_model, planar, record.build)
+    order = DRAW_ORDER[2]._replace(groups=(1,) * FAMILY_ATTEMPTS)
+    return SceneSampler(collision_model, planar, obstacles=obstacles, order=order)

@@ -111,7 +111,12 @@ def check_scenes(scenes: Scenes, collision_model: CollisionModel) -> None:
     Raises:
         ValueError: A scene is impossible; the message names the scene, the fault and the allowed values.
     """
-    for wrong, reason in problems(scenes, collision_model):
+    refuse(problems(scenes, collision_model))
+
+
+def refuse(faults: Iterator[Problem]) -> None:
+    """Raise ValueError for the first of some faults that a scene has."""
+    for wrong, reason in faults:
         if wrong.any():
             first = int(wrong.argmax())
             raise ValueError(f"scene {first}: {reason(first)}")
@@ -152,22 +157,8 @@ def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
 
 def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
     """Yield the faults of single obstacles."""
-    if has_shapes(scenes.obstacles):
-        yield from _problems_of_shapes(scenes)
-        return
-    dimension = scenes.start.shape[-1]
-    half = norm(scenes.obstacles[..., dimension : 2 * dimension])
-    radius = scenes.obstacles[..., -1]
-    named = (scenes.obstacles != 0.0).any(axis=-1)
-    for wrong, what in (
-        (named & (radius <= 0.0), "has no positive radius"),
-        (radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"),
-        (half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"),
-        (
-            (np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE).any(axis=-1),
-            "has its centre over 1 m from the origin",
-        ),
-    ):
+    faults = _problems_of_shapes(scenes) if has_shapes(scenes.obstacles) else _problems_of_capsules(scenes)
+    for wrong, what in faults:
         yield (
             wrong.any(axis=-1),
             lambda i, w=wrong, x=what: (  # type: ignore[misc]
@@ -176,8 +167,20 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
         )
 
 
-def _problems_of_shapes(scenes: Scenes) -> Iterator[Problem]:
-    """Yield the faults of single obstacles of any shape."""
+def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
+    """Yield the faults of single capsules: masks, shape (N, n), and what is wrong."""
+    dimension = scenes.start.shape[-1]
+    radius = scenes.obstacles[..., -1]
+    yield (scenes.obstacles != 0.0).any(axis=-1) & (radius <= 0.0), "has no positive radius"
+    yield radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"
+    half = norm(scenes.obstacles[..., dimension : 2 * dimension])
+    yield half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"
+    far = (np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE).any(axis=-1)
+    yield far, "has its centre over 1 m from the origin"
+
+
+def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
+    """Yield the faults of single obstacles of any shape: masks, shape (N, n), and what is wrong."""
     rows, (kind, centre, quaternion, half) = scenes.obstacles, shape_columns(scenes.obstacles)
     again = rows.copy()
     known = {number: name for number, (name, shape) in enumerate(SHAPES.items()) if shape.in_scenes}
@@ -187,20 +190,10 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[Problem]:
         place = centre[some][:, : scenes.start.shape[-1]]
         again[some] = shape_rows(known[int(number)], place, quaternion[some], half[some])
     strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
-    for wrong, what in (
-        ((rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"),
-        ((half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"),
-        (
-            (np.abs(centre) > FARTHEST_SHAPE).any(axis=-1),
-            f"has its centre over {FARTHEST_SHAPE:g} m from the origin",
-        ),
-    ):
-        yield (
-            wrong.any(axis=-1),
-            lambda i, w=wrong, x=what: (  # type: ignore[misc]
-                f"obstacle {w[i].argmax()} {_described(rows[i, w[i].argmax()])} {x}"
-            ),
-        )
+    yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"
+    yield (half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"
+    far = (np.abs(centre) > FARTHEST_SHAPE).any(axis=-1)
+    yield far, f"has its centre over {FARTHEST_SHAPE:g} m from the origin"
 
 
 def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:

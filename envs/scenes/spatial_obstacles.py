@@ -11,7 +11,14 @@ from viapoint.envs.common.arrays import squared_length
 from viapoint.envs.common.types import Bool, Float, Index, Int
 from viapoint.envs.geometry.rows import has_shapes, row_size, widened
 from viapoint.envs.scenes.config import SpaceDistribution
-from viapoint.envs.scenes.draws import FeasiblePath, Uniforms, present_first, shuffle_rows, whole_between
+from viapoint.envs.scenes.draws import (
+    IN_THE_WAY,
+    FeasiblePath,
+    Uniforms,
+    present_first,
+    shuffle_rows,
+    whole_between,
+)
 from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS, LARGEST_HALF_LENGTH
 from viapoint.envs.scenes.spatial_families import BUILDER_NUMBERS, SpatialSite, draw_obstacles
@@ -27,8 +34,6 @@ GIVE_WAY = 1.3
 """Distance by which a part retreats from the arm, relative to the clearance that it lacks."""
 SOME = 1e-6
 """Greatest clearance of interest where only its sign counts, [m]."""
-IN_THE_WAY = 0.004
-"""Depth by which the straight movement must cut into an obstacle that is in the way, [m]."""
 
 
 class SpatialObstacles:
@@ -130,14 +135,8 @@ class SpatialObstacles:
         chosen, enough = self._add_some(u, order[:, : self.rows], feasible, hardness, swept.outer, missing)
         rest = np.flatnonzero(~enough)
         if len(rest):
-            chosen[rest], enough[rest] = self._add_some(
-                u[rest],
-                order[rest],
-                feasible.take(rest),
-                hardness[rest],
-                swept.outer.take(rest),
-                missing[rest],
-            )
+            left = feasible.take(rest), hardness[rest], swept.outer.take(rest), missing[rest]
+            chosen[rest], enough[rest] = self._add_some(u[rest], order[rest], *left)
         return chosen, enough & self._free(swept.inner, chosen[:, None])[:, 0]
 
     def _add_some(

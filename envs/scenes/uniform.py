@@ -16,7 +16,7 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Index
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.draws import Uniforms, rotate, whole_between
+from viapoint.envs.scenes.draws import IN_THE_WAY, Uniforms, rotate, whole_between
 from viapoint.envs.scenes.feasible_path import Ends
 from viapoint.envs.scenes.planar_obstacles import draw_shapes
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS, Scenes, rest_clearance
@@ -28,8 +28,6 @@ NUMBERS = {2: 6, 3: 9}
 """Uniform numbers that make one obstacle, by the dimension."""
 N_TIMES = 24
 """Positions along the straight line at which its clearance and reach are computed."""
-IN_THE_WAY = 0.004
-"""Depth by which the straight movement must cut into an obstacle, [m]."""
 
 
 class UniformScenes:
@@ -42,9 +40,7 @@ class UniformScenes:
     resting arm at start or goal than `end_margin` are left out. A scene is good if the straight movement cuts into an
     obstacle, or if it has none.
 
-    Args:
-        collision_model: Arm that moves, and the bodies that must clear the obstacles.
-        distribution: Distribution of scenes, of the same dimension.
+    The arguments are those of :class:`~viapoint.envs.scenes.sampler.SceneSampler`.
     """
 
     def __init__(

@@ -114,4 +114,4 @@ def test_a_table_of_no_failures_can_be_written():
     nothing = {
         kind.name: {"count": 0, "by_band": dict.fromkeys(module.BANDS, 0), "another": None} for kind in KINDS
     }
-    assert "| all | 0 | 0.0 % | 0 | 0 | 0 | 0 | - |" in markdown(nothing, 0, 10)
+    assert "| all | 0 | 0.0 % | 0 | 0 | 0 | 0 | - |" in markdown(nothing, 10)

@@ -16,8 +16,9 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import callback
+from viapoint.training.runs.callback import TrainingStoppedError
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import TrainingStoppedError, train
+from viapoint.training.runs.trainer import train
 
 TINY = {
     "viaq": {

@@ -16,6 +16,7 @@ from viapoint.training.config.configs import ExportConfig, TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate
 from viapoint.training.io.files import BadFileError, read_json, write_bytes
 from viapoint.training.io.installed import versions
+from viapoint.training.io.template import load_template, packaged
 from viapoint.training.runs.run_dir import Run
 
 CARD = "README.md"
@@ -85,43 +86,18 @@ def model_card(
         command: Command that trained the model; None if it is not known.
         license_: Identifier of the model's licence; None to leave it open.
     """
-    algo, env_id, kwargs = record["algorithm"], record["env"]["id"], record["env"]["kwargs"]
-    module, name, more = CLASSES[algo]
+    module, name, more = CLASSES[record["algorithm"]]
+    env_id = record["env"]["id"]
     header = yaml.safe_dump(_header(name, env_id, evaluations, license_), sort_keys=False, allow_unicode=True)
-    arguments = "".join(f", {argument}={value!r}" for argument, value in kwargs.items())
-    lines = [
-        f"# {name} on {env_id}",
-        "",
-        f"An agent for an arm that reaches around obstacles, in the environment `{env_id}` of the Python package "
-        f"viapoint. The agent was trained with {record['num_timesteps']} decisions.",
-        "",
-        "## Use",
-        "",
-        "Opening an archive of Stable-Baselines3 runs code from it. viapoint must be installed.",
-        "",
-        "```python",
-        "import gymnasium as gym",
-        f"from {module} import {name}",
-        "",
-        f'env = gym.make("viapoint.envs:{env_id}"{arguments})',
-        f'agent = {name}.load("{archive}"{more})',
-        "observation, _ = env.reset(seed=0)",
-        "action, _ = agent.predict(observation, deterministic=True)",
-        "```",
-        "",
-        f"`viapoint import-sb3 {archive} --out FOLDER` converts it to a model without pickled objects.",
-        "",
-        *_table(evaluations),
-        "## Training",
-        "",
-        f"```sh\n{command}\n```" if command else "The command that trained the agent is not known.",
-        "",
-        f"SHA-256 of the weights (`weights.safetensors` of the model folder): `{record['weights_sha256']}`",
-        "",
-        f"Written by {', '.join(f'{package} {version}' for package, version in versions().items())}.",
-        "",
-    ]
-    return f"---\n{header}---\n\n" + "\n".join(lines)
+    written_by = ", ".join(f"{package} {version}" for package, version in versions().items())
+    template = load_template(
+        packaged("cli/templates/model_card.md.j2"),
+        filters={"repr": repr, "percent": lambda rate: f"{100.0 * rate:.1f}"},
+    )
+    return template.render(
+        header=header, name=name, env_id=env_id, record=record, module=module, more=more, archive=archive,
+        rows=list(_rows(evaluations)), command=command, versions=written_by,
+    )  # fmt: skip
 
 
 def _header(
@@ -159,23 +135,6 @@ def _rows(evaluations: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], s
         for method, summary in each["methods"].items():
             if method.startswith("agent"):
                 yield each, method, summary
-
-
-def _table(evaluations: list[dict[str, Any]]) -> list[str]:
-    rows = [
-        f"| {each['scenes']} (sha256 `{each['sha256'][:12]}`) | {summary['scenes']} | {method} "
-        f"| {100.0 * summary['success']['rate']:.1f} % "
-        f"({100.0 * summary['success']['low']:.1f}-{100.0 * summary['success']['high']:.1f}) "
-        f"| {100.0 * summary['collision']['rate']:.1f} % |"
-        for each, method, summary in _rows(evaluations)
-    ]
-    if not rows:
-        return []
-    return [
-        "## Results", "",
-        "Brackets hold the 95 % interval. With N checks, the agent computes the exact clearance of N proposals.", "",
-        "| scene set | scenes | method | success | collision |", "|---|---|---|---|---|", *rows, "",
-    ]  # fmt: skip
 
 
 def _stored_evaluations(folder: Path, record: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

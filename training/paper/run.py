@@ -13,6 +13,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
+from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.paper.claim import Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
 from viapoint.training.paper.figures import double, other
@@ -29,7 +30,6 @@ from viapoint.training.paper.rows import (
     timing,
 )
 from viapoint.training.paper.rows.obstacles import ObstacleMovements, check_agent
-from viapoint.training.runs import trainer as training
 
 ROWS: dict[int, Callable[[], list[Claim]]] = {
     1: straight.point_to_point_claims,
@@ -145,7 +145,7 @@ def run(config: PaperConfig) -> None:
     """
     if config.agent is not None:
         check_agent(config.agent)
-    with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, training.one_thread():
+    with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():
 
         def report_step(name: str) -> None:
             bar.set_description(name)

@@ -107,21 +107,15 @@ class Planner:
     def __call__(self, scenes: Scenes) -> PlannedActions:
         """Return the best action found in each of N scenes; each depends on its scene and the seed alone."""
         number = len(scenes.start)
-        found = PlannedActions(
-            np.zeros((number, self._size)),
-            np.full(number, -np.inf),
-            np.zeros(number, dtype=bool),
-            np.zeros(number, dtype=np.int64),
-        )
+        nothing = np.zeros(number, dtype=bool), np.zeros(number, dtype=np.int64)
+        found = PlannedActions(np.zeros((number, self._size)), np.full(number, -np.inf), *nothing)
         generator = np.random.default_rng(self._seed)
         self._try(scenes, np.arange(number), np.zeros((number, 1, self._size)), found)
         count = self._budget.first
         while True:
             rows = np.flatnonzero(~found.success) if found.n_tried.max() > 1 else np.arange(number)
-            if (
-                not len(rows)
-                or found.n_tried[rows].max() + count > self._budget.more + 1 + self._budget.first
-            ):
+            most = self._budget.more + 1 + self._budget.first
+            if not len(rows) or found.n_tried[rows].max() + count > most:
                 break
             actions = generator.uniform(-1.0, 1.0, (count, self._size))
             self._try(scenes, rows, np.broadcast_to(actions, (len(rows), count, self._size)), found)
@@ -165,6 +159,4 @@ class Planner:
             actions = np.array([[search.ask() for _ in range(population)] for search in searches])
             rewards = self._try(scenes, rows, actions, found)
             for search, candidates, values in zip(searches, actions, rewards, strict=True):
-                search.tell(
-                    [(action, -float(reward)) for action, reward in zip(candidates, values, strict=True)]
-                )
+                search.tell(list(zip(candidates, (-values).tolist(), strict=True)))

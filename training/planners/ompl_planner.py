@@ -85,7 +85,7 @@ class MotionPlanner:
 
     def __call__(self, scene: Scenes) -> Plan:
         """Return the first smooth plan of one scene that is clear, or else the one with the most clearance; one row."""
-        best, merit = self._straight(scene), -np.inf
+        best, merit = self._smooth(np.concatenate((scene.start, scene.goal))), -np.inf
         for attempt in range(self._budget.attempts):
             margin = MARGINS[min(attempt, len(MARGINS) - 1)]
             path = self._path(scene, margin)
@@ -111,9 +111,6 @@ class MotionPlanner:
         points = waypoints[None]
         duration = np.array([self._task.action.centre_duration])
         return Plan(points, np.asarray(primitives.passage_durations(points, duration)))
-
-    def _straight(self, scene: Scenes) -> Plan:
-        return self._smooth(np.concatenate((scene.start, scene.goal)))
 
     def _clearance(self, plan: Plan, scene: Scenes) -> float:
         """Return the least clearance of a plan, less the distance by which it leaves the reach, [m]."""

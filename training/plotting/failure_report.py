@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.evaluation.evaluator import MethodResult
+from viapoint.training.evaluation.evaluator import MethodResult, evenly_spread
 from viapoint.training.io.files import write_bytes, write_json
 from viapoint.training.plotting.gallery import Entry, gallery
 from viapoint.training.rollouts.rollout import SceneSimulation
@@ -148,7 +148,7 @@ def write_failures(failures: Failures, folder: Path, env_id: str, **env_kwargs: 
     The pictures of a kind range from its deepest collision to its shallowest.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    table = markdown(failures.counts(), len(failures.rows), len(failures.frozen.share))
+    table = markdown(failures.counts(), len(failures.frozen.share))
     heading = f"# Failures of {failures.method} on {env_id}, scenes {failures.frozen.name}"
     write_bytes(folder / "failures.md", f"{heading}\n\n{table}\n".encode())
     write_json(folder / "failures.json", {"method": failures.method, "kinds": failures.counts()})
@@ -157,41 +157,28 @@ def write_failures(failures: Failures, folder: Path, env_id: str, **env_kwargs: 
         mine = np.flatnonzero(failures.kind == i)
         if len(mine):
             ordered = mine[np.argsort(-failures.depth[mine], kind="stable")]
-            chosen = ordered[
-                np.unique(np.linspace(0, len(mine) - 1, min(MAX_PICTURES, len(mine))).round().astype(int))
-            ]
+            chosen = ordered[evenly_spread(len(mine), MAX_PICTURES)]
             entries = _entries(failures, chosen, env_id, env_kwargs)
             heading = f"{kind.description}: {len(mine)} of {len(failures.rows)} failures"
             written.append(gallery(folder / f"{kind.name}.png", entries, heading=heading))
     return written
 
 
-def markdown(counts: Mapping[str, Any], failures: int, scenes: int) -> str:
+def markdown(counts: Mapping[str, Any], scenes: int) -> str:
     """Return the table of counts as Markdown."""
     lines = [
         ["kind", "failures", "of all scenes", *(f"share {band}" for band in BANDS), "another succeeds"],
         ["---", *["---:"] * (3 + len(BANDS))],
     ]
-    for kind in KINDS:
-        each = counts[kind.name]
-        another = "-" if each["another"] is None else str(each["another"])
-        numbers = [str(each["by_band"][band]) for band in BANDS]
-        part = f"{100.0 * each['count'] / scenes:.1f} %" if scenes else "-"
-        lines.append([kind.description, str(each["count"]), part, *numbers, another])
-    lines.append(
-        ["all", str(failures), f"{100.0 * failures / scenes:.1f} %" if scenes else "-", *_sums(counts)]
-    )
+    groups = {kind.description: [counts[kind.name]] for kind in KINDS}
+    for description, group in {**groups, "all": list(counts.values())}.items():
+        number = sum(each["count"] for each in group)
+        part = f"{100.0 * number / scenes:.1f} %" if scenes else "-"
+        by_band = [str(sum(each["by_band"][band] for each in group)) for band in BANDS]
+        another = [each["another"] for each in group]
+        succeeds = "-" if None in another else str(sum(another))
+        lines.append([description, str(number), part, *by_band, succeeds])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _sums(counts: Mapping[str, Any]) -> Sequence[str]:
-    """Return the last columns of all kinds together."""
-    every = list(counts.values())
-    bands = [str(sum(each["by_band"][band] for each in every)) for band in BANDS]
-    return [
-        *bands,
-        "-" if any(e["another"] is None for e in every) else str(sum(e["another"] for e in every)),
-    ]
 
 
 def _entries(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -82,7 +81,6 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
     margin = 0.75 if heading else 0.45
     figure = Figure(figsize=(TILE * columns, tall * rows + margin), dpi=RESOLUTION)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
-    FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[len(entries) :]:
         axes.set_axis_off()

@@ -158,12 +158,11 @@ class EpisodeSimulation(SceneSimulation):
     def _play(
         self, scenes: Any, actions: Float, method: Any, *, single_decision: bool = False
     ) -> SimulationResults:
-        return SimulationResults.concatenate(
-            [
-                _episodes(env, scenes.take(rows), actions[rows], method, single_decision)
-                for rows, env in self._groups(len(scenes.start))
-            ]
-        )
+        pieces = [
+            _episodes(env, scenes.take(rows), actions[rows], method, single_decision)
+            for rows, env in self._groups(len(scenes.start))
+        ]
+        return SimulationResults.concatenate(pieces)
 
 
 def new_simulation(env_id: str, num_envs: int = 512, **kwargs: Any) -> SceneSimulation:

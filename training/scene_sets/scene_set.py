@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import sys
 import zipfile
@@ -29,6 +30,8 @@ DRAWN = ""
 """Family of the scenes that are drawn from the training distribution."""
 MEASURED = ("share", "solution")
 """Measured values of each scene."""
+PER_SCENE = (*MEASURED, "family", "number")
+"""Fields of a set that have one entry for each scene, besides the scenes."""
 LARGEST = 1 << 30
 """Limit of the memory of a file's arrays, [bytes], enough for a million scenes: a small archive can claim any size."""
 
@@ -92,15 +95,8 @@ class FrozenScenes:
 
     def take(self, rows: Any) -> FrozenScenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
-        return FrozenScenes(
-            name=self.name,
-            env_id=self.env_id,
-            scenes=self.scenes.take(rows),
-            share=self.share[rows],
-            solution=self.solution[rows],
-            family=self.family[rows],
-            number=self.number[rows],
-        )
+        rest = {name: getattr(self, name)[rows] for name in PER_SCENE}
+        return dataclasses.replace(self, scenes=self.scenes.take(rows), **rest)
 
 
 def shipped_path(name: str, env_id: str) -> Path:
@@ -129,15 +125,9 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
     if not path.is_file():
         raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
     kind, content = _read(path)
-    frozen = FrozenScenes(
-        name=str(name_or_path),
-        env_id=str(content["env_id"]),
-        scenes=kind(*(content[name] for name in kind._fields)),
-        share=content["share"],
-        solution=content["solution"],
-        family=content["family"],
-        number=content["number"],
-    )
+    scenes = kind(*(content[name] for name in kind._fields))
+    rest: Any = {name: content[name] for name in PER_SCENE}
+    frozen = FrozenScenes(name=str(name_or_path), env_id=str(content["env_id"]), scenes=scenes, **rest)
     if frozen.sha256 != str(content["sha256"]):
         raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
     if frozen.env_id != env_id:
@@ -162,7 +152,7 @@ def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
                 kind: Any = ChangingScenes if "jumps" in archive else Scenes
-                names = (*kind._fields, *MEASURED, "env_id", "sha256", "family", "number")
+                names = (*kind._fields, *PER_SCENE, "env_id", "sha256")
                 content = {name: archive[name] for name in names}
         _check_content(kind, content)
     except Exception as error:  # an archive can be broken in any of its layers
@@ -179,7 +169,7 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
     wanted |= {"jumps": (number, *content.get("jumps", content["goal"]).shape[1:2], d + 1)}
     wanted |= dict.fromkeys(("share", "family", "number"), (number,))
     wanted |= {"solution": (number, *content["solution"].shape[1:2])}
-    for name in (*kind._fields, *MEASURED, "family", "number"):
+    for name in (*kind._fields, *PER_SCENE):
         shape, numbers = content[name].shape, content[name].dtype.kind in "fi"
         if shape != wanted[name] or not number or numbers is (name == "family"):
             raise ValueError(f"{name} of {number} scenes is {content[name].dtype} of shape {shape}")
@@ -214,13 +204,8 @@ def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) ->
     simulation = new_simulation(env_id, 64 if env_id in REPLANNING_TASKS else 1, **env_kwargs)
     scenes = simulation.draw(number, SEEDS[name])
     simulation.close()
-    return FrozenScenes(
-        name="drawn",
-        env_id=env_id,
-        scenes=scenes,
-        share=np.full(number, np.nan),
-        solution=np.zeros((number, simulation.task.action.size)),
-    )
+    share, solution = np.full(number, np.nan), np.zeros((number, simulation.task.action.size))
+    return FrozenScenes(name="drawn", env_id=env_id, scenes=scenes, share=share, solution=solution)
 
 
 def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) -> FrozenScenes:
@@ -252,10 +237,8 @@ def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
     simulation = new_simulation(frozen.env_id, 1, **env_kwargs)
     layout = simulation.task.observation
     simulation.close()
-    mine, theirs = (
-        (layout.n_rows, layout.dimension),
-        (frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]),
-    )
+    mine = layout.n_rows, layout.dimension
+    theirs = frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]
     if mine != theirs:
         raise ValueError(
             f"{frozen.name} holds scenes of {theirs[0]} obstacles at most in {theirs[1]} dimensions; the "

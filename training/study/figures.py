@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
@@ -53,7 +52,6 @@ def _environment(name: str, numbers: Numbers, path: Path, shown: Sequence[str]) 
         if numbers["sets"][each]["bands"] and any(each in r["sets"] for r in rows)
     ]
     figure = Figure(figsize=(9.6, 3.2 * (2 if sets else 1)), layout="constrained")
-    FigureCanvasAgg(figure)
     parts: Any = figure.subfigures(2, 1, hspace=0.04) if sets else (figure, None)
     above, below = parts
     colours = _colours(numbers)
@@ -151,7 +149,6 @@ def _series(numbers: Numbers) -> dict[str, list[Numbers]]:
 def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:
     """Draw failures and jerk against the number of checks, and failures against the time of a decision."""
     figure = Figure(figsize=(3.4 * len(environments), 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(3, len(environments), squeeze=False, sharey="row")
     for column, (name, numbers) in enumerate(environments.items()):
         for i, (series, rows) in enumerate(_series(numbers).items()):

@@ -11,13 +11,13 @@ import os
 import re
 import statistics
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from viapoint.training.io.files import BadFileError, write_bytes
+from viapoint.training.io.template import load_template, packaged
 from viapoint.training.scene_sets.scene_set import BANDS
 from viapoint.training.study.config import Page
 
@@ -44,7 +44,7 @@ def write_pages(record: Numbers, page: Page) -> list[Path]:
 
 def render_page(record: Numbers, page: Page) -> str:
     """Return the page of a record as Markdown."""
-    default = Path(str(files("viapoint.training.study") / "templates" / "page.md.j2"))
+    default = packaged("study/templates/page.md.j2")
     template = _template(record, page.template or default)
     figures = Path(os.path.relpath(page.figures, page.file.parent))
     try:
@@ -74,24 +74,8 @@ def fill_tables(record: Numbers, page: Page, text: str, path: Path) -> str:
 
 
 def _template(record: Numbers, path: Path) -> jinja2.Template:
-    """Return a template of a file, which sees the record.
-
-    Raises:
-        BadFileError: It has a syntax error.
-    """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(path.parent),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters.update(FILTERS)
-    environment.globals.update(FUNCTIONS, record=record)
-    try:
-        return environment.get_template(path.name)
-    except jinja2.TemplateError as error:
-        raise BadFileError(path, f"is no template ({error})") from error
+    """Return a template of a file, which sees the record."""
+    return load_template(path, filters=FILTERS, **FUNCTIONS, record=record)
 
 
 def figure_name(environment: str) -> str:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from optuna.trial import FrozenTrial, TrialState
 
 from viapoint.training.config.configs import TrainConfig, TuneConfig
 from viapoint.training.io.files import write_bytes, write_json
 from viapoint.training.io.installed import versions
+from viapoint.training.io.template import load_template, packaged
 from viapoint.training.plotting.plots import style_axes
 from viapoint.training.runs.callback import validation_scenes
 from viapoint.training.runs.run_dir import Run
@@ -81,51 +81,22 @@ def best_training(tuning: Tuning, best: FrozenTrial) -> TrainConfig:
 def report(tuning: Tuning) -> str:
     """Return the report as Markdown."""
     search, trials = tuning.search, tuning.trials
-    states = Counter(each.state for each in trials)
     folders = [tuning.folder / tuning.folder_of(each) / f"seed-{search.seeds[0]}" for each in trials]
     first = next((each for each in folders if (each / "config.json").is_file()), None)
-    lines = [
-        f"# Hyperparameters of {search.algo} on {search.env}",
-        "",
-        f"{states[TrialState.COMPLETE]} trials of {search.n_timesteps} decisions finished, "
-        f"{states[TrialState.PRUNED]} were pruned, {states[TrialState.FAIL]} could not be trained. A trial trains "
-        f"{len(search.seeds)} seed{'s' if len(search.seeds) > 1 else ''} "
-        f"({', '.join(map(str, search.seeds))}); its score is the {search.objective} success rate"
-        f"{_scenes(first)}. The score of the best trial is the greatest of several noisy numbers: train its settings "
-        "with other seeds before you compare them.",
-        "",
-        *_table(tuning),
-        *_importance(tuning),
-        *_pruned(tuning),
-        *_failed(trials),
-    ]
-    if tuning.best is not None:
-        command = best_training(tuning, tuning.best).command
-        lines += ["## Best settings", "", "```sh", command, "```", "", "`best.json` holds them as JSON.", ""]
-    using = ", ".join(f"{name} {version}" for name, version in versions().items())
-    return "\n".join([*lines, f"Versions: {using}, optuna {optuna.__version__}.", ""])
-
-
-def _scenes(folder: Path | None) -> str:
-    """Return the validation scenes in words."""
-    if folder is None:
-        return ""
-    scenes = validation_scenes(Run(folder))
-    kind = "drawn" if scenes.name == "drawn" else "shipped"
-    return f" in the same {len(scenes.share)} {kind} validation scenes (sha256 {scenes.sha256[:12]})"
-
-
-def _table(tuning: Tuning) -> list[str]:
-    names = list(tuning.search.parameters)
-    rows = [
-        f"| {each.number}{' (given)' if 'fixed_params' in each.system_attrs else ''} "
-        f"| {100.0 * (each.value or 0.0):.1f} % "
-        f"| {f'{each.duration.total_seconds() / 60.0:.1f}' if each.duration else '-'} "
-        f"| {' | '.join(_shown(each.params[name]) for name in names)} |"
-        for each in tuning.ranked[:SHOWN]
-    ]
-    head = f"| trial | score | minutes | {' | '.join(f'`{name}`' for name in names)} |"
-    return ["## Best trials", "", head, "|" + "---|" * (3 + len(names)), *rows, ""] if rows else []
+    using = {**versions(), "optuna": optuna.__version__}
+    template = load_template(packaged("study/templates/tuning.md.j2"), filters={"shown": _shown})
+    return template.render(
+        search=search,
+        finished=sum(each.state == TrialState.COMPLETE for each in trials),
+        pruned=Counter(each.last_step or 0 for each in trials if each.state == TrialState.PRUNED),
+        failed=[each for each in trials if ERROR in each.user_attrs],
+        repeated=[each for each in trials if ATTEMPTS in each.user_attrs],
+        scenes=None if first is None else validation_scenes(Run(first)),
+        best=tuning.ranked[:SHOWN],
+        importance=importance(tuning),
+        command=best_training(tuning, tuning.best).command if tuning.best is not None else "",
+        versions=", ".join(f"{name} {version}" for name, version in using.items()),
+    )
 
 
 def importance(tuning: Tuning) -> dict[str, float]:
@@ -138,34 +109,6 @@ def importance(tuning: Tuning) -> dict[str, float]:
         return optuna.importance.get_param_importances(tuning.study, evaluator=evaluator)
 
 
-def _importance(tuning: Tuning) -> list[str]:
-    values = importance(tuning)
-    if not values:
-        return []
-    rows = [f"| `{name}` | {value:.2f} |" for name, value in values.items()]
-    return [
-        "## Importance of parameters", "",
-        "Estimated by PED-ANOVA from the finished trials; the sum is 1. With few trials it is a rough guess.", "",
-        "| parameter | importance |", "|---|---|", *rows, "",
-    ]  # fmt: skip
-
-
-def _pruned(tuning: Tuning) -> list[str]:
-    pruned = Counter(each.last_step or 0 for each in tuning.trials if each.state == TrialState.PRUNED)
-    rows = [f"| {step} | {number} |" for step, number in sorted(pruned.items())]
-    return ["## Pruned trials", "", "| decisions | trials |", "|---|---|", *rows, ""] if rows else []
-
-
-def _failed(trials: list[FrozenTrial]) -> list[str]:
-    rows = [f"* trial {each.number}: {each.user_attrs[ERROR]}" for each in trials if ERROR in each.user_attrs]
-    repeats = [
-        f"* trial {each.number} repeats trial {each.user_attrs[ATTEMPTS][-1]}, whose process ended"
-        for each in trials
-        if ATTEMPTS in each.user_attrs
-    ]
-    return ["## Failures", "", *rows, *repeats, ""] if rows or repeats else []
-
-
 def _shown(value: Any) -> str:
     value = plain(value)
     return f"{value:.3g}" if isinstance(value, float) else f"{value}"
@@ -174,7 +117,7 @@ def _shown(value: Any) -> str:
 def draw_curves(tuning: Tuning, path: Path) -> None:
     """Draw the success rate of every trial in validation against decisions."""
     figure = Figure(figsize=(6.0, 3.4), layout="constrained")
-    axes = FigureCanvasAgg(figure).figure.subplots()
+    axes = figure.subplots()
     best = tuning.best
     styles = {
         TrialState.COMPLETE: ("#9aa5b1", "-", "finished"), TrialState.PRUNED: ("#d9822b", "--", "pruned"),

@@ -95,7 +95,7 @@ def obstacles(avoidance: ObstacleMovements) -> Figure:
     figure, axes = sheet(3, 2, 10.5)
     found = features(avoidance.executed, avoidance.scenes)
     depth = np.array([each.valley_depth for each in avoidance.executed])
-    for column, row in enumerate((int(np.argmin(depth)), _median_row(depth))):
+    for column, row in enumerate(np.argsort(depth)[[0, len(depth) // 2]].tolist()):
         _obstacle_column(axes[:, column], avoidance, row, found.bend[row])
         axes[0, column].set_title("AB"[column], loc="left", pad=3.0)
         axes[2, column].set_xlabel("$t/t_f$")
@@ -108,11 +108,6 @@ def obstacles(avoidance: ObstacleMovements) -> Figure:
     axes[2, 0].set_ylabel(ROWS[1])
     axes[1, 1].legend(loc="upper right")
     return figure
-
-
-def _median_row(depth: Float) -> int:
-    """Return the row of the movement with the median depth."""
-    return int(np.argsort(depth)[len(depth) // 2])
 
 
 def _obstacle_column(ax: Float, avoidance: ObstacleMovements, row: int, bend: float) -> None:

@@ -43,7 +43,7 @@ def model() -> Figure:
     axes[2, 1].axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
     axes[2, 1].legend(loc="upper right", handlelength=1.2)
     for ax in (axes[0, 1], axes[1, 1], axes[2, 0], axes[2, 1]):
-        _time(ax)
+        ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
     for ax, letter in ((axes[0, 0], "A"), (axes[1, 0], "B")):
         ax.set_title(letter, loc="left", pad=3.0)
     return figure
@@ -70,10 +70,6 @@ def _curvature(ax: Axes, movement: Trajectory) -> None:
     ax.plot(profile.time[inner], profile.curvature[inner], **MODEL)
     ax.axvline(profile.valley, color="0.6", linewidth=0.7, linestyle=":")
     ax.set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
-
-
-def _time(ax: Axes) -> None:
-    ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
 
 
 def straight_movements() -> Figure:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import withStroke
@@ -65,7 +64,6 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and SVG."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
-    FigureCanvasAgg(figure)
     figure.savefig(paths[0], dpi=DOTS_PER_INCH, metadata={"Software": None})
     figure.set_layout_engine("none")  # the same layout for both files, computed once
     figure.savefig(paths[1], metadata={"Date": None, "Creator": None})

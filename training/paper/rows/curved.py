@@ -141,7 +141,11 @@ def valley_claims() -> list[Claim]:
 
 def _threshold_claim(along: float, exact: str, expected: ExpectedRange) -> Claim:
     model = valley_threshold(along, functools.partial(model_has_valley, along))
-    arm = valley_threshold(along, functools.partial(_arm_has_valley, along), halvings=12)
+
+    def arm_has_valley(height: float) -> bool:
+        return bool(np.isfinite(arm_profile(simulate(curved(*ENDS, along, -height))).valley))
+
+    arm = valley_threshold(along, arm_has_valley, halvings=12)
     return Claim(
         row=5, claim=f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds",
         figure="1B", paper=f"two peaks and a valley; {exact}".removesuffix("; -"), model=model, expected=expected,
@@ -153,10 +157,6 @@ def _threshold_claim(along: float, exact: str, expected: ExpectedRange) -> Claim
 def model_has_valley(along: float, height: float) -> bool:
     """Return whether the model's speed has a valley, exactly."""
     return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
-
-
-def _arm_has_valley(along: float, height: float) -> bool:
-    return bool(np.isfinite(arm_profile(simulate(curved(*ENDS, along, -height))).valley))
 
 
 def valley_threshold(along: float, has_valley: Callable[[float], bool], halvings: int = 30) -> float:

@@ -14,15 +14,14 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
-from viapoint.training.algorithms.agent import find_model, load_agent
+from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
 from viapoint.training.paper.reference_movements import construction, minimum_jerk_through, passage_share
 from viapoint.training.paper.rows.timing import FAST, SLOW
 from viapoint.training.paper.simulated import SimulatedMovements, simulate
-from viapoint.training.planners.baselines import Method, agent_method
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)
@@ -31,11 +30,10 @@ RADII = (0.008, 0.02)
 """Radii of the rows of lights, [m]."""
 SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
 """Offsets of a row's middle from the middle of the line between the targets, along and across it, [m]."""
-BUDGET = PlannerBudget(first=32, more=512, generations=8, population=6)
 
 
 class ObstacleMovements(NamedTuple):
-    """Successful movements of an agent or the planner around rows of lights."""
+    """Successful movements of an agent around rows of lights."""
 
     name: str
     scenes: Scenes
@@ -64,9 +62,11 @@ def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes
 
 
 def decide(agent: Path | None) -> ObstacleMovements:
-    """Simulate the agent of a run folder, the shipped one, or else the planner, around the rows of lights."""
+    """Simulate the agent of a run folder, or the shipped one, around the rows of lights."""
     scenes = light_scenes()
-    method, simulation = _method(agent)
+    found = load_agent(agent or DEFAULT_ENV)
+    method = agent_method("agent", found, 0)
+    simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
     check_scenes(scenes, simulation.task.collision_model)
     action = method.decide(simulation.observe(_padded(scenes, simulation)), _padded(scenes, simulation))
     success = simulation(scenes, action).success
@@ -98,22 +98,6 @@ def check_agent(agent: Path) -> None:
         )
 
 
-def _method(agent: Path | None) -> tuple[Method, SceneSimulation]:
-    if agent is not None or _is_shipped():
-        found = load_agent(agent or DEFAULT_ENV)
-        return agent_method("agent", found, 0), SceneSimulation(found.env_id, 256, **found.env_kwargs)
-    simulation = SceneSimulation(DEFAULT_ENV, 256)
-    return Planner(simulation, budget=BUDGET), simulation
-
-
-def _is_shipped() -> bool:
-    try:
-        find_model(DEFAULT_ENV)
-    except ValueError:
-        return False
-    return True
-
-
 def _padded(scenes: Scenes, simulation: SceneSimulation) -> Scenes:
     """Return scenes with as many obstacle rows as the observation; the added ones are absent."""
     most = simulation.task.scenes.n_obstacles[1]
@@ -143,11 +127,7 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
     valley = np.array([each.valley for each in profiles])
     bend = np.array([each.bend[0] for each in profiles])
     agrees = np.zeros(len(bend), dtype=bool)
-    via, residual, apart = (
-        np.full((len(bend), 2), np.nan),
-        np.full(len(bend), np.nan),
-        np.full(len(bend), np.nan),
-    )
+    via, (residual, apart) = np.full((len(bend), 2), np.nan), np.full((2, len(bend)), np.nan)
     for row in np.flatnonzero(np.isfinite(bend)):
         points = np.stack((scenes.start[row], profiles[row].place(bend[row]), scenes.goal[row]))
         model = minimum_jerk_through(points)
