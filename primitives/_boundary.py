@@ -8,16 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import ORDERS
-from .array_api import (
-    FREE,
-    Array,
-    Boundary,
-    Namespace,
-    as_floats,
-    broadcast_batch,
-    is_given,
-    refuse_free,
-)
+from .array_api import FREE, Array, Boundary, Namespace, as_floats, broadcast_batch, is_given, refuse_free
 
 Ends = dict[str, Boundary]
 """The four boundary values by name, in the order of END_NAMES."""

@@ -24,17 +24,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ._hermite_tables import coefficient_table, stiffness_table
-from .array_api import (
-    FREE,
-    Array,
-    Namespace,
-    broadcast_to,
-    constant,
-    is_given,
-    like,
-    to_numpy,
-    unit_factors,
-)
+from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
 
 Entry: TypeAlias = Any
 """An array or a Python float."""

@@ -12,16 +12,7 @@ from ._passage.cost import PassageCost
 from ._passage.moving_ends import fractions_moving
 from ._passage.newton import attach_gradient, fractions_by_newton
 from ._passage.rest_to_rest import fractions_at_rest
-from .array_api import (
-    FREE,
-    Array,
-    Boundary,
-    broadcast_to,
-    follows_gradient,
-    like,
-    require,
-    to_numpy,
-)
+from .array_api import FREE, Array, Boundary, broadcast_to, follows_gradient, like, require, to_numpy
 
 
 def passage_durations(

@@ -10,16 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import clamp
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.shape import (
-    CONTACT,
-    GUARD,
-    Components,
-    Geom,
-    Shape,
-    best_of,
-    safe_ratio,
-    spread,
-)
+from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape, best_of, safe_ratio, spread
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 NEWTON_STEPS = 12

@@ -42,11 +42,7 @@ def ends_of(links: Float) -> LinkPositions:
 
 
 def nearest_approach(
-    traced: LinkPositions,
-    radii: tuple[float, ...],
-    obstacles: Float,
-    present: Bool,
-    last: Int | None = None,
+    traced: LinkPositions, radii: tuple[float, ...], obstacles: Float, present: Bool, last: Int | None = None
 ) -> Float:
     """Return the least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.
 

@@ -79,11 +79,7 @@ class ObservationLayout:
         """Return the observation space of one environment."""
         point = np.full(self.dimension, FARTHEST)
         low, high = self._joint_bounds
-        bounds = {
-            "hand": (-point, point),
-            "goal": (-point, point),
-            "joints": (low, high),
-        }
+        bounds = {"hand": (-point, point), "goal": (-point, point), "joints": (low, high)}
         if self.n_rows and self.shapes != CAPSULES:
             kinds = np.ones(len(self.shapes))
             row = np.concatenate((kinds, 3 * [FARTHEST_SHAPE], np.ones(6), 3 * [LARGEST_HALF_LENGTH], [1.0]))

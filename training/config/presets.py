@@ -113,7 +113,7 @@ REPLANNING_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
         hyperparameters=(*PRESETS["viaq"].hyperparameters, ("gradient_steps", 6), ("next_candidates", 4)),
-    ),
+    )
 }
 """Presets of replanning tasks, in which discounts follow time; viaq does not discount, as episodes end in seconds."""
 
