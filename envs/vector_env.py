@@ -254,7 +254,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         d, n = self.arm.dimension, self.task.observation.n_rows
         shapes = self.task.scenes.shapes
-        empty = Scenes(*np.zeros((2, number, d)), np.zeros((number, n, row_size(d, shapes))))
+        points = np.zeros((number, d))
+        empty = Scenes(points, points, np.zeros((number, n, row_size(d, shapes))))
         given = given_scenes(options, empty, self.arm, shapes)._asdict()
         return {name: given[name] for name in options}
 

@@ -122,8 +122,10 @@ class ReplanningDecoder:
         )(centre[:, None] * shares)
         vias = np.where(changed[:, None, None], anew, rest)
         remaining = np.where(changed | ~begun, centre, np.maximum(end - time, 0.0))
-        vias = np.where(begun[:, None, None], vias, straight)
-        return NominalPlan(begun, changed & begun, state, start, goal, vias, remaining)
+        begin = begun[:, None, None]
+        return NominalPlan(
+            begun, changed & begun, state, start, goal, np.where(begin, vias, straight), remaining
+        )
 
     def _passages(self, plan: MovingPlan, time: Float) -> Float:
         """Return passage times of the remaining via-points, and times on the last segment for those passed.

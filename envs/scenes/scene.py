@@ -167,7 +167,7 @@ def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
         )
 
 
-def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
+def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Any, str]]:
     """Yield the faults of single capsules: masks, shape (N, n), and what is wrong."""
     dimension = scenes.start.shape[-1]
     radius = scenes.obstacles[..., -1]
@@ -175,11 +175,11 @@ def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
     yield radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"
     half = norm(scenes.obstacles[..., dimension : 2 * dimension])
     yield half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"
-    far = (np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE).any(axis=-1)
-    yield far, "has its centre over 1 m from the origin"
+    far = np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE
+    yield far.any(axis=-1), "has its centre over 1 m from the origin"
 
 
-def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
+def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
     """Yield the faults of single obstacles of any shape: masks, shape (N, n), and what is wrong."""
     rows, (kind, centre, quaternion, half) = scenes.obstacles, shape_columns(scenes.obstacles)
     again = rows.copy()
@@ -192,8 +192,8 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Bool, str]]:
     strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
     yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"
     yield (half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"
-    far = (np.abs(centre) > FARTHEST_SHAPE).any(axis=-1)
-    yield far, f"has its centre over {FARTHEST_SHAPE:g} m from the origin"
+    far = np.abs(centre) > FARTHEST_SHAPE
+    yield far.any(axis=-1), f"has its centre over {FARTHEST_SHAPE:g} m from the origin"
 
 
 def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:

@@ -81,8 +81,8 @@ class ScaledMovements(NamedTuple):
 
     def take(self, rows: Int) -> ScaledMovements:
         """Return the movements at some rows."""
-        scenes, plan = self.scenes.take(rows), self.plan.take(rows)
-        return ScaledMovements(self.sims[rows], scenes, plan, *(part[rows] for part in self[3:]))
+        found = self.stretch[rows], self.within[rows], self.duration[rows], self.steps[rows]
+        return ScaledMovements(self.sims[rows], self.scenes.take(rows), self.plan.take(rows), *found)
 
 
 class TrackingReferences(NamedTuple):

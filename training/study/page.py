@@ -224,7 +224,7 @@ FILTERS = {
     "mean": statistics.mean,
 }
 """Filters of templates by name."""
-FUNCTIONS = {
+FUNCTIONS: dict[str, Any] = {
     "row": row,
     "chosen": chosen,
     "summary": summary,
