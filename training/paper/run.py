@@ -108,7 +108,7 @@ def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None])
         report_step(f"row {row}")
         claims += compute()
     report_step("row 12")
-    avoidance = obstacles.decide(agent)
+    avoidance = obstacles.agent_movements(agent)
     claims += obstacles.obstacle_claims(avoidance)
     claims.sort(key=lambda claim: claim.row)
     pictures = []

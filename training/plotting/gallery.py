@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ TILE = 2.6
 """Width of one picture, [inch]."""
 RESOLUTION = 110
 """Resolution, [dots per inch]."""
+LINE = 28
+"""Greatest number of characters of the heading above one picture."""
 VIEW = ((-0.53, 0.45), (-0.09, 0.75))
 """Limits of x and y, [m]."""
 
@@ -78,7 +81,8 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
     columns = min(columns, len(entries))
     rows = -(-len(entries) // columns)
     tall = TILE * (VIEW[1][1] - VIEW[1][0]) / (VIEW[0][1] - VIEW[0][0]) + 0.3
-    margin = 0.75 if heading else 0.45
+    lines = textwrap.wrap(heading, LINE * columns)
+    margin = 0.45 + 0.3 * bool(lines) + 0.2 * len(lines[1:]) + 0.3 * (columns == 1)
     figure = Figure(figsize=(TILE * columns, tall * rows + margin), dpi=RESOLUTION)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
     grid = figure.subplots(rows, columns, squeeze=False)
@@ -91,8 +95,8 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
         axes.set_title(entry.outcome, loc="left", fontsize=8.5, color=colour, fontweight="bold", pad=3)
         axes.set_title(entry.title, loc="right", fontsize=8, color=PALETTE.joint, pad=3)
     _legend(figure, columns)
-    if heading:
-        figure.suptitle(heading, fontsize=11, color=PALETTE.executed)
+    if lines:
+        figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
     path = Path(path)
     figure.savefig(path)
     return path
@@ -111,7 +115,7 @@ def _legend(figure: Figure, columns: int) -> None:
         list(styles.values()),
         list(styles),
         loc="outside lower center",
-        ncols=5 if columns > 1 else 3,
+        ncols=5 if columns > 1 else 2,
         fontsize=8,
         frameon=False,
     )

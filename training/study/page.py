@@ -91,6 +91,18 @@ def has_figure(numbers: Numbers) -> bool:
     return bands or any(each.get("curve") for each in agents)
 
 
+def caption(numbers: Numbers) -> str:
+    """Return the caption of an environment's figure: axes and number of scenes."""
+    above = (
+        "success without checks in validation scenes against decisions, simulated time and time of training"
+    )
+    sets = [f"{about['scenes']:,} `{name}`" for name, about in numbers["sets"].items() if about["bands"]]
+    if not sets:
+        return f"*{above.capitalize()}. The table has the number of seeds.*"
+    below = f"success by solution share in {' and '.join(sets)} scenes, with 95 % intervals"
+    return f"*Above: {above}. Below: {below}. The tables have the numbers of seeds.*"
+
+
 def short(environment: str) -> str:
     """Return the name of an environment without namespace and version."""
     return environment.rpartition("/")[2].removesuffix("-v0")
@@ -231,6 +243,7 @@ FUNCTIONS: dict[str, Any] = {
     "by_family": by_family,
     "table": table,
     "figure_name": figure_name,
+    "caption": caption,
     "has_figure": has_figure,
     "BANDS": BANDS,
 }

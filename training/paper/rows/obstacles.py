@@ -61,7 +61,7 @@ def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes
     return scenes
 
 
-def decide(agent: Path | None) -> ObstacleMovements:
+def agent_movements(agent: Path | None) -> ObstacleMovements:
     """Simulate the agent of a run folder, or the shipped one, around the rows of lights."""
     scenes = light_scenes()
     found = load_agent(agent or DEFAULT_ENV)
