@@ -26,8 +26,6 @@ PATH_BLOCK = 1 << 16
 """Hand positions that are computed together, so that temporary arrays stay in the cache."""
 REVISED_PARTS = ("hand", "velocity", "acceleration", "goal", "via", "remaining")
 """Parts of an observation that determine the revised movement of an action."""
-_STEPS = 3
-"""Newton steps for passage times, enough for a relative error of 1e-5."""
 _LEAST_PRODUCT = 1e-6
 """Lower bound of tau1 (1 - tau1); below it the via-point coincides with an end and its residual vanishes."""
 
@@ -151,11 +149,11 @@ def _through_one(
 
 
 def _passage_time(along: Numbers, across_square: Numbers, square: Numbers) -> Numbers:
-    """Return tau1 of via-points in the frame of start and goal, by Newton steps of the primitives."""
+    """Return tau1 of via-points in the frame of start and goal, by the Newton iteration of the primitives."""
     length = np.sqrt(square)
     late = along > 0.5 * length
     near = np.where(late, length - along, along)
-    root = nearer_fraction(near * length, square, near * near + across_square, steps=_STEPS)
+    root = nearer_fraction(near * length, square, near * near + across_square)
     return np.asarray(np.where(late, 1.0 - root, root))
 
 

@@ -203,11 +203,10 @@ def interval(values: Sequence[float]) -> str:
     return f"{estimate:.1f} % ({low:.1f}-{high:.1f})"
 
 
-def spread(rates: Sequence[float]) -> str:
-    """Return the mean of rates in percent, with the least and the greatest."""
-    percents = [100.0 * each for each in rates]
-    mean = f"{statistics.mean(percents):.1f} %"
-    return mean if len(percents) == 1 else f"{mean} ({min(percents):.1f}-{max(percents):.1f})"
+def spread(measured: Numbers) -> str:
+    """Return the success in a set in percent, with the seeds of the least and of the greatest success."""
+    each, estimate = measured["each"], percent(measured["success"][0])
+    return estimate if len(each) == 1 else f"{estimate} ({100.0 * min(each):.1f}-{100.0 * max(each):.1f})"
 
 
 def multiple(value: float | None) -> str:
@@ -233,7 +232,6 @@ FILTERS = {
     "seeds": seeds,
     "effort": effort,
     "median": statistics.median,
-    "mean": statistics.mean,
 }
 """Filters of templates by name."""
 FUNCTIONS: dict[str, Any] = {

@@ -36,6 +36,8 @@ BUDGET = 5.0
 """Wall time after which no further decision of a method is timed, [s]."""
 MOST_CHECKS = 1 << 16
 """Greatest number of checks of a search of equal time."""
+NEARLY, TRIES = 0.97, 6
+"""Share of the allowed time that a search of equal time shall take, and most searches that are timed to get there."""
 FEWEST_CHECKS = 64
 """Checks with which the search of equal time begins. With fewer often no plan is clear, and a decision takes longer."""
 
@@ -103,8 +105,8 @@ def median_time(study: Study, env: Environment, method: Method) -> float:
 def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: float) -> tuple[int, float]:
     """Return the number of checks of a search that takes at most a time, and its own time, [s].
 
-    The number is doubled until it takes longer, then interpolated once; a search that takes longer even with the fewest
-    checks has these.
+    The number is doubled until it takes longer. Then interpolation narrows the interval, until the time is within
+    NEARLY of the limit or after TRIES searches. A search that takes longer even with the fewest checks has these.
     """
     frozen = next(iter(sets_of(env).values()))
 
@@ -112,15 +114,21 @@ def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: f
         search = dataclasses.replace(baseline, checks=checks)
         return median_time(study, env, method_of(search, env, frozen, threads=1))
 
-    checks, took = FEWEST_CHECKS, timed(FEWEST_CHECKS)
-    while took < seconds and checks < MOST_CHECKS:
-        longer = timed(2 * checks)
-        if longer > seconds:
-            between = int(checks * (1.0 + (seconds - took) / (longer - took)))
-            tried = timed(between)
-            return (between, tried) if tried <= seconds else (checks, took)
-        checks, took = 2 * checks, longer
-    return checks, took
+    low, took = FEWEST_CHECKS, timed(FEWEST_CHECKS)
+    high, longer = low, took
+    while longer <= seconds and high < MOST_CHECKS:
+        low, took = high, longer
+        high, longer = 2 * low, timed(2 * low)
+    for _ in range(TRIES):
+        if took >= NEARLY * seconds or high - low < 2 or longer <= seconds:
+            break
+        between = int(np.clip(low + (high - low) * (seconds - took) / (longer - took), low + 1, high - 1))
+        tried = timed(between)
+        if tried <= seconds:
+            low, took = between, tried
+        else:
+            high, longer = between, tried
+    return (high, longer) if longer <= seconds else (low, took)
 
 
 def _to_time(study: Study, env: Environment) -> Iterator[Timed]:
