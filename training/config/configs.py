@@ -488,6 +488,6 @@ class StudyConfig(Config):
     )  # fmt: skip
     """Steps to run."""
     redo: tuple[str, ...] = ()
-    """Patterns of rows whose measurements by these steps are made again, such as 'viaq/*' (not viaq itself) or 'PandaReach-v0/*'."""
+    """Patterns of rows whose measurements these steps make again, such as viaq, 'viaq/*' or 'PandaReach-v0/*'."""
 
     least: ClassVar = {"workers": 0}
