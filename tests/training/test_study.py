@@ -11,7 +11,7 @@ from PIL import Image
 
 from viapoint.training import Study, run_study
 from viapoint.training.io.files import read_json
-from viapoint.training.study import jobs, run
+from viapoint.training.study import jobs, run, timing
 from viapoint.training.study.config import rows_of
 from viapoint.training.study.page import fill_tables, render_page, row, table
 from viapoint.training.study.results import gather
@@ -294,3 +294,18 @@ def test_tables_leave_out_columns_of_zeros():
         [["method", "success", "collision", "jerk"], ["a", "1", "0.0 %", "-"], ["b", "2", "0.0 %", "-"]]
     )
     assert text.splitlines() == ["| method | success |", "| --- | ---: |", "| a | 1 |", "| b | 2 |"]
+
+
+@pytest.mark.parametrize("power", [0.7, 1.0, 1.6])
+@pytest.mark.parametrize("seconds", [0.0005, 0.004, 0.031, 0.5])
+def test_a_search_of_equal_time_takes_nearly_the_whole_time(tmp_path, monkeypatch, power, seconds):
+    study = study_of(tmp_path)
+    (baseline,) = (each for each in study.baselines if each.name == "in-time")
+    monkeypatch.setattr(timing, "method_of", lambda search, *_, **__: search.checks)
+    monkeypatch.setattr(timing, "median_time", lambda _, __, checks: 0.001 + 1e-5 * checks**power)
+    checks, took = timing.checks_within(study, study.environments[0], baseline, seconds)
+    assert took == pytest.approx(0.001 + 1e-5 * checks**power)
+    if took > seconds:
+        assert checks == timing.FEWEST_CHECKS
+    else:
+        assert took >= timing.NEARLY * seconds or checks == timing.MOST_CHECKS
