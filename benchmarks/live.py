@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from viapoint.training.live.page import LivePage
 
@@ -28,6 +29,7 @@ def main() -> None:
     import browser
     from test_live_page import drag, steady
 
+    torch.set_num_threads(1)  # as the command `viapoint live` does
     window = browser.Browser()
     print("environment, changes, median [ms], 95 % [ms]")
     for env_id, middle in INWARDS.items():

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from viapoint.envs.common.validation import check_increasing_pair, is_number
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
-from viapoint.envs.scenes.families import MOST_OBSTACLES, scene_families
+from viapoint.envs.scenes.families import MOST_DRAWN, MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
 
 TRAINED = ("clutter", "pillar", "shelf", "gate", "slot", "window", "window")
@@ -61,7 +61,7 @@ class SceneDistribution:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
         check_shapes(self.shapes)
         check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
@@ -99,7 +99,7 @@ class SpaceDistribution(SpatialSizes):
 
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES)
+        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
         check_shapes(self.shapes)
         check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
@@ -139,15 +139,17 @@ class SpaceDistribution(SpatialSizes):
         return {"shapes": shapes, "families": TRAINED + others}
 
 
-def check_count(pair: Sequence[int], name: str, limit: int) -> None:
+def check_count(pair: Sequence[int], name: str, limit: int, fewest_limit: int | None = None) -> None:
     """Check a pair of fewest and most.
 
     Raises:
-        ValueError: The numbers are not 0 <= fewest <= most <= limit.
+        ValueError: The numbers are out of range.
     """
     fewest, most = pair
-    if not 0 <= fewest <= most <= limit:
-        raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}, got {pair}")
+    least = limit if fewest_limit is None else fewest_limit
+    if not 0 <= fewest <= most <= limit or fewest > least:
+        also = f" and fewest <= {least}" if least < limit else ""
+        raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}{also}, got {pair}")
 
 
 def check_share(share: float, name: str) -> None:

@@ -33,8 +33,10 @@ from viapoint.envs.scenes.spatial_families import (
     window,
 )
 
-MOST_OBSTACLES = 8
-"""Greatest number of obstacles in a scene."""
+MOST_OBSTACLES = 24
+"""Greatest number of obstacles in a scene that is given."""
+MOST_DRAWN = 8
+"""Greatest number of obstacles in a scene that is drawn."""
 
 SiteBuilder = Callable[[Uniforms, Site], Float]
 """Function of uniform numbers and a site that returns obstacles, see :func:`register_scene_family`."""
@@ -139,7 +141,7 @@ def register_scene_family(
         raise TypeError(f"name must be a string, got {name!r}")
     if dimension not in _FAMILIES:
         raise ValueError(f"dimension must be one of {', '.join(map(str, _FAMILIES))}, got {dimension!r}")
-    most = FAMILY_ROWS if dimension == 2 else MOST_OBSTACLES
+    most = FAMILY_ROWS if dimension == 2 else MOST_DRAWN
     whole_number("n_obstacles", n_obstacles, 1, most)
     families = _FAMILIES[dimension]
     if not name or name in families:

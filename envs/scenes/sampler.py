@@ -17,7 +17,7 @@ from viapoint.envs.common.types import Float, Index, Int
 from viapoint.envs.geometry.rows import CAPSULES, row_size
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, ObstacleSampler, Uniforms, reshaped
-from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.families import MOST_DRAWN, scene_families
 from viapoint.envs.scenes.feasible_path import DRAW_ORDER, DrawOrder, Ends, sample_ends, sample_paths
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS
 from viapoint.envs.scenes.planar_obstacles import FamilyObstacles, HandObstacles, WholeArmObstacles
@@ -56,10 +56,12 @@ class SceneSampler:
         order: DrawOrder | None = None,
     ) -> None:
         self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
-        if obstacles is None and isinstance(distribution, SpaceDistribution):
-            obstacles = SpatialObstacles(collision_model, distribution)
+        drawn = _drawn(distribution)
+        self._spare = 0 if obstacles else distribution.n_obstacles[1] - drawn.n_obstacles[1]
+        if obstacles is None and isinstance(drawn, SpaceDistribution):
+            obstacles = SpatialObstacles(collision_model, drawn)
         planar = WholeArmObstacles if collision_model.whole_arm else HandObstacles
-        self._obstacles: ObstacleSampler = obstacles or planar(collision_model, distribution)  # type: ignore[arg-type]
+        self._obstacles: ObstacleSampler = obstacles or planar(collision_model, drawn)  # type: ignore[arg-type]
         self._order = order or DRAW_ORDER[self.arm.dimension]
 
     def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
@@ -95,6 +97,9 @@ class SceneSampler:
             pending = pending[first < 0]
         if len(pending):
             raise RuntimeError(self._not_found(numbers.made, pending[0], ends))
+        if self._spare:
+            spare = np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0)))
+            scenes = scenes._replace(obstacles=spare)
         return scenes
 
     def _not_found(self, attempts: int, scene: int, ends: Ends) -> str:
@@ -193,7 +198,7 @@ class UniformSampler(SceneSampler):
     def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
         order = DRAW_ORDER[distribution.dimension]._replace(groups=UNIFORM_GROUPS)
         super().__init__(collision_model, distribution, order=order)
-        self._uniform = UniformScenes(collision_model, distribution)
+        self._uniform = UniformScenes(collision_model, _drawn(distribution))
 
     @property
     def _size(self) -> int:
@@ -305,6 +310,12 @@ def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -
     """Return the sampler of a distribution."""
     kind = MixedSampler if distribution.uniform_share else SceneSampler
     return kind(collision_model, distribution)
+
+
+def _drawn(distribution: Distribution) -> Distribution:
+    """Return a distribution without the room for given obstacles beyond those that are drawn."""
+    fewest, most = distribution.n_obstacles
+    return dataclasses.replace(distribution, n_obstacles=(fewest, min(most, MOST_DRAWN)))
 
 
 def sampler_of_family(

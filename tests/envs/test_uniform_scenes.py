@@ -75,6 +75,24 @@ def test_numbers_and_sizes_are_those_of_the_task(env, scenes):
     assert some[:, -1].max() <= max(high for _, high in radii)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("env_id", ["PlanarWholeArm", "PandaObstacles"])
+def test_room_for_given_obstacles_does_not_change_drawn_ones(env_id, share):
+    drawn = []
+    for most in (8, 24):
+        env = gym.make_vec(
+            f"viapoint/{env_id}-v0", num_envs=1, threads=1, n_obstacles=(1, most), uniform_share=share
+        )
+        drawn.append(env.unwrapped.task.sampler()([np.random.default_rng(seed) for seed in range(6)]))
+        env.close()
+    few, many = drawn
+    np.testing.assert_array_equal(many.obstacles[:, :8], few.obstacles)
+    assert many.obstacles.shape[1] == 24
+    assert not many.present[:, 8:].any()
+    with pytest.raises(ValueError, match="fewest <= 8"):
+        gym.make_vec(f"viapoint/{env_id}-v0", num_envs=1, n_obstacles=(9, 24))
+
+
 def test_a_scene_depends_on_its_own_generator_alone(env, scenes):
     sample = UniformSampler(env.task.collision_model, env.task.scenes)
     for row in (0, 5, 17):

@@ -17,7 +17,12 @@ import trimesh
 from viser import transforms
 
 import viapoint.envs as ve
+from viapoint.envs.arms import PANDA as PANDA_ARM
+from viapoint.envs.arms import PANDA_FINE
+from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.geometry.rows import widened
 from viapoint.envs.registration import ENV_IDS
+from viapoint.envs.scenes.scene import Scenes, check_scenes, rest_clearance
 from viapoint.training import load_agent
 from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
@@ -25,8 +30,14 @@ from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.live import drawing, movements, obstacle_editing
 from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
+from viapoint.training.live.scene_draws import (
+    benchmark_scene,
+    nearest_free,
+    problems_of_benchmark,
+    scene_kinds,
+)
 from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
-from viapoint.training.live.shared import Shared
+from viapoint.training.live.setting import Setting, Shared
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
@@ -44,29 +55,38 @@ def shared():
 
     yield of
     for each in made.values():
-        each.comparison.close()
+        each.close()
+
+
+def drawn(setting):
+    """Return a random scene with the rows of a setting."""
+    scene, _ = scene_kinds(setting.whole_id, setting.whole_kwargs, setting.task, seed=0)["Random"]()
+    return scene.with_shapes(setting.task.scenes.shapes)
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, shared):
     """Without an agent the geometry search decides; environments of an own arm have the Panda by default."""
     some = shared(env_id)
-    env, task = some.make_env(), some.task
+    setting, task = some.own, some.own.task
+    env = setting.make_env()
     for draw in some.scene_kinds().values():
-        scene = draw()
+        scene, _ = draw()
         again = from_json(to_json(scene, env_id), task.arm.dimension)
-        for mine, theirs in zip(scene, again, strict=True):
+        for mine, theirs in zip(*(each.with_shapes(("capsule",)) for each in (scene, again)), strict=True):
             np.testing.assert_allclose(mine, theirs, atol=1e-6)
+    scene, _ = some.scene_kinds()["Random"]()
+    scene = scene.with_shapes(task.scenes.shapes)
     observation, _ = env.reset(options=scene.options(changing=task.replanning))
-    decision = some.decisions.choose(observation)
-    proposals = some.decisions.proposals(observation, decision)
+    decision = setting.decisions.choose(observation)
+    proposals = setting.decisions.proposals(observation, decision)
     np.testing.assert_allclose(decision.chosen.plan.waypoints[[0, -1]], (scene.start, scene.goal), atol=1e-6)
     assert decision.chosen.clear
     profile = movements.plan_profile(task, scene, decision.chosen.plan)
     assert profile.speed[0] < 1e-6 < profile.speed.max()
     if task.replanning:
         segments = movements.execute_replanning(
-            env, some.decisions, scene, decision.chosen.plan, lambda: scene.goal
+            env, setting.decisions, scene, decision.chosen.plan, lambda: scene.goal
         )
     else:
         segments = movements.execute_whole(env, scene, decision.chosen.plan)
@@ -76,7 +96,7 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     paths = np.array([each.path() for each in proposals])
     for i, j in np.argwhere(~np.eye(len(paths), dtype=bool)):
         assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * APART
-    parts = some.drawing(env.model)
+    parts = some.drawing()
     assert len(parts.poses(task.arm.inverse_kinematics(scene.start))) == len(parts.parts) > 0
     env.close()
 
@@ -85,7 +105,7 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
 @pytest.mark.parametrize("checks", [0, 16])
 def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
     agent = load_agent(env_id)
-    some = Shared(env_id, agent, model_file=None, seed=0, env_kwargs={})
+    some = Setting(env_id, agent, {})
     observation, _ = some.make_env().reset(seed=4)
     decision = some.decisions.choose(observation, checks=checks)
     agent.policy.checks = checks
@@ -98,7 +118,7 @@ def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
 
 
 def test_other_numbers_of_via_points_are_searched(shared):
-    some = shared(PLANAR)
+    some = shared(PLANAR).own
     observation, _ = some.make_env().reset(seed=4)
     for number in (0, 2, 3):
         decision = some.decisions.choose(observation, n_via=number)
@@ -107,7 +127,7 @@ def test_other_numbers_of_via_points_are_searched(shared):
 
 
 def test_a_plan_by_hand_is_valued_as_the_same_decision(shared):
-    some = shared(PLANAR)
+    some = shared(PLANAR).own
     env = some.make_env()
     observation, _ = env.reset(seed=4)
     chosen = some.decisions.choose(observation).chosen
@@ -120,8 +140,8 @@ def test_a_plan_by_hand_is_valued_as_the_same_decision(shared):
 
 def test_a_dragged_goal_is_reached_without_a_jump():
     agent = load_agent(MOVING)
-    some = Shared(MOVING, agent, model_file=None, seed=0, env_kwargs={})
-    env, scene = some.make_env(), some.scene_kinds()["Random"]()
+    some = Setting(MOVING, agent, {})
+    env, scene = some.make_env(), drawn(some)
     observation, _ = env.reset(options=scene.options(changing=True))
     plan = some.decisions.choose(observation).chosen.plan
     asked, aside = [], scene.goal + (0.02, 0.04) * np.sign(0.3 - scene.goal)
@@ -141,8 +161,9 @@ def test_a_dragged_goal_is_reached_without_a_jump():
 
 def test_methods_are_compared_in_a_scene(shared):
     some = shared(PLANAR)
-    scene = some.scene_kinds()["Hard"]()
-    results = {name: result() for name, result in some.comparison(scene)}
+    scene, _ = some.scene_kinds()["Hard"]()
+    scene = scene.with_shapes(("capsule",))
+    results = {name: result() for name, result in some.own.comparison(scene)}
     assert list(results) == ["straight", "geometry search", "planner"]
     assert not results["straight"].success
     assert results["planner"].success
@@ -154,8 +175,7 @@ def test_methods_are_compared_in_a_scene(shared):
     st.integers(2, 3), st.floats(0.01, 0.1), st.floats(0.01, 0.3), st.floats(-89.0, 89.0), st.floats(-80, 80)
 )
 def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevation):
-    row = np.zeros(2 * d + 1)
-    row[-1] = 0.02
+    row = widened(np.array([*np.zeros(2 * d), 0.02]))
     values = {"radius": radius, "half-length": length, "heading": heading}
     values |= {"elevation": elevation} if d == 3 else {}
     for name in ("half-length", *values):
@@ -175,19 +195,21 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
     env.reset(seed=0)
     scene = LiveScene.of(env.scenes)
     number, d = len(scene.obstacles), len(scene.start)
-    for kind in obstacle_editing.obstacle_kinds(shapes):
-        row = obstacle_editing.new_obstacle(scene, kind, shapes)
-        for name, value in (("half-depth", 0.06), ("half-height", 0.09), ("heading", 30.0)):
+    for kind in obstacle_editing.KINDS[d]:
+        row = obstacle_editing.new_obstacle(scene, kind)
+        before = row
+        for name in obstacle_editing.sizes_of(row):
+            value = 30.0 if name in ("heading", "elevation") else 0.07
             row = obstacle_editing.resized(row, name, value)
-        sizes = obstacle_editing.sizes_of(row)
-        assert sizes["half-depth"] == pytest.approx(0.06)
+            assert obstacle_editing.sizes_of(row)[name] == pytest.approx(value)
+        np.testing.assert_allclose(row[:d], before[:d])  # it stays where it is
         mesh = drawing.obstacle_mesh(row, -0.02, 0.03)
         (shape,) = ve.obstacles_from_rows(row[None])
         around = mesh.vertices + np.array([*row[:d], 0.0][:3]) * ([1, 1, 0] if d == 2 else 1)
         around[:, 2] = 0.0 if d == 2 else around[:, 2]
         assert np.abs(shape.distance(around)).max() < 2e-3
         scene = scene.with_obstacle(row)
-    again = from_json(to_json(scene, env_id), d, shapes)
+    again = from_json(to_json(scene, env_id), d)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) * ([1, 1, 0] if d == 2 else 1)
     for mine, theirs in zip(*map(ve.obstacles_from_rows, (again.obstacles, scene.obstacles)), strict=True):
         np.testing.assert_allclose(mine.distance(points), theirs.distance(points), atol=1e-9)
@@ -204,7 +226,7 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
 def test_obstacles_are_drawn_where_they_are(d, radius, length, angle):
     """All corners lie on the surface: their distance from the axis is the radius."""
     half = length * np.array([np.cos(angle), np.sin(angle), 0.0])[:d]
-    mesh = drawing.obstacle_mesh(np.array([*np.zeros(d), *half, radius]), -0.02, 0.03)
+    mesh = drawing.obstacle_mesh(widened(np.array([*np.zeros(d), *half, radius])), -0.02, 0.03)
     points = np.asarray(mesh.vertices)[:, :d]
     square = float(half @ half)
     along = np.clip(points @ half / square, -1.0, 1.0) if square > 1e-12 else np.zeros(len(points))
@@ -247,8 +269,8 @@ def test_an_arm_of_ones_own_is_drawn_from_its_file():
 def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
     env_id = "viapoint/PlanarObstaclesStep-v0"
     agent = SAC("MultiInputPolicy", ViaVecEnv(env_id, num_envs=1), buffer_size=2, seed=0)
-    some = Shared(env_id, agent, model_file=None, seed=0, env_kwargs={})
-    scene, env = some.scene_kinds()["Random"](), some.make_step_env()
+    some = Setting(env_id, agent, {})
+    scene, env = drawn(some), some.make_step_env()
     (segment,) = movements.execute_stepwise(env, agent, scene)
     assert env.terminated[0] or env.truncated[0]
     np.testing.assert_allclose(segment.hand[0], scene.start, atol=0.01)
@@ -259,11 +281,12 @@ def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA, MOVING])
 def test_python_code_sets_the_scene_up(env_id, shared):
     some = shared(env_id)
-    scene = some.scene_kinds()["Random"]()
+    scene = drawn(some.own)
     names = {}
-    exec(to_python(scene, env_id, {}, changing=some.task.replanning), names)
+    exec(to_python(scene, env_id, {}, changing=some.own.task.replanning), names)
     env = names["env"].unwrapped
-    np.testing.assert_allclose(LiveScene.of(env.batch.scenes).obstacles, scene.obstacles, atol=1e-6)
+    set_up = LiveScene.of(env.batch.scenes).with_shapes(some.own.task.scenes.shapes)
+    np.testing.assert_allclose(set_up.obstacles, scene.obstacles, atol=1e-6)
     np.testing.assert_allclose(env.batch.scenes.goal[0], scene.goal, atol=1e-6)
     assert isinstance(names["observation"], dict)
     assert isinstance(names["gym"].spec(env_id), gym.envs.registration.EnvSpec)
@@ -281,7 +304,7 @@ def test_python_code_sets_the_scene_up(env_id, shared):
         ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
         ({"obstacles": [{"shape": "sphere", "radius": "x"}]}, "obstacle 0 of the scene file"),
         ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
-        ({"obstacles": [{"shape": "box", "size": [0.1, 0.1, 0.1]}]}, "shapes capsule, sphere, not box"),
+        ({"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 0]]}]}, "distances only"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane, with z = 0"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "obstacle 0: course"),
         ({"jumps": [[1.0]]}, "jumps"),
@@ -330,3 +353,63 @@ def test_the_page_never_asks_for_a_public_address():
         assert page.url.startswith("http://127.0.0.1:")
         assert page._server.request_share_url() is None
     assert PLANAR in SHIPPED_IDS
+
+
+def test_scenes_that_exceed_the_environment_of_the_agent_go_to_a_wider_one(shared):
+    some = shared(PLANAR)
+    scene = LiveScene.of(some.own.task.sampler()([np.random.default_rng(0)]))
+    assert some.setting_of(scene) is some.own
+    crowded = scene
+    while len(crowded.obstacles) <= some.own.task.observation.n_rows:
+        crowded = crowded.with_obstacle(obstacle_editing.new_obstacle(crowded, "post"))
+    boxed = scene.with_obstacle(obstacle_editing.new_obstacle(scene, "box"))
+    for other, limit in ((crowded, "with at most 5 obstacles"), (boxed, "without box obstacles")):
+        assert some.own.limit(other) == limit
+        wide = some.setting_of(other)
+        assert wide is not some.own
+        fitted = other.with_shapes(wide.task.scenes.shapes)
+        env = wide.make_env()
+        observation, _ = env.reset(options=fitted.options(changing=False))
+        assert wide.decisions.choose(observation).maker.startswith("search")
+        env.close()
+    for _ in range(30):
+        crowded = crowded.with_obstacle(crowded.obstacles[0])
+    with pytest.raises(ValueError, match="at most 24 obstacles"):
+        some.setting_of(crowded)
+
+
+@pytest.mark.parametrize("arm", [PANDA_ARM, PANDA_FINE], ids=lambda arm: arm.name)
+def test_problems_of_the_benchmark_are_possible_and_moved_as_little_as_said(arm):
+    model = CollisionModel(arm, True)
+    names = [(each["set"], each["number"]) for each in problems_of_benchmark()]
+    assert len(set(names)) == len(names) >= 20
+    for record in problems_of_benchmark()[::4]:
+        scene, moved = benchmark_scene(record, model)
+        fitted = scene.with_shapes(("capsule", "cylinder", "box"))
+        check_scenes(Scenes(*fitted.batch()[:3]), model)
+        assert {each["shape"] for each in record["obstacles"]} == set(scene.shapes)
+        for name in ("start", "goal"):
+            hand = arm.hand_position(np.array(record[name]))
+            assert np.linalg.norm(getattr(scene, name) - hand) == pytest.approx(moved[name])
+            assert moved[name] <= 0.2
+
+
+def test_only_pages_of_the_panda_have_the_benchmark(shared):
+    kinds = {env_id: set(shared(env_id).scene_kinds()) for env_id in ENV_IDS}
+    assert {env_id for env_id in ENV_IDS if "Benchmark" in kinds[env_id]} == {
+        env_id for env_id in ENV_IDS if "Planar" not in env_id
+    }
+
+
+def test_nearest_free_positions_are_nearest_and_free():
+    model = CollisionModel(PANDA_ARM, True)
+    ball = widened(np.array([[0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 0.05]]))
+    inside, free = np.array([0.5, 0.0, 0.3]), np.array([0.45, 0.3, 0.3])
+    np.testing.assert_array_equal(nearest_free(free, ball, model), free)
+    moved = nearest_free(inside, ball, model)
+    scenes = Scenes(moved[None], moved[None], ball[None])
+    assert rest_clearance(scenes, moved[None], model).min() > 0.0
+    assert 0.05 < np.linalg.norm(moved - inside) < 0.15
+    wall = widened(np.tile([[0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 2.0]], (1, 1)))
+    with pytest.raises(ValueError, match="nowhere"):
+        nearest_free(inside, wall, model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 
@@ -11,13 +12,15 @@ Job = Callable[[], None]
 
 TICK = 0.03
 """Time between two pictures of an animation, [s]."""
+PAUSE = 0.12
+"""Time without other jobs after which `later` jobs are done, [s]."""
 
 
 class JobThread(threading.Thread):
     """Thread that does jobs one after the other and animates in between.
 
     Jobs of the same key replace each other while they wait, so that a fast drag skips positions instead of lagging
-    behind. Jobs whose key begins with `later` wait until there are no others.
+    behind. Jobs whose key begins with `later` wait for a pause, so that they do not delay what follows in a drag.
 
     Args:
         name: Name of the thread.
@@ -32,7 +35,10 @@ class JobThread(threading.Thread):
     ) -> None:
         super().__init__(name=name, daemon=True)
         self._begin, self._animate, self._end, self._tell = begin, animate, end, tell
-        self._jobs: dict[str, Job] = {}
+        self._jobs: dict[str, tuple[float, Job]] = {}
+        self._quiet_at = 0.0
+        self.posted = 0.0
+        """Time at which the present job was posted, of `time.perf_counter`, [s]."""
         self._wake, self._busy = threading.Condition(), True
         self.closed = False
         """True after :meth:`close`."""
@@ -47,7 +53,9 @@ class JobThread(threading.Thread):
         """Hand a job to the thread; a waiting one of the same key is replaced."""
         with self._wake:
             self._jobs.pop(key, None)
-            self._jobs[key] = job
+            self._jobs[key] = time.perf_counter(), job
+            if not key.startswith("later"):
+                self._quiet_at = self._jobs[key][0] + PAUSE
             self._wake.notify()
 
     def close(self) -> None:
@@ -90,10 +98,21 @@ class JobThread(threading.Thread):
         """Return the next job; wait for one, but only for a moment while something is animated."""
         with self._wake:
             self._busy = False
-            if not self._jobs and not self.closed:
-                self._wake.wait(TICK if animated else None)
-            if self.closed or not self._jobs:
+            key = self._due()
+            if key is None and not self.closed:
+                left = max(self._quiet_at - time.perf_counter(), 0.001) if self._jobs else None
+                waits = [each for each in (left, TICK if animated else None) if each is not None]
+                self._wake.wait(min(waits, default=None))
+                key = self._due()
+            if self.closed or key is None:
                 return None
             self._busy = True
-            urgent = [key for key in self._jobs if not key.startswith("later")]
-            return self._jobs.pop(urgent[0] if urgent else next(iter(self._jobs)))
+            self.posted, job = self._jobs.pop(key)
+            return job
+
+    def _due(self) -> str | None:
+        """Return the key of the next job; None while there is none, or only later ones that wait for a pause."""
+        urgent = [key for key in self._jobs if not key.startswith("later")]
+        if urgent or time.perf_counter() < self._quiet_at:
+            return urgent[0] if urgent else None
+        return next(iter(self._jobs), None)

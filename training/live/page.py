@@ -19,7 +19,7 @@ from viapoint.envs.registration import check_registered
 from viapoint.training.algorithms.agent import Agent, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.live.session import Session
-from viapoint.training.live.shared import Shared
+from viapoint.training.live.setting import Shared
 
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
@@ -104,7 +104,7 @@ class LivePage:
             session.join(JOIN)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
-        self._shared.comparison.close()
+        self._shared.close()
 
     def __enter__(self) -> Self:
         return self

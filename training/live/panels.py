@@ -62,7 +62,7 @@ class Facts(NamedTuple):
     title: str
     subtitle: str
     scene_kinds: Sequence[str]
-    shapes: Sequence[str]
+    obstacle_kinds: Sequence[str]
     n_via: int
     most_vias: int
     duration_range: tuple[float, float]
@@ -80,11 +80,11 @@ class Panels:
         self._build_decision()
         self._build_controls()
 
-    def tell(self, text: str, colour: str = PLAIN) -> None:
-        """Show one sentence."""
+    def tell(self, text: str, colour: str = PLAIN, remark: str = "") -> None:
+        """Show one sentence, and a remark on the scene below it."""
         self._message.content = (
-            f'<div id="viapoint-message" style="padding:0 0.9em 0.4em;color:{colour};font-size:0.9em;'
-            f'line-height:1.35;min-height:3.9em">{html.escape(text)}</div>'
+            f'<div style="min-height:4.2em"><div id="viapoint-message" style="padding:0.2em 0.9em;color:{colour};'
+            f'font-size:0.9em;line-height:1.35">{html.escape(text)}</div>{_note(remark) if remark else ""}</div>'
         )
 
     def show_proposals(self, proposals: Sequence[Proposal], picked: int, maker: str, seconds: float) -> None:
@@ -208,7 +208,7 @@ class Panels:
                 name: gui.add_uplot(
                     *_lines(()), title=title,
                     height=PLOT_HEIGHT, scales={"x": {"time": False}}, legend={"show": False},
-                    cursor={"show": True}, axes=({"size": 30}, {"size": 40}), padding=(10, 10, 0, 0),
+                    cursor={"show": True}, axes=({"size": 30}, {"size": 46}), padding=(10, 10, 0, 0),
                 )
                 for name, title in (
                     ("speed", "speed of the hand [m/s]"),
@@ -289,7 +289,7 @@ class Panels:
         for name, slider in self._sizes.items():
             resize = functools.partial(actions.resize, name)
             slider.on_update(self._unless_quiet(lambda event, resize=resize: resize(event.target.value)))  # type: ignore[misc]
-        add = gui.add_button_group("Add", self._facts.shapes)
+        add = gui.add_button_group("Add", self._facts.obstacle_kinds)
         add.on_click(lambda event: actions.add(event.target.value))
         self._remove = gui.add_button("Remove the selected one", disabled=True)
         self._remove.on_click(lambda _: actions.remove())

@@ -15,13 +15,18 @@ from viapoint.envs.geometry.rows import (
     obstacle_rows,
     obstacles_from_rows,
     row_size,
+    shape_columns,
+    shape_number,
+    widened,
 )
-from viapoint.envs.geometry.shapes import as_obstacle
+from viapoint.envs.geometry.shapes import SHAPES, as_obstacle
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 
 FORMAT = "viapoint-scene"
 """Value of the key `format` of a scene file."""
+SCENE_SHAPES = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
+"""Shapes that obstacles of a scene may have."""
 LARGEST_FILE = 1 << 20
 """Greatest size of a scene file, [bytes]."""
 DIGITS = 6
@@ -36,7 +41,7 @@ class LiveScene(NamedTuple):
     goal: Float
     """Shape (D,), [m]."""
     obstacles: Float
-    """Rows of either kind, shape (n, .), [m], see :mod:`viapoint.envs.geometry.rows`."""
+    """Rows with shapes, shape (n, .), [m], see :mod:`viapoint.envs.geometry.rows`."""
     courses: Float
     """Rows (velocity D, time, velocity D), shape (n, 2 D + 1), [m/s] and [s]; zero for obstacles at rest."""
     jumps: Float
@@ -50,8 +55,25 @@ class LiveScene(NamedTuple):
         if isinstance(scenes, ChangingScenes):
             courses, jumps = scenes.courses[row, present], scenes.jumps[row]
             jumps = jumps[(jumps != 0.0).any(axis=-1)]
-        parts = (scenes.start[row], scenes.goal[row], scenes.obstacles[row, present], courses, jumps)
+        obstacles = widened(scenes.obstacles[row, present])
+        parts = (scenes.start[row], scenes.goal[row], obstacles, courses, jumps)
         return cls(*(np.array(part, dtype=np.float64) for part in parts))
+
+    @property
+    def shapes(self) -> list[str]:
+        """Names of the obstacles' shapes."""
+        return [list(SHAPES)[int(number)] for number in shape_columns(self.obstacles).kind]
+
+    def with_shapes(self, shapes: Sequence[str]) -> LiveScene:
+        """Return the scene with the rows of an environment whose obstacles have some shapes, among them its own."""
+        rows, d = self.obstacles, len(self.start)
+        if tuple(shapes) == CAPSULES:
+            return self._replace(obstacles=np.concatenate((rows[:, : 2 * d], rows[:, -1:]), axis=-1))
+        if "sphere" not in shapes:  # a capsule without a length
+            rows = rows.copy()
+            kind = rows[:, 2 * d]
+            kind[kind == shape_number("sphere")] = shape_number("capsule")
+        return self._replace(obstacles=rows)
 
     def options(self, *, changing: bool) -> dict[str, Float]:
         """Return the options of `reset`; `changing` environments get courses and jumps, too."""
@@ -91,10 +113,11 @@ def to_json(scene: LiveScene, env_id: str) -> str:
 
     Example:
         >>> import numpy as np
-        >>> from viapoint.training.live.scene_file import LiveScene, from_json, to_json
-        >>> row = np.array([[-0.05, 0.35, 0.0, 0.0, 0.03]])
+        >>> from viapoint.envs import Sphere, obstacle_rows
+        >>> from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json, to_json
+        >>> rows = obstacle_rows([Sphere(0.03, position=(-0.05, 0.35, 0.0))], 2, SCENE_SHAPES)
         >>> none = np.zeros((1, 5)), np.zeros((0, 3))
-        >>> scene = LiveScene(np.array([-0.2, 0.3]), np.array([0.1, 0.4]), row, *none)
+        >>> scene = LiveScene(np.array([-0.2, 0.3]), np.array([0.1, 0.4]), rows, *none)
         >>> from_json(to_json(scene, "viapoint/PlanarObstacles-v0"), dimension=2).goal.tolist()
         [0.1, 0.4]
     """
@@ -111,13 +134,12 @@ def to_json(scene: LiveScene, env_id: str) -> str:
     return json.dumps(record, indent=1) + "\n"
 
 
-def from_json(text: str | bytes, dimension: int, shapes: Sequence[str] = CAPSULES) -> LiveScene:
+def from_json(text: str | bytes, dimension: int) -> LiveScene:
     """Return the scene of a JSON file; whether a movement can start and end in it is checked later.
 
     Args:
         text: Content of the file.
         dimension: Dimension D of the arm's space.
-        shapes: Names of the shapes that obstacles may have.
 
     Raises:
         ValueError: The text is no scene file, or a value has another shape or is not finite.
@@ -133,10 +155,10 @@ def from_json(text: str | bytes, dimension: int, shapes: Sequence[str] = CAPSULE
     obstacles = record.get("obstacles", [])
     if not isinstance(obstacles, list):
         raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
-    rows = np.zeros((len(obstacles), row_size(dimension, shapes)))
+    rows = np.zeros((len(obstacles), row_size(dimension, SCENE_SHAPES)))
     courses = np.zeros((len(obstacles), 2 * dimension + 1))
     for i, each in enumerate(obstacles):
-        rows[i], courses[i] = _obstacle(i, each, dimension, shapes)
+        rows[i], courses[i] = _obstacle(i, each, dimension)
     jumps = _numbers("jumps", record.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
     start, goal = (_numbers(name, record.get(name), (dimension,)) for name in ("start", "goal"))
     return LiveScene(start, goal, rows, courses, jumps)
@@ -161,13 +183,13 @@ def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, c
     return "\n".join(lines) + "\n"
 
 
-def _obstacle(i: int, record: Any, dimension: int, shapes: Sequence[str]) -> tuple[Float, Float]:
+def _obstacle(i: int, record: Any, dimension: int) -> tuple[Float, Float]:
     """Return row and course of an obstacle of a file."""
     course, rest = None, record
     if isinstance(record, Mapping):
         course, rest = record.get("course"), {name: v for name, v in record.items() if name != "course"}
     try:
-        (row,) = obstacle_rows([as_obstacle(rest)], dimension, shapes)
+        (row,) = obstacle_rows([as_obstacle(rest)], dimension, SCENE_SHAPES)
     except ValueError as error:
         reason = str(error).removeprefix("obstacle 0: ")
         raise ValueError(f"obstacle {i} of the scene file: {reason}") from None

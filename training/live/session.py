@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.scene import Scenes, problems
 from viapoint.training.live.comparison import MethodResult
 from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
 from viapoint.training.live.job_thread import Job, JobThread
-from viapoint.training.live.media import png
 from viapoint.training.live.movements import (
     Profile,
     Segment,
@@ -27,14 +25,15 @@ from viapoint.training.live.movements import (
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
 from viapoint.training.live.panels import BAD, GOOD, PLAIN, Actions, Panels
-from viapoint.training.live.playback import Playback
-from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
+from viapoint.training.live.playback import Playback, png
+from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
 
 if TYPE_CHECKING:
     import viser
 
-    from viapoint.training.live.shared import Shared
+    from viapoint.envs.mdp.task import Task
+    from viapoint.training.live.setting import Setting, Shared
 
 LATENCIES = 200
 """Changes whose latency is kept."""
@@ -50,14 +49,14 @@ class Session:
 
     Args:
         client: Tab.
-        shared: Task and agent, which all tabs share.
+        shared: Environments and agent, which all tabs share.
         on_end: Function that is called when the session has ended.
     """
 
     def __init__(self, client: viser.ClientHandle, shared: Shared, on_end: Callable[[], object]) -> None:
         self._on_end = on_end
-        self._client, self._shared, self._task = client, shared, shared.task
-        self._checks, self._n_via = 0, shared.task.action.n_via
+        self._client, self._shared, self._setting = client, shared, shared.own
+        self._checks, self._n_via = 0, shared.own.task.action.n_via
         self._by_hand: tuple[Float, float] | None = None
         self._duration: float | None = None
         self._selected: int | None = None
@@ -71,7 +70,9 @@ class Session:
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         """Times from the last changes to the messages with their plans, [s]."""
         self._fading = False
-        self._envs: tuple[Any, ...] = ()
+        self._envs: dict[Setting, Any] = {}
+        self._step_env: Any = None
+        self._origin = ""
         self._jobs = JobThread(
             f"viapoint-tab-{client.client_id}", begin=self._open, animate=self._animate, end=self._end,
             tell=self._tell_error,
@@ -124,20 +125,34 @@ class Session:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
         self.post("load", lambda: self._load(content))
 
+    @property
+    def _task(self) -> Task:
+        return self._setting.task
+
+    @property
+    def _fitted(self) -> LiveScene:
+        """Present scene with the rows of the present setting."""
+        return self._scene.with_shapes(self._task.scenes.shapes)
+
+    @property
+    def _env(self) -> Any:
+        """Environment of the present setting."""
+        if self._setting not in self._envs:
+            self._envs[self._setting] = self._setting.make_env()
+        return self._envs[self._setting]
+
     # The thread
 
     def _open(self) -> None:
         shared = self._shared
-        self._env = shared.make_env()
-        self._step_env = shared.make_step_env()
-        self._envs = tuple(env for env in (self._env, self._step_env) if env is not None)
+        self._step_env = shared.own.make_step_env()
         self._kinds = shared.scene_kinds()
-        floor = float(self._env.model.geom("table").pos[2])
+        floor = float(shared.own.model.geom("table").pos[2])
         self._client.gui.set_panel_label("Viapoint")
         self._panels = Panels(self._client, shared.facts(tuple(self._kinds)), self._actions())
         with self._client.atomic():
             self._view = SceneView(
-                self._client, self._task, shared.drawing(self._env.model), floor,
+                self._client, self._task, shared.drawing(), floor,
                 on_drag=lambda *event: self.post(f"drag {event[0]}", lambda: self._drag(*event)),
                 on_pick=lambda index: self.post("pick", lambda: self._pick(index)),
                 on_select=lambda row: self.post("select", lambda: self._select(row)),
@@ -146,8 +161,9 @@ class Session:
         self._jobs.guard(lambda: self._draw_scene(next(iter(self._kinds))))
 
     def _end(self) -> None:
-        for env in self._envs:
-            env.close()
+        for env in (*self._envs.values(), self._step_env):
+            if env is not None:
+                env.close()
         self._on_end()
 
     def _tell_error(self, sentence: str) -> None:
@@ -179,31 +195,28 @@ class Session:
     # Scenes
 
     def _draw_scene(self, kind: str) -> None:
-        self._take(self._kinds[kind]())
+        self._take(*self._kinds[kind]())
 
-    def _take(self, scene: LiveScene) -> None:
-        """Go to another scene."""
-        most = self._task.observation.n_rows
-        if len(scene.obstacles) > most:
-            raise ValueError(
-                f"{self._shared.env_id} has at most {most} obstacles, got {len(scene.obstacles)}"
-            )
+    def _take(self, scene: LiveScene, origin: str) -> None:
+        """Go to another scene, of which a sentence says where it comes from."""
         self._by_hand = self._duration = self._selected = None
-        self._set_scene(scene, changed=True)
+        self._set_scene(scene, changed=True, origin=origin)
         self._panels.show_selected("", None)
 
-    def _set_scene(self, scene: LiveScene, *, changed: bool) -> None:
+    def _set_scene(self, scene: LiveScene, *, changed: bool, origin: str = "") -> None:
         """Show a scene and decide in it."""
-        begin = time.perf_counter()
+        setting = self._shared.setting_of(scene)
         self._stop()
         self._view.show_executed(None)
-        self._scene = scene
+        self._scene, self._setting = scene, setting
+        if changed:
+            self._origin = origin
         with self._client.atomic():
             self._view.show_scene(scene, self._selected)
             self._view.pose(np.asarray(self._task.arm.inverse_kinematics(scene.start)))
         if changed:
             self._panels.show_comparison(())
-        self._decide(begin)
+        self._decide()
 
     def _drag(self, name: str, point: Float, end: bool) -> None:
         """Move what is dragged."""
@@ -261,11 +274,9 @@ class Session:
         numbers = resized(self._scene.obstacles[row], name, value)
         self._set_scene(self._scene.with_row(row, numbers), changed=True)
 
-    def _add(self, shape: str) -> None:
-        scene = self._scene.with_obstacle(new_obstacle(self._scene, shape, self._task.scenes.shapes))
-        most = self._task.observation.n_rows
-        if len(scene.obstacles) > most:
-            raise ValueError(f"{self._shared.env_id} has at most {most} obstacles")
+    def _add(self, kind: str) -> None:
+        scene = self._scene.with_obstacle(new_obstacle(self._scene, kind))
+        self._shared.setting_of(scene)
         self._selected = len(scene.obstacles) - 1
         self._set_scene(scene, changed=True)
         self._panels.show_selected(f"obstacle {self._selected}", sizes_of(scene.obstacles[-1]))
@@ -278,46 +289,33 @@ class Session:
 
     # Decisions
 
-    def _observe(self) -> Any:
-        """Return the first observation in the scene, after a check of the scene."""
-        scene = self._scene
-        for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
-            if wrong.any():
-                raise ValueError(reason(0))
-        if self._task.replanning:
-            return self._env.reset(options=scene.options(changing=True))[0]
-        joints, rows = np.asarray(self._task.arm.inverse_kinematics(scene.start[None])), scene.batch()
-        missing = self._task.observation.n_rows - rows.obstacles.shape[1]
-        obstacles = np.pad(rows.obstacles, ((0, 0), (0, missing), (0, 0)))
-        return self._task.observation.observe(joints, rows.start, Scenes(rows.start, rows.goal, obstacles))
-
-    def _decide(self, begin: float) -> None:
+    def _decide(self) -> None:
         """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
-        self._proposals, self._picked = (), 0
+        self._decision, self._proposals, self._picked = None, (), 0
         try:
-            observation = self._observe()
+            observation = self._setting.observe(self._fitted, self._env)
         except ValueError:
             self._view.show_plan(None, np.zeros((0, self._task.arm.dimension)), clear=False)
             self._view.show_proposals([])
             self._panels.show_proposals((), 0, "", 0.0)
             self._panels.show_plots(None, None)
             raise
-        self._decision = decision = self._shared.decisions.choose(
+        self._decision = decision = self._setting.decisions.choose(
             observation, n_via=self._n_via, checks=self._checks
         )
         chosen = decision.chosen
         if self._by_hand is not None:
-            chosen = self._shared.decisions.evaluate(observation, plan_by_hand(self._scene, *self._by_hand))
+            chosen = self._setting.decisions.evaluate(observation, plan_by_hand(self._scene, *self._by_hand))
         elif self._duration is not None:
             vias = np.asarray(chosen.plan.waypoints[1:-1])
-            chosen = self._shared.decisions.evaluate(
+            chosen = self._setting.decisions.evaluate(
                 observation, plan_by_hand(self._scene, vias, self._duration)
             )
         self._proposals = (chosen,)
         self._show_plan()
         self._client.flush()
         self.decisions += 1
-        self.latencies.append(time.perf_counter() - begin)
+        self.latencies.append(time.perf_counter() - self._jobs.posted)
         self.post("later proposals", lambda: self._add_proposals(observation, decision))
 
     def _show_plan(self) -> None:
@@ -329,13 +327,16 @@ class Session:
             if self._proposals[1:] == ():
                 self._view.show_proposals([])
         self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
-        self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD)
+        remarks, limit = [self._origin], self._shared.own.limit(self._scene)
+        if limit and self._shared.own.agent is not None:
+            remarks.append(f"The agent was trained {limit}, so the geometry search decides.")
+        self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, " ".join(filter(None, remarks)))
 
     def _add_proposals(self, observation: Any, decision: Decision) -> None:
         """Show the other proposals, and the profile of the plan."""
         if decision is not self._decision or self._playing is not None:
             return
-        others = self._shared.decisions.proposals(observation, decision)
+        others = self._setting.decisions.proposals(observation, decision)
         own = self._proposals[0]
         by_hand = own.rank == 0
         self._proposals = (own, *others) if by_hand else others
@@ -349,7 +350,7 @@ class Session:
         with self._client.atomic():
             self._view.show_proposals([each.path() for each in others], [each.clear for each in others])
         self._panels.show_proposals(self._proposals, self._picked, decision.maker, decision.seconds)
-        self._panels.show_plots(plan_profile(self._task, self._scene, plan.plan), executed)
+        self._panels.show_plots(plan_profile(self._task, self._fitted, plan.plan), executed)
 
     def _pick(self, index: int) -> None:
         """Show another proposal as the plan."""
@@ -390,13 +391,13 @@ class Session:
         plan = self.proposal
         assert plan is not None
         if self._task.replanning:
-            decisions = self._shared.decisions
+            decisions = self._setting.decisions
             return execute_replanning(
-                self._env, decisions, self._scene, plan.plan, lambda: self._scene.goal, self._checks
+                self._env, decisions, self._fitted, plan.plan, lambda: self._scene.goal, self._checks
             )
-        if self._step_env is not None and plan.rank == 1:
-            return execute_stepwise(self._step_env, self._shared.agent, self._scene)
-        return execute_whole(self._env, self._scene, plan.plan)
+        if self._step_env is not None and plan.rank == 1 and self._setting is self._shared.own:
+            return execute_stepwise(self._step_env, self._setting.agent, self._fitted)
+        return execute_whole(self._env, self._fitted, plan.plan)
 
     def _finish(self) -> None:
         """Say what came of the movement, and show its profile."""
@@ -409,9 +410,9 @@ class Session:
 
     def _compare(self) -> None:
         """Compare methods, one job for each, so that changes of the scene come between."""
-        scene, results = self._scene, list[MethodResult]()
-        self._observe()
-        rows = self._shared.comparison(scene, self._checks)
+        scene, setting, results = self._scene, self._setting, list[MethodResult]()
+        setting.observe(self._fitted, self._env)  # an impossible scene is refused
+        rows = setting.comparison(self._fitted, self._checks)
 
         def step() -> None:
             if scene is not self._scene:
@@ -420,7 +421,7 @@ class Session:
             self._panels.show_comparison(results, running=following[0] if following else "")
             if following is not None:
                 self._client.flush()
-                with self._shared.comparing:
+                with setting.comparing:
                     results.append(following[1]())
                 self.post("later comparison", step)
 
@@ -429,20 +430,15 @@ class Session:
     # Files
 
     def _load(self, content: bytes) -> None:
-        scene = from_json(content, self._task.arm.dimension, self._task.scenes.shapes)
-        for wrong, reason in problems(scene.batch(), self._task.collision_model):  # type: ignore[arg-type]
-            if wrong.any():
-                raise ValueError(f"the scene file is impossible: {reason(0)}")
-        self._take(scene)
+        self._take(self._shared.read(content), "")
 
     def _save(self) -> None:
-        text = to_json(self._scene, self._shared.env_id)
+        text = to_json(self._scene, self._setting.env_id)
         self._download("scene.json", text.encode())
 
     def _code(self) -> None:
-        shared = self._shared
-        changing = self._task.replanning
-        self._panels.show_code(to_python(self._scene, shared.env_id, shared.env_kwargs, changing=changing))
+        setting, changing = self._setting, self._task.replanning
+        self._panels.show_code(to_python(self._fitted, setting.env_id, setting.env_kwargs, changing=changing))
 
     def _picture(self) -> None:
         self._download("viapoint.png", png(self._playback.photograph("png")))

@@ -1,0 +1,189 @@
+"""Environments, agent and comparison that all tabs of the live page share."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from viapoint.envs.common.types import Observation
+from viapoint.envs.mdp.task import Task
+from viapoint.envs.scenes.families import MOST_OBSTACLES
+from viapoint.envs.scenes.scene import Scenes, check_scenes
+from viapoint.training.algorithms.agent import Agent
+from viapoint.training.live.comparison import Comparison
+from viapoint.training.live.decisions import DecisionMaker
+from viapoint.training.live.drawing import ArmDrawing
+from viapoint.training.live.movements import DECISION_INTERVAL
+from viapoint.training.live.obstacle_editing import KINDS
+from viapoint.training.live.panels import Facts
+from viapoint.training.live.scene_draws import Draw, scene_kinds
+from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
+from viapoint.training.rollouts.step_rollout import is_step_wise, whole_task
+
+MOST_VIAS = 4
+"""Greatest number of via-points of the slider."""
+
+
+class Setting:
+    """Environment, what decides in it, and a comparison of methods.
+
+    Args:
+        env_id: Id of a registered environment.
+        agent: Agent of that environment; None for the geometry search.
+        env_kwargs: Arguments of the environment.
+    """
+
+    def __init__(self, env_id: str, agent: Agent | None, env_kwargs: Mapping[str, Any]) -> None:
+        self.env_id, self.agent, self.env_kwargs = env_id, agent, dict(env_kwargs)
+        self.whole_id, self.whole_kwargs = whole_task(env_id, self.env_kwargs)
+        env = self.make_env()
+        self.task: Task = env.task
+        self.model = env.model
+        env.close()
+        self._steps = agent is not None and is_step_wise(env_id)
+        self.decisions = DecisionMaker(self.task, None if self._steps else agent)
+        self.comparison = Comparison(self.whole_id, agent, **self.whole_kwargs)
+        self.comparing = threading.Lock()
+        """Lock of the comparison, whose environments all tabs share."""
+
+    def make_env(self) -> Any:
+        """Return a vector environment of one environment, whose actions are whole movements or revisions of them."""
+        kwargs = dict(self.whole_kwargs)
+        env: Any = gym.make_vec(self.whole_id, num_envs=1, threads=1, **kwargs)
+        if env.unwrapped.task.replanning and "horizon" not in kwargs:
+            env.close()
+            env = gym.make_vec(self.whole_id, num_envs=1, threads=1, **kwargs, horizon=DECISION_INTERVAL)
+        return env.unwrapped
+
+    def make_step_env(self) -> Any:
+        """Return an environment for an agent that acts in every control step; None for other agents."""
+        if not self._steps:
+            return None
+        env: Any = gym.make_vec(self.env_id, num_envs=1, threads=1, **self.env_kwargs)
+        return env.unwrapped
+
+    def observe(self, scene: LiveScene, env: Any) -> Observation:
+        """Return the first observation in a scene, after a check of the scene.
+
+        Args:
+            scene: Scene with the rows of this setting.
+            env: Environment of :meth:`make_env`.
+
+        Raises:
+            ValueError: The scene is impossible, with the reason.
+        """
+        task, rows = self.task, scene.batch()
+        check_scenes(rows, task.collision_model)  # type: ignore[arg-type]
+        observation: Observation
+        if task.replanning:
+            observation = env.reset(options=scene.options(changing=True))[0]
+            return observation
+        joints = np.asarray(task.arm.inverse_kinematics(rows.start))
+        missing = task.observation.n_rows - rows.obstacles.shape[1]
+        obstacles = np.pad(rows.obstacles, ((0, 0), (0, missing), (0, 0)))
+        scenes = Scenes(rows.start, rows.goal, obstacles)
+        observation = task.observation.observe(joints, rows.start, scenes)
+        return observation
+
+    def limit(self, scene: LiveScene) -> str:
+        """Return the limit of the environment that a scene exceeds, as part of a sentence; "" if it has room for it."""
+        known, most = self.task.scenes.shapes, self.task.observation.n_rows
+        others = [name for name in scene.shapes if name not in known]
+        others = [name for name in others if name != "sphere" or "capsule" not in known]
+        if not most and len(scene.obstacles):
+            return "without obstacles"
+        if others:
+            return f"without {others[0].replace('_', '-')} obstacles"
+        return f"with at most {most} obstacles" if len(scene.obstacles) > most else ""
+
+
+class Shared:
+    """Settings, and everything else that is expensive to make, for all tabs of a page.
+
+    Args:
+        env_id: Id of a registered environment.
+        agent: Agent of that environment; None for the geometry search.
+        model_file: MJCF file that the arm was loaded from, whose meshes are drawn.
+        seed: Seed of the random scenes.
+        env_kwargs: Arguments of the environment.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        agent: Agent | None,
+        *,
+        model_file: str | Path | None,
+        seed: int | None,
+        env_kwargs: Mapping[str, Any],
+    ) -> None:
+        self.own = Setting(env_id, agent, env_kwargs)
+        """Setting of the agent."""
+        self._wide: Setting | None = None
+        self._making = threading.Lock()
+        self._model_file, self._seed = model_file, seed
+        self.drawing()
+
+    def setting_of(self, scene: LiveScene) -> Setting:
+        """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used.
+
+        Raises:
+            ValueError: The scene has more obstacles than any setting.
+        """
+        if not self.own.limit(scene):
+            return self.own
+        if len(scene.obstacles) > MOST_OBSTACLES:
+            raise ValueError(f"a scene has at most {MOST_OBSTACLES} obstacles, got {len(scene.obstacles)}")
+        with self._making:
+            if self._wide is None:
+                room = {"shapes": SCENE_SHAPES, "n_obstacles": (0, MOST_OBSTACLES)}
+                self._wide = Setting(self.own.env_id, None, self.own.env_kwargs | room)
+        return self._wide
+
+    def read(self, content: bytes) -> LiveScene:
+        """Return the scene of a JSON file.
+
+        Raises:
+            ValueError: The file holds no scene, or an impossible one.
+        """
+        scene = from_json(content, self.own.task.arm.dimension)
+        try:
+            task = self.setting_of(scene).task
+            check_scenes(scene.with_shapes(task.scenes.shapes).batch(), task.collision_model)  # type: ignore[arg-type]
+        except ValueError as error:
+            reason = str(error).removeprefix("scene 0: ")
+            raise ValueError(f"the scene file is impossible: {reason}") from None
+        return scene
+
+    def drawing(self) -> ArmDrawing:
+        """Return the parts of the arm."""
+        return ArmDrawing(self.own.task.arm, self.own.model, self._model_file)
+
+    def scene_kinds(self) -> dict[str, Draw]:
+        """Return functions that draw scenes, by the names of their buttons."""
+        return scene_kinds(self.own.whole_id, self.own.whole_kwargs, self.own.task, self._seed)
+
+    def facts(self, kinds: Sequence[str]) -> Facts:
+        """Return what the panels show of the page."""
+        own, task = self.own, self.own.task
+        n_via = task.action.n_via
+        who = "no agent: the geometry search decides"
+        if own.agent is not None:
+            who = f"agent: {type(own.agent).__name__}"
+        return Facts(
+            title=own.env_id.removeprefix("viapoint/"), subtitle=who, scene_kinds=kinds,
+            obstacle_kinds=tuple(KINDS[task.arm.dimension]), n_via=n_via,
+            most_vias=n_via if task.replanning else max(MOST_VIAS, n_via),
+            duration_range=task.action.duration_range, ranks=own.decisions.ranks, spatial=task.spatial,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the environments of the comparisons."""
+        for setting in (self.own, self._wide):
+            if setting is not None:
+                setting.comparison.close()
