@@ -38,11 +38,7 @@ class MultiStepVectorEnv(ReachVectorEnv):
         return () if self.scenes is None else tuple(self._rollout(row) for row in range(self.num_envs))
 
     def transition(self, actions: Any) -> Transition:
-        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result.
-
-        Args:
-            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
-        """
+        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
         observation, reward, info = self.execute_actions(actions)
         last, rows = None, np.flatnonzero(self.terminated | self.truncated)
         if rows.size:
@@ -80,6 +76,15 @@ class MultiStepVectorEnv(ReachVectorEnv):
         scene = self.scenes.take([row])
         return self._episodes.rollout(row, lambda *movement: self._clearance(scene, *movement))
 
+    def _render_one(self, sim: int) -> Any:
+        if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
+            return super()._render_one(sim)
+        return self._film(sim, self.scenes.take([sim]))
+
+    @abstractmethod
+    def _film(self, sim: int, scene: Any) -> Any:
+        """Render the running episode of one environment."""
+
     @abstractmethod
     def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
         """Return the clearance in one scene at each time, shape (T,), [m]."""
@@ -103,11 +108,7 @@ class MultiStepEnv(ReachEnv):
         return result
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Make one step.
-
-        Args:
-            action: Shape (m,), in [-1, 1]; components beyond are clipped.
-        """
+        """Make one step; see :meth:`ReachEnv.step`."""
         if self._over:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
         observation, reward, _, _, info = super().step(action)

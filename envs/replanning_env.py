@@ -279,7 +279,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         return episodes.outcome(arrived & now.sound, goal_error, duration, cost)
 
     def _clearance(self, scene: ChangingScenes, hand: Float, joints: Float, time: Float) -> Float:
-        """Return the clearance in one scene at each time, shape (T,), [m]."""
         profile = self.task.collision_model.clearance_profile(
             hand[None], scene.places(time[None]), scene.present, joints[None]
         )
@@ -308,15 +307,9 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             generators[i] = tried[i]
         return changing
 
-    def _start(self, rows: Int, scenes: ChangingScenes) -> None:  # type: ignore[override]
+    def _start(self, rows: Int, scenes: ChangingScenes) -> Float:  # type: ignore[override]
         """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""
-        if self.scenes is None or len(rows) == self.num_envs:
-            self.scenes = scenes
-        else:
-            self.scenes = ChangingScenes(*(field.copy() for field in self.scenes))
-            self.scenes.put(rows, scenes)
-        joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
-        self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
+        joints = super()._start(rows, scenes)  # type: ignore[arg-type]
         places = scenes.places(np.zeros((len(rows), 1)))
         clearance = self.task.collision_model.clearance_profile(scenes.start[:, None], places, scenes.present)
         self._episodes.begin(rows, joints, scenes.start, clearance.min(axis=(1, 2), initial=MAX_CLEARANCE))
@@ -326,6 +319,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         self._plan_start.step[rows], self._plan_start.begun[rows] = 0, False
         for row in rows:
             self._history[row] = []
+        return joints
 
     def observe(self) -> Observation:
         """Return the present observations."""
@@ -335,10 +329,8 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             episodes.now.joints, self.scenes, self.default, episodes.time
         )
 
-    def _render_one(self, sim: int) -> Any:
-        if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
-            return super()._render_one(sim)
-        return self._renderer.episode(self.scenes.take([sim]), self._history[sim], self._rollout(sim))
+    def _film(self, sim: int, scene: ChangingScenes) -> Any:
+        return self._renderer.episode(scene, self._history[sim], self._rollout(sim))
 
 
 class ReplanningEnv(MultiStepEnv):

@@ -357,9 +357,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     ) -> tuple[Decision, Future[Scenes] | None]:
         """Stages 2 to 7: scale time, build references, simulate, measure, score and observe.
 
-        Args:
-            movements: Decided movements.
-            meanwhile: Independent job for the time of the physics; its future is returned.
+        The job `meanwhile` runs during the physics; its future is returned.
         """
         stages = self._executor
         scaled = stages.scale_time(movements)
@@ -415,15 +413,16 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             generators[i] = generator
         return scenes
 
-    def _start(self, rows: Int, scenes: Scenes) -> None:
-        """Start episodes with the arms at rest at the start and the obstacles in place."""
+    def _start(self, rows: Int, scenes: Scenes) -> Float:
+        """Start episodes with the arms at rest at the start and the obstacles in place; return the joint angles."""
         if self.scenes is None or len(rows) == self.num_envs:
             self.scenes = scenes
         else:
-            self.scenes = Scenes(*(field.copy() for field in self.scenes))
+            self.scenes = type(scenes)(*(field.copy() for field in self.scenes))
             self.scenes.put(rows, scenes)
         joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
         self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
+        return joints
 
     def observe(self) -> Observation:
         """Return the present observations."""

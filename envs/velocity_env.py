@@ -221,15 +221,15 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         cost = straight_jerk_cost(norm(scenes.goal - scenes.start), duration)
         return self._episodes.outcome(success, norm(now.hand - scenes.goal), duration, cost)
 
-    def _start(self, rows: Int, scenes: Scenes) -> None:
-        super()._start(rows, scenes)
+    def _start(self, rows: Int, scenes: Scenes) -> Float:
+        joints = super()._start(rows, scenes)
         self._motion.put(rows, Motion.at_rest(scenes.start))
         self._rest.steps[rows] = 0
         clearance = self.task.collision_model.least_clearance(
             scenes.start[:, None], scenes.obstacles, scenes.present
         )
-        joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
         self._episodes.begin(rows, joints, scenes.start, clearance)
+        return joints
 
     def observe(self) -> Observation:
         """Return the present observations."""
@@ -239,17 +239,13 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         return self.observation_layout.moving(seen, self.scenes, self._motion, self._episodes.time)
 
     def _clearance(self, scene: Scenes, hand: Float, joints: Float, time: Float) -> Float:
-        """Return the clearance in one scene at each time, shape (T,), [m]."""
         obstacles = np.repeat(scene.obstacles, len(time), axis=0)
         present = np.repeat(scene.present, len(time), axis=0)
         return self.task.collision_model.least_clearance(hand[:, None], obstacles, present, joints[:, None])
 
-    def _render_one(self, sim: int) -> Any:
-        if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
-            return super()._render_one(sim)
+    def _film(self, sim: int, scene: Scenes) -> Any:
         plan = self.last_plan
         assert plan is not None
-        scene = self.scenes.take([sim])
         return self._renderer.movement(scene, plan.take([sim]), self._rollout(sim))
 
 

@@ -151,11 +151,7 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start new episodes.
-
-        Args:
-            seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
-            options: See :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`.
+        """Start new episodes; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`.
 
         Raises:
             ValueError: A given scene is impossible; the environments are unchanged.
@@ -179,11 +175,7 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return observation, {}
 
     def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
-        """Execute one action in each environment; where an episode ends, start the next.
-
-        Args:
-            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
-        """
+        """Execute one action in each environment; where an episode ends, start the next."""
         results = self._execute("transition", actions)
         ended = [each.last_observation is not None for each in results]
         lasts = [
@@ -196,11 +188,7 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return step
 
     def execute_actions(self, actions: Any) -> Any:
-        """Execute one action in each environment, without a reset.
-
-        Args:
-            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
-        """
+        """Execute one action in each environment, without a reset."""
         return merge(self._execute("execute_actions", actions))
 
     def observe(self) -> Observation:

@@ -34,11 +34,7 @@ class WorkerDiedError(RuntimeError):
 
 
 class SharedMemory:
-    """Memory that two processes share by an open file without a name; the system frees it when both have ended.
-
-    Args:
-        file: File descriptor; None opens a new file.
-    """
+    """Memory that two processes share by an open file without a name, which the system frees when both have ended."""
 
     def __init__(self, file: int | None = None) -> None:
         self.file = _open_unnamed() if file is None else file

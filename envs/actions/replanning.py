@@ -87,11 +87,7 @@ class NominalPlan(NamedTuple):
 
 
 class ReplanningDecoder:
-    """Decoder of actions during a movement.
-
-    Args:
-        layout: Layout of the actions.
-    """
+    """Decoder of actions during a movement."""
 
     def __init__(self, layout: ActionLayout) -> None:
         self.layout = layout

@@ -103,12 +103,7 @@ class Steering:
         return np.stack([(velocity * axis).sum(axis=-1) for axis in axes], axis=-1) / self.top_speed
 
     def follow(self, motion: Motion, wanted: Float) -> Motion:
-        """Return references over one control step, shape (N, S + 1, D): at its beginning and after each physics step.
-
-        Args:
-            motion: State at the beginning, shape (N, D) each.
-            wanted: Decoded velocity, shape (N, D), [m/s].
-        """
+        """Return references at the beginning of a control step and after each physics step, (N, S + 1, D) each."""
         return Motion(*(_combined(table, motion, wanted) for table in self._tables))
 
     def jerk_cost(self, motion: Motion, wanted: Float) -> Float:

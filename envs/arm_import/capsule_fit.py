@@ -141,12 +141,7 @@ def cover_points(points: Float, tolerance: float) -> list[Capsule]:
 
 
 def fit_capsule(corners: Float, body: ConvexMesh) -> Capsule:
-    """Return a capsule that contains points with little excess over a convex body that contains them.
-
-    Args:
-        corners: Points, shape (n, 3), [m].
-        body: Convex body.
-    """
+    """Return a capsule that contains points, shape (n, 3), with little excess over a convex body around them, [m]."""
     centre, axes, (low, high) = _principal_frame(corners)
     size = float((high - low).max())
     best, least = np.empty((2, 3)), np.inf

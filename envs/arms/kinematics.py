@@ -104,12 +104,7 @@ class Chain:
         return frames
 
     def points(self, joints: Array, places: tuple[tuple[int, Constants], ...]) -> Array:
-        """Return the world positions of points fixed to joint frames, shape (..., P, 3), [m].
-
-        Args:
-            joints: Angles, shape (..., J), [rad].
-            places: P pairs of a joint's index and a point in its frame, [m].
-        """
+        """Return the world positions of P points in frames of joints (index, point), shape (..., P, 3), [m]."""
         xp = namespace_of(joints)
         frames = self.frames(joints)
         placed = [frames[index].transform(point) for index, point in places]

@@ -115,8 +115,7 @@ class PandaInverseKinematics:
 def _elbow(square: Array) -> tuple[Array, Array, Array]:
     """Return the cosine of the triangle's angle at joint 4, and cosine and sine of that joint.
 
-    Args:
-        square: Squared distance of shoulder and wrist, [m^2].
+    The argument is the squared distance of shoulder and wrist, [m^2].
     """
     xp = namespace_of(square)
     cosine = (UPPER_SIDE**2 + FORE_SIDE**2 - square) * (0.5 / (UPPER_SIDE * FORE_SIDE))

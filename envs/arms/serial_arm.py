@@ -440,12 +440,7 @@ def _limits(values: tuple[float, ...], like: Array) -> Array:
 
 
 def _interpolate(knots: Array, number: int) -> Array:
-    """Return values at `number` steps, linear between every CONTROL_STRIDE-th of them; the last knot is held.
-
-    Args:
-        knots: Values at steps 0, CONTROL_STRIDE, ..., shape (..., K, U).
-        number: Number of steps.
-    """
+    """Return values at `number` steps, linear between knots (..., K, U) at every CONTROL_STRIDE-th; the last holds."""
     xp = namespace_of(knots)
     following = xp.concat((knots[..., 1:, :], knots[..., -1:, :]), axis=-2)
     share = xp.asarray(np.arange(CONTROL_STRIDE)[:, None] / CONTROL_STRIDE, dtype=knots.dtype)

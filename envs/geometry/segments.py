@@ -9,13 +9,9 @@ from viapoint.primitives.array_api import Array, namespace_of
 
 
 def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
-    """Return the squared distance of points p from segments c + t a, -1 <= t <= 1, [m^2].
+    """Return the squared distance of points p from segments c + t a, -1 <= t <= 1, [m^2], from p - c and a.
 
     The nearest point of the segment is at t = (p - c) . a / |a|^2, clamped.
-
-    Args:
-        offset: Components of p - c, [m].
-        axis: Components of a, [m].
     """
     square = dot(axis, axis)
     along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)

@@ -432,14 +432,10 @@ def best_of(xp: Namespace, function: Any, candidates: Any) -> Array:
 
 
 def lowest_of_lines(slopes: Array, offsets: Array) -> Array:
-    """Return t in [0, 1] where the greatest of K affine functions is least, shape (M,).
+    """Return t in [0, 1] where the greatest of K affine functions a_k t + b_k, shape (K, M), is least, shape (M,).
 
     The minimum of max_k (a_k t + b_k) lies where a falling and a rising function cross. Each step replaces one of the
     two by the greatest function at their crossing, so it ends after at most K steps, usually after three.
-
-    Args:
-        slopes: a_k, shape (K, M).
-        offsets: b_k, shape (K, M).
     """
     xp = namespace_of(slopes)
     each = xp.arange(slopes.shape[1])

@@ -29,12 +29,7 @@ RESHAPE_NUMBERS = 3
 
 
 class Uniforms:
-    """Rows of uniform numbers in [0, 1), taken from the front.
-
-    Args:
-        values: Shape (..., n).
-        taken: Count of numbers in each row that are taken already.
-    """
+    """Rows of uniform numbers in [0, 1), shape (..., n), of which the first `taken` are taken."""
 
     def __init__(self, values: Float, taken: int = 0) -> None:
         self._values, self._taken = values, taken
@@ -148,12 +143,7 @@ class ObstacleSampler(Protocol):
         """Uniform numbers of one attempt."""
 
     def steered(self, uniforms: Uniforms, number: int) -> Bool:
-        """Return which paths must leave room on one side (above; in the plane towards the base), shape (N,).
-
-        Args:
-            uniforms: Numbers of the obstacles; none are taken.
-            number: Count of scenes, N.
-        """
+        """Return which of `number` paths must leave room on one side (above; in the plane towards the base)."""
 
     def __call__(self, uniforms: Uniforms, feasible: FeasiblePath) -> tuple[Float, Bool]:
         """Return obstacles, shape (N, rows, 2 D + 1), [m], and which scenes are good, shape (N,)."""

@@ -76,11 +76,9 @@ class ChangingScenes(NamedTuple):
         return np.asarray(targets[np.arange(len(targets)), number])
 
     def places(self, time: Float, *, unturned: Float | None = None) -> Float:
-        """Return obstacles at T times of each scene, shape (N, T, n, 2 D + 1), [m].
+        """Return obstacles at times of shape (N, T), [s], shape (N, T, n, 2 D + 1), [m].
 
-        Args:
-            time: Shape (N, T), [s].
-            unturned: Time after which changes of course are ignored, as they cannot be foreseen, shape (N,), [s].
+        Changes of course after `unturned`, shape (N,), [s], are ignored, as they cannot be foreseen.
         """
         d = self.start.shape[-1]
         turn = self.turn_times

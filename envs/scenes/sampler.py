@@ -282,12 +282,7 @@ class AttemptNumbers:
         return drawn
 
     def put_back(self, scenes: Int, first: Int) -> None:
-        """Put the generators of P scenes back to the end of the group of the first good attempt.
-
-        Args:
-            scenes: Indices of the scenes, shape (P,).
-            first: Index of the first good attempt, shape (P,); -1 for none.
-        """
+        """Put the generators of P scenes back to the end of the group of the first good attempt, -1 for none."""
         if len(self._groups) == 1:
             return
         ends = np.cumsum(self._groups)

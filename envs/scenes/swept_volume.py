@@ -128,15 +128,7 @@ class SweptVolume(NamedTuple):
         )
 
     def top(self, phase: Int, place: Float) -> Float:
-        """Return the height of the links above the hand, at K times of each movement.
-
-        Args:
-            phase: Indices of the times, shape (N, K).
-            place: Positions of the hand then, shape (N, K, 3), [m].
-
-        Returns:
-            Shape (N, K), [m].
-        """
+        """Return the height of the links above the hand at `place` at the times of index `phase`, shape (N, K), [m]."""
         there = self.outer.ends[:, :, np.arange(len(phase))[:, None], :, phase]
         x, y, z = (place[:, :, i, None, None] for i in range(3))
         apart = np.sqrt(np.square(there[..., 0, :] - x) + np.square(there[..., 1, :] - y))

@@ -60,12 +60,7 @@ class UniformScenes:
         return 2 * dimension + 1 + DRAWN * self.rows * NUMBERS[dimension]
 
     def __call__(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
-        """Return the indices of good attempts and their scenes.
-
-        Args:
-            uniforms: Numbers of the attempts; `size` of each are taken.
-            ends: Given starts and goals.
-        """
+        """Return the indices of good attempts and their scenes; `size` of the uniform numbers are taken."""
         start, goal, good = self._ends(uniforms, ends)
         count = whole_between(self._distribution.n_obstacles, uniforms.take(1)[:, 0])
         rows = np.flatnonzero(good)

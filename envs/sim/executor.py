@@ -151,11 +151,7 @@ def join_groups(movements: Movements, groups: list[MeasuredMovements]) -> Execut
 
 
 class Executor:
-    """Stages of whole movements, each a batch function from one record to the next.
-
-    Args:
-        simulator: Simulator that was placed at the starts of the movements.
-    """
+    """Stages of movements of a simulator that is at their starts, each a batch function from one record to the next."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator, self.arm = simulator, simulator.arm

@@ -25,11 +25,7 @@ SIMILAR, SLACK = 1.15, 4
 
 
 def groups_of(steps: Int) -> list[Int]:
-    """Return indices of decisions of similar length, at most GROUP per group and in increasing order.
-
-    Args:
-        steps: Physics steps of each, shape (n,).
-    """
+    """Return indices of decisions of similar length (n,), at most GROUP per group and in increasing order."""
     groups: list[list[int]] = []
     for index in np.argsort(steps, kind="stable"):
         shortest = steps[groups[-1][0]] if groups else 0
@@ -104,11 +100,7 @@ class SimulatedDecisions(NamedTuple):
 
 
 class ReplanningExecutor:
-    """Stages of decisions, each a batch function from one record to the next.
-
-    Args:
-        simulator: Simulator in the present state of the episodes.
-    """
+    """Stages of decisions, each a batch function from one record to the next."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator, self.arm = simulator, simulator.arm

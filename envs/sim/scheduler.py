@@ -18,11 +18,7 @@ Measured = TypeVar("Measured")
 
 
 class Scheduler:
-    """Runner of stages on a background thread, or on the calling thread alone.
-
-    Args:
-        threaded: True to use a background thread, which starts with the first job.
-    """
+    """Runner of stages on a background thread, which starts with the first job, or on the calling thread alone."""
 
     def __init__(self, threaded: bool) -> None:
         self._threaded = threaded

@@ -100,12 +100,7 @@ class Simulator:
         self.batch.bind("mocap_pos")[sims] = self._bodies(sims, centre)
 
     def rollout(self, sims: NDArray[np.int64], controls: Float) -> SimulationLog:
-        """Run simulations under controls, all for the same number of steps.
-
-        Args:
-            sims: The simulations in increasing order, shape (n,).
-            controls: Shape (n, T, U).
-        """
+        """Run simulations, in increasing order, under controls of shape (n, T, U)."""
         steps = controls.shape[1]
         warnings = self._warnings(sims)
         out = self.batch.rollout(steps, controls, record=self.recorded, ids=sims)

@@ -33,9 +33,7 @@ class TimeScale(NamedTuple):
 def required_time_scale(arm: Arm, plan: Any) -> TimeScale:
     """Return the time scaling that joint limits require; for an arm without limits, check the reach of short plans.
 
-    Args:
-        arm: Arm that moves.
-        plan: N movements, with `durations` of their segments [s], `trajectory()` and `take(rows)`.
+    The plan has N movements: `durations` of their segments [s], `trajectory()` and `take(rows)`.
     """
     number, segments = plan.durations.shape
     stretch, within = np.ones(number), np.ones(number, dtype=bool)

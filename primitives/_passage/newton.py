@@ -60,12 +60,7 @@ class Minima:
 
 
 def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
-    """Return fractions of the duration (N, S), and True where the iteration converged (N,).
-
-    Args:
-        cost: the movements.
-        several: search from several starts.
-    """
+    """Return fractions of the duration (N, S), from several starts if asked, and True where it converged (N,)."""
     first, *others = _starts(cost.steps, several)
     best = _minimise_cost(cost, first)
     for start in others:

@@ -15,7 +15,7 @@ from viapoint.training.algorithms.viaq_policy import ViaQPolicy, seen_from_line
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.search.candidates import sobol_actions
-from viapoint.training.search.plan_checks import best_plan, check_plans
+from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN, check_plans, merit
 
 IDS = (
     "viapoint/PlanarReach-v0",
@@ -166,7 +166,8 @@ def test_of_the_candidates_that_are_checked_it_takes_the_best(simulation, checks
     for row in range(16):
         candidates = {each.tobytes() for each in every[row]}
         assert len({each.tobytes() for each in checked[row]} & candidates) == checked.shape[1]
-    best = checked[np.arange(16), best_plan(check_plans(observation, checked, simulation.task))]
+    merits = merit(check_plans(observation, checked, simulation.task), CLEARANCE_MARGIN, REACH_MARGIN)
+    best = checked[np.arange(16), merits.argmax(axis=-1)]
     np.testing.assert_array_equal(decided, best)
     if checks > 1:
         greatest = every[np.arange(16), values.argmax(axis=1)]

@@ -15,7 +15,6 @@ from viapoint.training.search.plan_checks import (
     MAX_REFINED,
     MIN_REFINED,
     NODES,
-    best_plan,
     check_plans,
     merit,
     pruned_merit,
@@ -184,7 +183,7 @@ def test_the_best_plan_is_within_the_margins_or_else_comes_nearest():
     env, observation = made(PLANE)
     checks = check_plans(observation, random_actions(env.task, 16, 64), env.task)
     for margins in ((0.001, 0.001), (0.05, 0.001), (2.0, 0.0)):
-        best, rows = best_plan(checks, *margins), np.arange(16)
+        best, rows = merit(checks, *margins).argmax(axis=-1), np.arange(16)
         within = (checks.clearance > margins[0]) & (checks.reach_margin > margins[1])
         wanted = np.where(within, checks.reward, -np.inf)
         least = np.minimum(checks.clearance, checks.reach_margin)

@@ -27,13 +27,7 @@ from viapoint.training.algorithms.extractors import EXTRACTORS
 from viapoint.training.algorithms.sb3_minimum_critic import POLICIES as MINIMUM
 from viapoint.training.algorithms.smdp_buffers import time_discount, unit_of
 from viapoint.training.config.discount import check_discount_unit
-from viapoint.training.io.files import (
-    BadFileError,
-    read_arrays,
-    read_json,
-    write_arrays,
-    write_json,
-)
+from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.io.model_limits import (
     LARGEST_MODEL_JSON,
     LARGEST_WEIGHTS,
@@ -52,18 +46,8 @@ FORMAT = 1
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
 """Learning algorithms by their names on the command line; the modules that define them add them."""
 NOT_STORED = frozenset(
-    {
-        "self",
-        "policy",
-        "env",
-        "seed",
-        "device",
-        "verbose",
-        "tensorboard_log",
-        "_init_setup_model",
-        "stats_window_size",
-    }
-    | {"monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
+    {"self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+    | {"stats_window_size", "monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
 """Arguments of algorithms that model files do not hold."""

@@ -143,10 +143,6 @@ class PairMinimum(nn.Module):
         This takes a fraction of the time of the minimum over all pairs, and is never less. A pair is near if its
         distance exceeds the least one of the plan by at most NEAR. Distance means here the rough one of
         :meth:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.gap`.
-
-        Args:
-            poses: Planned poses.
-            parts: Obstacle parts.
         """
         return torch.stack([self._of_near_pairs(poses, parts, scene) for scene in range(len(parts.present))])
 

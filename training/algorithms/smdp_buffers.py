@@ -26,12 +26,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import (
-    DictReplayBuffer,
-    DictRolloutBuffer,
-    ReplayBuffer,
-    RolloutBuffer,
-)
+from stable_baselines3.common.buffers import DictReplayBuffer, DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
@@ -128,12 +123,7 @@ class TimedRolloutBuffer(RolloutBuffer):
         self._told: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
     def tell(self, infos: Sequence[Mapping[str, Any]], rewards: NDArray[np.float32]) -> None:
-        """Store infos and rewards that the next call of :meth:`add` needs and does not receive.
-
-        Args:
-            infos: Infos of N environments.
-            rewards: Rewards of the environments, shape (N,).
-        """
+        """Store infos and rewards (N,) that the next call of :meth:`add` needs and does not receive."""
         self._told = self.time_discount.of(infos), rewards.copy()
 
     def add(self, obs: Any, action: Any, reward: Any, *args: Any, **kwargs: Any) -> None:
@@ -154,12 +144,7 @@ class TimedRolloutBuffer(RolloutBuffer):
         super().add(obs, action, paid + (reward - paid) * (discounts / self.gamma), *args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: NDArray[np.bool_]) -> None:
-        """Compute returns and advantages of a complete rollout.
-
-        Args:
-            last_values: Values of the observations after the rollout, N of them.
-            dones: Mask of environments whose last decision ended an episode, shape (N,).
-        """
+        """Compute returns and advantages of a complete rollout."""
         last = last_values.detach().cpu().numpy().reshape(1, -1)
         following = np.concatenate((self.values[1:], last))
         begins = np.concatenate((self.episode_starts[1:], dones[None].astype(np.float32)))

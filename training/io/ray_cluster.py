@@ -97,9 +97,6 @@ def _check_listens(address: str) -> None:
 def check_nodes(options: Mapping[str, Any] | None = None) -> None:
     """Check that every node has the packages of this machine.
 
-    Args:
-        options: Options of the function that runs on the nodes.
-
     Raises:
         ValueError: One has other versions, or lacks a package; the message names it.
     """

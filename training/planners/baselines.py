@@ -89,11 +89,7 @@ class RandomVias:
 
 
 class StoredSolutions:
-    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew.
-
-    Args:
-        frozen: :class:`~viapoint.training.scene_sets.scene_set.FrozenScenes`.
-    """
+    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew."""
 
     name = "planner (stored)"
     timed = False

@@ -25,12 +25,7 @@ INSTANTS = np.arange(1, 49, dtype=np.float32) / 48
 
 
 class OpenLoopBaseline:
-    """First decision of a method, which is never revised.
-
-    Args:
-        method: Method that decides.
-        simulation: Simulation of the environment.
-    """
+    """First decision of a method, which is never revised."""
 
     def __init__(self, method: Any, simulation: EpisodeSimulation) -> None:
         self.name, self._method = f"{method.name}, no revision", method
@@ -50,10 +45,6 @@ class ReplanningPlanner:
     """Planner that searches the smoothest clear plan in every decision, with the future motion of the obstacles known.
 
     The search is among the same actions; plans are computed, not simulated.
-
-    Args:
-        simulation: Simulation of the environment.
-        seed: Seed of the search.
     """
 
     name = "planner, knows all courses"

@@ -80,12 +80,7 @@ class Failures:
 
 
 def classify(outcomes: Mapping[str, NDArray[Any]], another: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the index into KINDS of each of n failed movements.
-
-    Args:
-        outcomes: Outcomes of the movements, by the names of the environment's info, shape (n,) each.
-        another: Mask of failures where another proposal succeeds, shape (n,).
-    """
+    """Return the index into KINDS of n failed movements; `another` is True where another proposal succeeds."""
     reachable, collision = (np.asarray(outcomes[name], dtype=bool) for name in ("reachable", "collision"))
     clearance = np.asarray(outcomes["planned_clearance"], dtype=np.float64)
     fits = (~reachable, ~collision, clearance > 0.0, clearance >= -MAX_GRAZE, another, np.ones_like(another))

@@ -63,12 +63,7 @@ def learning_curve(
 
 
 def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
-    """Draw each method's success by the difficulty of the scenes, with Wilson intervals.
-
-    Args:
-        path: PNG file.
-        record: Record of an evaluation, see :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict`.
-    """
+    """Draw the success of each method of an evaluation by the difficulty of the scenes, with Wilson intervals."""
     summaries = record["methods"]
     figure = Figure(figsize=(8.0, 3.8), layout="constrained")
     ax = figure.subplots()

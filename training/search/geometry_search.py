@@ -47,7 +47,7 @@ class GeometrySearch:
     """Planner that checks a fixed set of actions with computed geometry and takes the best one.
 
     The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. Their plans
-    are ordered by :func:`~viapoint.training.search.plan_checks.best_plan`. Where nothing moves, clearance does not
+    are ordered by :func:`~viapoint.training.search.plan_checks.merit`. Where nothing moves, clearance does not
     depend on the duration; then all candidates but the first have the duration of the greatest reward. Candidates
     that jerk, duration or reach rule out count as checked, though their clearance is not computed.
 

@@ -101,26 +101,11 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
     return found
 
 
-def best_plan(
-    checks: PlanChecks, clearance_margin: float = CLEARANCE_MARGIN, reach_margin: float = REACH_MARGIN
-) -> Index:
-    """Return the index of the best plan of each scene, shape (B,).
-
-    The best plan has the greatest reward of those whose clearance and reach margin exceed the given margins. Where none
-    does, it has the greatest minimum of clearance and reach margin.
-
-    Args:
-        checks: Checks of H plans in each of B scenes.
-        clearance_margin: Least clearance, [m].
-        reach_margin: Least reach margin, [m].
-    """
-    return np.asarray(merit(checks, clearance_margin, reach_margin).argmax(axis=-1))
-
-
 def merit(checks: PlanChecks, clearance_margin: float, reach_margin: float) -> NDArray[np.float64]:
-    """Return the merit by which :func:`best_plan` orders plans, shape (B, H): the reward of those within the margins.
+    """Return the merit of plans, shape (B, H), by which the best one has the greatest.
 
-    Plans outside the margins have a merit near INFEASIBLE; the minimum of clearance and reach margin orders them.
+    It is the reward of plans whose clearance and reach margin exceed the given margins, [m]. Others have a merit near
+    INFEASIBLE; the minimum of clearance and reach margin orders them.
     """
     within = (checks.clearance > clearance_margin) & (checks.reach_margin > reach_margin)
     least = np.minimum(checks.clearance, checks.reach_margin, dtype=np.float64)

@@ -263,9 +263,6 @@ class _DistanceProfile:
         These are local minima in time from which STEP_REACH of a step to the next instant may lead below the limit: on
         a straight path d^2 = d_min^2 + s^2, so they have d^2 <= (limit + radii)^2 + (STEP_REACH step)^2. The distance
         from other shapes than capsules changes by at most s: d <= limit + radii + STEP_REACH step.
-
-        Args:
-            limit: Clearance of interest, shape (B, H), [m].
         """
         reach = np.maximum(limit[:, None] + self.radii, 0.0)
         bound, steps = np.where(reach > 0.0, reach * reach, -np.inf), self._steps_squared()

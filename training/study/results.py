@@ -91,12 +91,7 @@ def rows_in(study: Study, env: Environment) -> list[Row]:
 
 
 def gather(study: Study, before: Numbers | None = None) -> Numbers:
-    """Return the record of a study from its files, and from an earlier record.
-
-    Args:
-        study: Study.
-        before: Earlier record, of which rows are kept that are not measured again.
-    """
+    """Return the record of a study from its files; rows of an earlier record are kept that are not measured again."""
     record: Numbers = {
         "study": study.name,
         "versions": versions(),

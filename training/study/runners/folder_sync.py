@@ -91,12 +91,7 @@ def _extract(content: bytes, folder: Path) -> None:
 
 
 class Sender:
-    """Thread that sends the changes of a folder while a job runs, and at its end.
-
-    Args:
-        folder: Folder of the job.
-        send: Function that takes changes.
-    """
+    """Thread that sends the changes of a job's folder while it runs, and at its end."""
 
     def __init__(self, folder: Path, send: Callable[[Changes], object]) -> None:
         self._folder, self._send = folder, send

@@ -17,12 +17,7 @@ from viapoint.training.study.runners.job import LINEAR_ALGEBRA, Answer, Job, ans
 
 
 class LocalRunner:
-    """Runner on this machine.
-
-    Args:
-        root: Folder that the folders of jobs are in.
-        workers: Number of processes, which share the cores; 0 runs jobs in this process.
-    """
+    """Runner on this machine in `workers` processes, which share the cores; with 0 it runs jobs in this process."""
 
     def __init__(self, root: Path, workers: int = 1) -> None:
         self._root, self._workers = root, workers
