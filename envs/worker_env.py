@@ -32,14 +32,7 @@ SHARED = ("begin", "execute")
 
 
 class BatchServer:
-    """Native batch of environments that a worker runs.
-
-    Args:
-        kind: Class of the vector environment.
-        num_envs: Number of environments.
-        kwargs: Keyword arguments of the class.
-        arms: Arms that the keyword arguments may name.
-    """
+    """Native batch of environments that a worker runs; the arms are those that the keyword arguments may name."""
 
     def __init__(self, kind: Any, num_envs: int, kwargs: Mapping[str, Any], arms: Iterable[Any]) -> None:
         for arm in arms:

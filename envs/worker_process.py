@@ -138,11 +138,6 @@ class WorkerProcess:
     """Process that runs one object; :meth:`submit` and :meth:`result` call its methods.
 
     The first result, None, tells that the object has been made.
-
-    Args:
-        make: Function that makes the object in the process.
-        title: Name of the process in errors.
-        threads: Threads of numerical libraries.
     """
 
     def __init__(self, make: Callable[[], Any], title: str, threads: int) -> None:
@@ -170,10 +165,7 @@ class WorkerProcess:
     def submit(self, command: str, arguments: tuple[Any, ...], *, shared: bool) -> None:
         """Begin to call a method of the object; results that nobody took are dropped.
 
-        Args:
-            command: Name of the method.
-            arguments: Arguments of the method.
-            shared: True if the arrays of the result stay in shared memory, until the next call of this method.
+        The arrays of a shared result stay in shared memory until the next call of this method.
         """
         while self._pending:
             self._receive()

@@ -139,13 +139,7 @@ class ReplanningDecoder:
         return np.where(index < ahead, kept, filled)
 
     def revise(self, default: NominalPlan, plan: MovingPlan, actions: Float) -> tuple[MovingPlan, Bool]:
-        """Return plans for actions, and True where the plan under way is kept: zero action, or close to the goal.
-
-        Args:
-            default: Nominal plans, which the actions change.
-            plan: Plans under way.
-            actions: Shape (N, m), in [-1, 1].
-        """
+        """Return plans for actions (N, m), and True where the present one is kept: zero action or close to the goal."""
         zero = (actions == 0.0).all(axis=-1)
         near = (default.remaining > 0.0) & (default.remaining < self.least_remaining)
         keep = default.begun & ~default.changed & (zero | near)

@@ -261,13 +261,7 @@ def check_room(arm: SerialArm, reach: Box) -> None:
 
 
 def _grown(feasible: Bool, first: list[int], last: list[int]) -> tuple[list[int], list[int]]:
-    """Return a box of feasible grid points, grown by one feasible layer at a time, along its shortest side first.
-
-    Args:
-        feasible: Feasibility of the grid points, shape (A, B, C).
-        first: Lowest indices of the box to start with.
-        last: Highest indices.
-    """
+    """Return a box of feasible grid points, grown by one feasible layer at a time, along its shortest side first."""
     first, last = list(first), list(last)
     stuck: set[tuple[int, int]] = set()
     while len(stuck) < 6:

@@ -31,14 +31,7 @@ MAX_CLEARANCE = 1.0
 
 
 def hand_clearance(points: Array, radius: float, obstacles: Array, present: Array) -> Array:
-    """Return the least clearance of the hand over a movement from each obstacle, shape (..., n), [m].
-
-    Args:
-        points: Hand positions, shape (..., T, D), [m].
-        radius: Radius of the hand, [m].
-        obstacles: See the module.
-        present: See the module.
-    """
+    """Return the least clearance of the hand at points (..., T, D) from each obstacle, shape (..., n), [m]."""
     if has_shapes(obstacles):
         return _shape_clearance(points, None, radius, obstacles, present)
     xp = np if isinstance(points, np.ndarray) else namespace_of(points)  # mostly NumPy: without a call
@@ -47,14 +40,7 @@ def hand_clearance(points: Array, radius: float, obstacles: Array, present: Arra
 
 
 def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, present: Array) -> Array:
-    """Return the least clearance of all links over a movement from each obstacle, shape (..., n), [m].
-
-    Args:
-        links: Both ends of the links' axes, shape (..., T, L, 2, D), [m].
-        radii: Radii of the links, [m].
-        obstacles: See the module.
-        present: See the module.
-    """
+    """Return the least clearance of links with ends (..., T, L, 2, D) from each obstacle, shape (..., n), [m]."""
     if has_shapes(obstacles):
         ends = np.reshape(links, (*links.shape[:-4], -1, 2, links.shape[-1]))
         every = np.tile(radii, links.shape[-4])
@@ -68,13 +54,7 @@ def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, pres
 
 
 def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:
-    """Return the squared distance of points from the obstacles' axes, shape (..., n, T), [m^2].
-
-    Args:
-        points: Positions, shape (..., T, D), [m].
-        obstacles: See the module.
-        drift: See the module.
-    """
+    """Return the squared distance of points (..., T, D) from the obstacles' axes, shape (..., n, T), [m^2]."""
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
     offset = offset if drift is None else [o - drift[..., i] for i, o in enumerate(offset)]
@@ -82,14 +62,7 @@ def point_distance_squared(points: Array, obstacles: Array, drift: Array = None)
 
 
 def segment_distance_squared(first: Array, second: Array, obstacles: Array, drift: Array = None) -> Array:
-    """Return the squared distance of segments from the axes of obstacles, shape (..., n, T), [m^2].
-
-    Args:
-        first: One end of each segment, shape (..., T, D), [m].
-        second: Other end of each segment, shape (..., T, D), [m].
-        obstacles: See the module.
-        drift: See the module.
-    """
+    """Return the squared distance of segments, ends (..., T, D), from the obstacles' axes, shape (..., n, T), [m^2]."""
     dimension = first.shape[-1]
     link = [second[..., None, :, i] - first[..., None, :, i] for i in range(dimension)]
     axis = [2.0 * obstacles[..., :, None, dimension + i] for i in range(dimension)]

@@ -252,13 +252,7 @@ def observed_rows(rows: Float, shapes: Sequence[str]) -> Float:
 
 
 def rows_of_observed(seen: Numbers, shapes: Sequence[str], dimension: int) -> Float:
-    """Return the rows of scenes from those of :func:`observed_rows`, shape (..., n, .).
-
-    Args:
-        seen: Shape (..., n, .).
-        shapes: Names of the shapes of the one-hot part.
-        dimension: D.
-    """
+    """Return the rows of scenes from those of :func:`observed_rows`, shape (..., n, .)."""
     kind, place = seen[..., : len(shapes)].argmax(axis=-1), len(shapes)
     values: Float = seen[..., place:].astype(np.float64)
     centre, rotation, half = values[..., :3], values[..., 3:9], values[..., 9:12]

@@ -168,14 +168,7 @@ class ReplanningObservationLayout(ObservationLayout):
     def observe_replanning(
         self, joints: Float, scenes: ChangingScenes, default: NominalPlan, time: Float
     ) -> Observation:
-        """Return observations of N environments, shape (N, .) each, in fresh arrays.
-
-        Args:
-            joints: Shape (N, J), [rad].
-            scenes: N of them.
-            default: Plans of N hands on a zero action.
-            time: Time since the start, shape (N,), [s].
-        """
+        """Return observations at times since the start, shape (N,), [s], in fresh arrays of shape (N, .) each."""
         now = scenes.at(time)
         d, number = self.dimension, len(time)
         now.obstacles[..., :d] = np.clip(now.obstacles[..., :d], -FARTHEST, FARTHEST)

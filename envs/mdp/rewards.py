@@ -89,11 +89,6 @@ def reward_terms(outcome: Outcome, centre_duration: float, weights: RewardWeight
     Every term is bounded, so that no movement outweighs all others. With the default weights any success is worth
     more than any failure; and among movements of one shape the one of the centre duration is best: there a longer
     one costs as much time as it saves jerk.
-
-    Args:
-        outcome: Metrics of N movements.
-        centre_duration: Duration of the zero action, [s].
-        weights: Weights of the terms.
     """
     relative: Any = outcome.duration / centre_duration
     log_jerk = np.log(outcome.jerk_ratio) - 5.0 * np.log(relative)  # jerk cost scales with duration^-5

@@ -63,14 +63,7 @@ class Movement(NamedTuple):
 def first_contact(
     collision_model: CollisionModel, scene: Scenes, joints: Float, contact: Bool
 ) -> FirstContact | None:
-    """Return the first contact: the nearest body and obstacle at the first step at which the simulation reports one.
-
-    Args:
-        collision_model: Arm, and whether its links collide.
-        scene: Scene of one row.
-        joints: Joint angles, shape (T + 1, J), [rad].
-        contact: True for steps with contact, shape (T,).
-    """
+    """Return the first contact: the nearest body and obstacle at the first step at which the simulation reports one."""
     if not contact.any():
         return None
     arm, step = collision_model.arm, int(contact.argmax())

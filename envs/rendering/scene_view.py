@@ -56,14 +56,7 @@ class SceneView:
     def set(
         self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0
     ) -> mujoco.MjvScene:
-        """Set up the scene for one picture.
-
-        Args:
-            scene: Start, goal and obstacles, one row.
-            joints: Joint angles, shape (J,), [rad].
-            movement: Movement to draw: its whole plan, and its execution up to `step`.
-            step: Index into the movement's states.
-        """
+        """Set up one picture of a scene; of a movement the whole plan is drawn, and its execution up to a step."""
         contact = None if movement is None else movement.contact
         contact = None if contact is None or step < contact.step else contact
         self._pose(joints)

@@ -114,13 +114,7 @@ class ChangingScenes(NamedTuple):
 def problems_of_changes(
     scenes: ChangingScenes, collision_model: CollisionModel, *, time_limit: float
 ) -> Iterator[Problem]:
-    """Yield the faults that the changes of N scenes can have; the scenes are possible at the start.
-
-    Args:
-        scenes: N scenes.
-        collision_model: Arm that must reach the targets.
-        time_limit: Time limit of an episode, [s].
-    """
+    """Yield the faults that the changes of N scenes can have; the scenes are possible at the start."""
     d = scenes.start.shape[-1]
     given, turns = (scenes.jumps != 0.0).any(axis=-1), scenes.turns
     for there, time, what in (

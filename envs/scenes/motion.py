@@ -60,10 +60,7 @@ class ChangeDistribution:
 class ChangeSampler:
     """Sampler of the changes of scenes, each from a random generator of its own.
 
-    Args:
-        collision_model: Arm that moves.
-        distribution: Distribution of the changes.
-        durations: Shortest, centre and longest duration of a movement, [s].
+    The durations are the shortest, the centre and the longest of a movement, [s].
     """
 
     def __init__(

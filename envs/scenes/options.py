@@ -30,12 +30,6 @@ def draw_given(
     Sampled obstacles stand in the way of the given ends; with given obstacles, start and goal are only sampled clear of
     them.
 
-    Args:
-        options: See :func:`given_scenes`.
-        sampler: Sampler of the other parts.
-        generators: N random generators.
-        n_rows: Greatest number of obstacles in a scene.
-
     Raises:
         ValueError: A scene is impossible, with the reason.
     """

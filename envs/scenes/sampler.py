@@ -318,11 +318,6 @@ def sampler_of_family(
 ) -> SceneSampler:
     """Return a sampler of one family of scenes.
 
-    Args:
-        collision_model: Arm of a task.
-        distribution: Distribution of the scenes of the task.
-        family: Name of a built-in or registered family.
-
     Raises:
         ValueError: There is no such family, or it needs more obstacles than the task has.
     """

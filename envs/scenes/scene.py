@@ -197,13 +197,7 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
 
 
 def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:
-    """Return the clearance of an arm at rest from n obstacles and one far away, shape (N, n + 1), [m].
-
-    Args:
-        scenes: N scenes.
-        point: Positions of the hand, shape (N, D), [m].
-        collision_model: Arm, and the bodies that count.
-    """
+    """Return the clearance of an arm, its hand at (N, D), from n obstacles and one far away, shape (N, n + 1), [m]."""
     arm = collision_model.arm
     hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
     if collision_model.whole_arm:

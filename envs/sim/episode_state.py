@@ -123,14 +123,7 @@ class Episodes:
         return np.asarray(self.now.steps * self.timestep)
 
     def begin(self, rows: Int, joints: Float, hand: Float, clearance: Float) -> None:
-        """Start episodes at rest.
-
-        Args:
-            rows: Episodes, shape (n,).
-            joints: Joint angles, shape (n, J), [rad].
-            hand: Hand positions, shape (n, D), [m].
-            clearance: Clearance of the resting arms, shape (n,), [m].
-        """
+        """Start episodes (n,) at rest with joint angles (n, J), hand positions (n, D) and clearances (n,)."""
         now = self.now
         for part in now:
             part[rows] = 0

@@ -66,12 +66,7 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
 
 
 def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
-    """Load a model.
-
-    Args:
-        folder: Model folder.
-        env: Environment to train on; if not given, one environment of the model's own kind, and a small replay buffer,
-            as decisions need.
+    """Load a model to train it on `env`, or to decide, with an environment and a small replay buffer of its own.
 
     Raises:
         BadFileError: A file is missing, torn, foreign, or says something that is not allowed.

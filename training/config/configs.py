@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import tyro
 
@@ -179,32 +179,32 @@ class TrainConfig(Config):
         return Path(self.out) if self.out else usual
 
 
-def take_pretrained(config: Any) -> None:
-    """Set the agent of a configuration from `pretrained`.
+@dataclass(frozen=True, kw_only=True)
+class AgentConfig(Config):
+    """Configuration of a command for one agent."""
 
-    Raises:
-        ValueError: An agent is named twice, or no agent is shipped for the id.
-    """
-    if config.pretrained is None:
-        return
-    if config.agent not in (None, config.pretrained):
-        raise ValueError(f"the agent is named twice: {config.agent} and pretrained={config.pretrained}")
-    if config.pretrained not in SHIPPED_IDS:
-        raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {config.pretrained!r}")
-    object.__setattr__(config, "agent", config.pretrained)
+    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
+    """Run folder, model folder, or id of an environment with a shipped agent."""
+    pretrained: Annotated[str | None, PRETRAINED] = None
+    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
+
+    def _check(self) -> None:
+        if self.pretrained is None:
+            return
+        if self.agent not in (None, self.pretrained):
+            raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
+        if self.pretrained not in SHIPPED_IDS:
+            raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {self.pretrained!r}")
+        object.__setattr__(self, "agent", self.pretrained)
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(Config):
+class EvaluateConfig(AgentConfig):
     """Evaluate an agent and baselines on the same scenes.
 
     Example: viapoint evaluate runs/first --baselines straight planner --scenes test
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    """Run folder, model folder, or id of an environment with a shipped agent; None for baselines alone."""
-    pretrained: Annotated[str | None, PRETRAINED] = None
-    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     baselines: tuple[str, ...] = ("straight", "random", "planner")
     """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
     search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
@@ -225,7 +225,7 @@ class EvaluateConfig(Config):
     least: ClassVar = {"n_scenes": 1}
 
     def _check(self) -> None:
-        take_pretrained(self)
+        super()._check()
         check_baselines(self.baselines)
         if self.env is not None:
             check_env(self.env)
@@ -243,16 +243,12 @@ class EvaluateConfig(Config):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayConfig(Config):
+class PlayConfig(AgentConfig):
     """Record a video of an agent's movements.
 
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    pretrained: Annotated[str | None, PRETRAINED] = None
-    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -265,23 +261,19 @@ class PlayConfig(Config):
     least: ClassVar = {"n_scenes": 1, "checks": 0}
 
     def _check(self) -> None:
-        take_pretrained(self)
+        super()._check()
         if self.agent is None:
             raise ValueError("name an agent: run folder, model folder or id")
         check_file("video", self.video, ".mp4")
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveConfig(Config):
+class LiveConfig(AgentConfig):
     """Serve a page in the browser on which scenes are changed by hand and the agent decides anew.
 
     Example: viapoint live --pretrained viapoint/PandaObstacles-v0
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    pretrained: Annotated[str | None, PRETRAINED] = None
-    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
     env: Annotated[str | None, ENV] = None
     """Id of the environment; where no agent is shipped for it, the geometry search decides."""
     host: str = "127.0.0.1"
@@ -294,7 +286,7 @@ class LiveConfig(Config):
     least: ClassVar = {"port": 0, "seed": 0}
 
     def _check(self) -> None:
-        take_pretrained(self)
+        super()._check()
         if self.env is not None:
             check_env(self.env)
 

@@ -96,13 +96,7 @@ DRAWINGS = (
 
 
 def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
-    """Compute every row and draw every figure.
-
-    Args:
-        out: Folder for the figures.
-        agent: Run folder of the agent of row 12.
-        report_step: Function that is called with the name of each of the `STEPS` steps when it begins.
-    """
+    """Compute every row, row 12 with an agent, and draw every figure; each of the `STEPS` steps is reported."""
     claims: list[Claim] = []
     for row, compute in ROWS.items():
         report_step(f"row {row}")

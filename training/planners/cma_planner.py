@@ -88,13 +88,7 @@ class PlannedActions(NamedTuple):
 
 
 class Planner:
-    """Search for the action of the highest simulated reward.
-
-    Args:
-        simulation: Simulation of the environment.
-        seed: Seed of the random actions and of the evolution strategy.
-        budget: Budget of the search.
-    """
+    """Search for the action of the highest simulated reward."""
 
     name = "planner"
 

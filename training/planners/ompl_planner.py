@@ -71,13 +71,7 @@ class MotionPlannerBudget:
 
 
 class MotionPlanner:
-    """Planner of one movement in one scene.
-
-    Args:
-        task: Task of the environment.
-        seed: Seed of the library, which has one random generator for all its planners.
-        budget: Budget in each scene.
-    """
+    """Planner of one movement in one scene; the library has one random generator for all its planners."""
 
     def __init__(self, task: Task, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
         self._task, self._budget, self._ompl = task, budget or MotionPlannerBudget(), import_ompl()

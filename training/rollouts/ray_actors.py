@@ -80,13 +80,7 @@ class Host:
 
 
 class ActorHandle:
-    """Actor that runs one object, and its successors if it dies.
-
-    Args:
-        make: Function that makes the object in the actor.
-        title: Name of the actor in errors.
-        threads: Cores that the actor uses.
-    """
+    """Actor that runs the object that `make` returns on some threads, and its successors if it dies."""
 
     def __init__(self, make: Callable[[], Any], title: str, threads: int = 1) -> None:
         self._ray = import_ray()
@@ -145,11 +139,6 @@ class RecoveringActor:
     """Actor with a native batch, whose work is repeated by another actor if it dies; nothing is lost.
 
     The environments are deterministic: a snapshot of their state and the commands since then restore them exactly.
-
-    Args:
-        make: Function that makes the :class:`BatchServer` in the actor.
-        title: Name of the actor in errors.
-        threads: Cores that the actor uses.
     """
 
     def __init__(self, make: Callable[[], BatchServer], title: str, threads: int) -> None:

@@ -46,13 +46,7 @@ class _ActorVectorEnv(WorkerVectorEnv):
 
 
 class DummyServer:
-    """Environments of Gymnasium that an actor runs in a `DummyVecEnv`.
-
-    Args:
-        spec: Specification of the environment.
-        num_envs: Number of environments.
-        kwargs: Keyword arguments of the environment.
-    """
+    """Environments of Gymnasium that an actor runs in a `DummyVecEnv`."""
 
     def __init__(self, spec: EnvSpec, num_envs: int, kwargs: Mapping[str, Any]) -> None:
         self.env = DummyVecEnv([lambda: Monitor(gym.make(spec, **kwargs)) for _ in range(num_envs)])

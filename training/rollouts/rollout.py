@@ -38,13 +38,7 @@ class SimulationResults(NamedTuple):
 
 
 class SceneSimulation:
-    """Simulation of actions in given scenes, `num_envs` at a time.
-
-    Args:
-        env_id: Id of a registered environment.
-        num_envs: Greatest number of scenes that are simulated together.
-        **kwargs: Arguments of the environment.
-    """
+    """Simulation of actions in given scenes, `num_envs` at a time."""
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
         check_registered(env_id)
@@ -110,13 +104,7 @@ def repeated(values: Float, number: int) -> Float:
 
 
 class EpisodeSimulation(SceneSimulation):
-    """Simulation of whole episodes in given scenes, `num_envs` at a time.
-
-    Args:
-        env_id: Id of a registered environment with replanning.
-        num_envs: Greatest number of scenes that are simulated together.
-        **kwargs: Arguments of the environment.
-    """
+    """Simulation of whole episodes in given scenes, `num_envs` at a time."""
 
     @property
     def time_limit(self) -> float:

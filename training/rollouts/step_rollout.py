@@ -40,12 +40,6 @@ class StepAgentMethod:
 
     A decision is the first action; the others follow during the simulation. The decision time is that of one control
     step, of which a movement has about twenty.
-
-    Args:
-        name: Name in tables of results.
-        model: Model with `predict`.
-        env_id: Id of a step-wise environment.
-        env_kwargs: Arguments of the environment.
     """
 
     def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:

@@ -265,12 +265,7 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
-    """Check that a run is resumed with its own settings.
-
-    Args:
-        run: Run to resume.
-        config: Configuration of the call.
-        usual: Configuration with defaults for everything that the call does not name.
+    """Check that a run is resumed with its own settings; `usual` has defaults for all that the call does not name.
 
     Raises:
         BadFileError: Something was asked for that the run did not begin with.

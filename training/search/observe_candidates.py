@@ -38,11 +38,6 @@ def candidate_margins(observation: Mapping[str, NDArray[Any]], task: Task, numbe
     The margin of a plan is the minimum of its clearance and its reach margin, clipped to +- BOUND. Candidate k is the
     same action in every observation, see :func:`~viapoint.training.search.candidates.candidate_actions`; the first one
     is the zero action.
-
-    Args:
-        observation: Parts of B observations, shape (B, .) each.
-        task: Task of the environment.
-        number: Number of candidates.
     """
     actions = candidate_actions(task, number, replanning=is_replanning(observation))
     every = np.broadcast_to(actions, (len(observation["hand"]), *actions.shape))
@@ -52,13 +47,7 @@ def candidate_margins(observation: Mapping[str, NDArray[Any]], task: Task, numbe
 
 
 def with_candidates(observation: Mapping[str, NDArray[Any]], task: Task, number: int) -> Observation:
-    """Return observations with the margins of candidate plans; those that have them are returned as they are.
-
-    Args:
-        observation: Parts of one observation, shape (.,), or of a batch, shape (B, .).
-        task: Task of the environment.
-        number: Number of candidates.
-    """
+    """Return one observation or a batch with the margins of candidate plans; one that has them is returned as it is."""
     parts = {name: np.asarray(part) for name, part in observation.items()}
     if OBSERVED in parts:
         return parts

@@ -58,13 +58,7 @@ def modes(agent: Agent, env: Environment) -> list[Mode]:
 
 
 class RandomOrder:
-    """Best of some plans that are drawn at random for each scene and checked with computed geometry.
-
-    Args:
-        env_id: Id of the environment.
-        checks: Number of plans.
-        **kwargs: Arguments of the environment.
-    """
+    """Best of some plans that are drawn at random for each scene and checked with computed geometry."""
 
     def __init__(self, env_id: str, checks: int, **kwargs: Any) -> None:
         self.name, self._checks = f"random order, {checks} checks", checks
