@@ -145,7 +145,8 @@ def test_rounds_of_refinement_merge_where_only_the_hand_must_clear_and_plans_are
 
     monkeypatch.setattr(policy, "values", observed)
     assert policy.propose(observation)[0].shape[1] == 32 + 2 * 16
-    merged = checks > 0 and not simulation.task.whole_arm and not policy.replanning
+    one = simulation.task.action.n_via <= 1 and not simulation.task.whole_arm and not policy.replanning
+    merged = checks > 0 and one
     assert sizes == ([32, 32] if merged else [32, 16, 16])
 
 

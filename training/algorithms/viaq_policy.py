@@ -78,8 +78,8 @@ class ViaQPolicy(BasePolicy):
         instants: Instants of a plan at which the pair networks are evaluated. The default is 16 if every link must
             clear obstacles, and 32 if only the hand must.
         candidates: Number of Sobol points in the action space.
-        refinements: Rounds of candidates around the best ones. If plans of single movements are checked and only the
-            hand must clear obstacles, one round has the candidates of all.
+        refinements: Rounds of candidates around the best ones. If plans are checked, one round may have the candidates
+            of all, see :meth:`propose`.
         per_refinement: Candidates of each round.
         checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
     """
@@ -223,7 +223,8 @@ class ViaQPolicy(BasePolicy):
     def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
         """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero.
 
-        In single movements of which only the hand must clear obstacles, checks make up for a second round.
+        Checks make up for a second round of refinement where this was measured: in single movements with one via-point
+        of which only the hand must clear obstacles.
         """
         block = max(POSITIONS // (self.candidates * self.instants), 1)
         number = len(observation["hand"])
@@ -236,7 +237,7 @@ class ViaQPolicy(BasePolicy):
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
         actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
         coarse, rounds, size = self.checks > 0, self.refinements, self.per_refinement
-        if coarse and rounds and not (self.task.whole_arm or self.replanning):
+        if coarse and rounds and self.task.action.n_via <= 1 and not (self.task.whole_arm or self.replanning):
             rounds, size = 1, rounds * size
         values = self.values(observation, actions, scene, coarse=coarse)
         for each in range(rounds):
