@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.mjcf import joint_frames
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import dimension_of, has_shapes, obstacles_from_rows, shape_columns
+from viapoint.envs.geometry.rows import dimension_of, shape_columns
+from viapoint.envs.geometry.shapes import SHAPES
 
 SIDES = 8
 """Sides of a tube."""
-CORNERS = 24
-"""Corners of each rounded end of an obstacle in the plane."""
 LOW, TALL = 0.030, 0.060
 """Height of obstacles in the plane, [m]: below links that pass above them, and where links collide."""
 VISUAL_GROUPS = 3
@@ -80,41 +79,29 @@ def _tube_faces(number: int) -> NDArray[np.integer[Any]]:
 def obstacle_mesh(row: Float, floor: float, height: float) -> Triangles:
     """Return the mesh of an obstacle about its centre, in the plane a wall with its footprint.
 
+    In space, the vertices are the farthest points of the shape in the directions of a sphere's vertices. The mesh of a
+    half-space is that of its box.
+
     Args:
-        row: Row of either kind, see :mod:`viapoint.envs.geometry.rows`, [m].
+        row: Row with shapes, see :mod:`viapoint.envs.geometry.rows`, [m].
         floor: Height of the table of a planar arm, [m].
         height: Height up to which an obstacle of the plane rises, [m].
     """
-    if has_shapes(row):
-        return _shape_mesh(row, floor, height)
-    d = dimension_of(row)
-    half, radius = row[d : 2 * d], float(row[-1])
-    if d == 3:
-        return _capsule(half, radius)
-    angle = np.pi * np.linspace(-0.5, 0.5, CORNERS)
-    heading = np.arctan2(half[1], half[0])
-    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    length = float(np.hypot(*half))
-    arc = radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    ahead = np.array([length, 0.0])
-    outline = np.concatenate((ahead + arc, -ahead - arc)) @ turn.T
-    return _prism(outline, floor, height)
-
-
-def _shape_mesh(row: Float, floor: float, height: float) -> Triangles:
-    """Return the mesh of an obstacle of any shape; of a half-space, that of its box in space."""
-    (shape,) = obstacles_from_rows(row[None])
-    centre, half = shape_columns(row)[1], shape_columns(row)[3]
+    kind, centre, quaternion, half = shape_columns(row)
+    name = list(SHAPES)[int(kind)]
+    shape = SHAPES["box" if name == "half_space" else name].from_box(centre, quaternion, half)
     if dimension_of(row) == 2:
         (outline,) = shape.footprint()
         return _prism(outline - centre[:2], floor, height)
-    if shape.kind == "half_space":
-        points = half * trimesh.creation.box(extents=(2.0, 2.0, 2.0)).vertices @ shape.rotation.T
-    else:
-        directions = np.asarray(trimesh.creation.icosphere(subdivisions=4).vertices)
-        points = shape.support(directions @ shape.rotation) @ shape.rotation.T
-    hull = trimesh.convex.convex_hull(points)
-    return Triangles(np.asarray(hull.vertices), np.asarray(hull.faces))
+    directions, faces = _sphere()
+    return Triangles(shape.support(directions) @ shape.rotation.T, faces)
+
+
+@functools.cache
+def _sphere() -> tuple[Float, NDArray[np.integer[Any]]]:
+    """Return vertices and faces of a unit sphere with vertices on all axes."""
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    return np.round(mesh.vertices, 12), np.asarray(mesh.faces)
 
 
 def _prism(outline: Float, low: float, high: float) -> Triangles:
@@ -125,16 +112,6 @@ def _prism(outline: Float, low: float, high: float) -> Triangles:
     walls = np.stack((ring, following, following + n, ring, following + n, ring + n), axis=-1).reshape(-1, 3)
     fan = np.stack((np.zeros(n - 2, dtype=int), np.arange(1, n - 1), np.arange(2, n)), axis=-1) + 2 * n
     return Triangles(vertices, np.concatenate((walls, fan)))
-
-
-def _capsule(half: Float, radius: float) -> Triangles:
-    length = float(np.sqrt(half @ half))
-    if length < 1e-9:
-        mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    else:
-        mesh = trimesh.creation.capsule(height=2.0 * length, radius=radius)
-        mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], half / length))
-    return Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 class ArmDrawing:

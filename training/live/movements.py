@@ -136,8 +136,10 @@ def execute_replanning(
         wanted, restarted = goal_of(), False
         moved = norm(wanted - goal) > 0.0
         if env.terminated[0]:
+            if not moved or not info["is_success"][0]:  # without a success, the segment may be empty
+                return
             hand = segment.hand[-1]
-            if not moved or not info["is_success"][0] or norm(wanted - hand) < MIN_GOAL_DISTANCE:
+            if norm(wanted - hand) < MIN_GOAL_DISTANCE:
                 return
             offset += float(segment.time[-1])
             scene, done, restarted = scene._replace(start=hand, goal=wanted), 0, True

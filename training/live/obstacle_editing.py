@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.rows import (
     dimension_of,
+    obstacles_from_rows,
     quaternion_of_axes,
     rotation_axes,
     shape_columns,
     shape_rows,
 )
 from viapoint.envs.geometry.shape import TALL, Shape, quaternion_to
-from viapoint.envs.geometry.shapes import SHAPES
+from viapoint.envs.geometry.shapes import SHAPES, nearest_distance
 
 if TYPE_CHECKING:
     from viapoint.training.live.scene_file import LiveScene
@@ -27,6 +29,8 @@ LEAST_SIZE = 1e-4
 """Least size of an obstacle, [m]; a capsule of this half length has no direction."""
 STEEPEST = 89.99
 """Greatest elevation that is set, [deg]: the heading is kept."""
+STEP, PLACES = 0.02, 16
+"""Distance and number of the places to either side that are tried for a new obstacle, [m]."""
 
 
 class NewObstacle(NamedTuple):
@@ -56,7 +60,7 @@ KINDS: dict[int, dict[str, NewObstacle]] = {
 
 
 def new_obstacle(scene: LiveScene, kind: str) -> Float:
-    """Return the row of a new obstacle near the middle of the movement, where it touches neither end.
+    """Return the row of a new obstacle beside the middle of the movement, clear of the others if there is room.
 
     Args:
         scene: Scene.
@@ -67,8 +71,12 @@ def new_obstacle(scene: LiveScene, kind: str) -> Float:
     aside = np.zeros(3)
     aside[:2] = -line[1], line[0]
     aside /= max(float(np.linalg.norm(aside)), 1e-9)
-    centre = 0.5 * (scene.start + scene.goal) + 0.02 * aside[:d] * (1 + len(scene.obstacles))
     shape, half, across = KINDS[d][kind]
+    steps = np.outer(np.arange(1, PLACES) * STEP, aside[:d])
+    places = 0.5 * (scene.start + scene.goal) + np.stack((steps, -steps), axis=1).reshape(-1, d)
+    others = obstacles_from_rows(scene.obstacles)
+    free = nearest_distance(others, in_space(places), radius=max(half[:2]), most=1.0) > 0.0
+    centre = places[free.argmax()]
     turn = quaternion_to(aside if across else (0.0, 0.0, 1.0))
     (row,) = shape_rows(shape, centre[None], turn[None], np.array([half]))
     return np.asarray(row)

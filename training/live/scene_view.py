@@ -10,6 +10,8 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.rows import shape_columns
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.training.live.drawing import LOW, TALL, ArmDrawing, Triangles, obstacle_mesh, tube
 
 if TYPE_CHECKING:
@@ -29,6 +31,12 @@ RADII = {"start": 0.012, "goal": 0.017, "via": 0.012}
 """Radii of the handles, [m]."""
 OPACITY = 0.45
 """Opacity of a planar arm, which hides what is below it."""
+NARROW = 0.75
+"""Ratio of width and height of a window in which the first view just shows everything."""
+SEE_THROUGH = 0.45
+"""Opacity of large obstacles in space, which would hide the others."""
+LARGE = 0.16
+"""Greatest half length of obstacles in space that are not large, [m]."""
 GRID = 0.1
 """Distance of the lines on the table, [m]."""
 LEVEL = 0.0
@@ -77,13 +85,17 @@ class SceneView:
         self.look_at_everything()
 
     def look_at_everything(self) -> None:
-        """Move the camera to its first view: the plane from above, space from the side."""
+        """Move the camera to its first view: the plane from above, space from the side, farther in a narrow window."""
         camera = self._client.camera
+        away = max(1.0, NARROW / max(camera.aspect, 0.1))
         if self._planar:
             view: Any = ((-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0)
         else:
             view = ((1.75, -1.30, 1.25), (0.28, 0.0, 0.30), (0.0, 0.0, 1.0), 34.0)
-        camera.up_direction, camera.position, camera.look_at = view[2], view[0], view[1]
+        target = np.array(view[1])
+        camera.up_direction = view[2]
+        camera.position = target + away * (np.array(view[0]) - target)
+        camera.look_at = target  # after the position, which takes the target along
         camera.fov = float(np.radians(view[3]))
 
     def pose(self, joints: Float) -> None:
@@ -116,6 +128,9 @@ class SceneView:
                 self._make_draggable(handle, f"obstacle {i}")
                 handle.on_click(lambda _, row=i: self._on_select(row))
                 self._obstacles.append((handle, row[d:]))
+            kind, _, _, half = shape_columns(row)
+            handle.flat_shading = not list(SHAPES.values())[int(kind)].round
+            handle.opacity = SEE_THROUGH if not self._planar and half.max() > LARGE else None
             handle.position = in_space(row[:d], 0.0)
             self._obstacles[i] = handle, row[d:].copy()
 

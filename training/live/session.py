@@ -174,7 +174,8 @@ class Session:
         now = time.monotonic()
         if now >= self._next_fade:
             self._next_fade = now + FADE_EVERY
-            self._fading = self._view.fade()
+            with self._client.atomic():
+                self._fading = self._view.fade()
         if self._playing is not None and now >= self._next_picture:
             self._jobs.guard(self._advance)
         return self._playing is not None or self._fading
@@ -322,15 +323,16 @@ class Session:
         """Show the picked proposal, and say what it does."""
         plan = self.proposal
         assert plan is not None
-        with self._client.atomic():
-            self._view.show_plan(plan.path(), np.asarray(plan.plan.waypoints[1:-1]), clear=plan.clear)
-            if self._proposals[1:] == ():
-                self._view.show_proposals([])
-        self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
         remarks, limit = [self._origin], self._shared.own.limit(self._scene)
         if limit and self._shared.own.agent is not None:
             remarks.append(f"The agent was trained {limit}, so the geometry search decides.")
-        self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, " ".join(filter(None, remarks)))
+        remark = " ".join(filter(None, remarks))
+        with self._client.atomic():  # one message
+            self._view.show_plan(plan.path(), np.asarray(plan.plan.waypoints[1:-1]), clear=plan.clear)
+            if self._proposals[1:] == ():
+                self._view.show_proposals([])
+            self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
+            self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, remark)
 
     def _add_proposals(self, observation: Any, decision: Decision) -> None:
         """Show the other proposals, and the profile of the plan."""
@@ -346,11 +348,11 @@ class Session:
         plan, decision = self.proposal, self._decision
         if plan is None or decision is None:
             return
-        others = self._proposals
+        others, profile = self._proposals, plan_profile(self._task, self._fitted, plan.plan)
         with self._client.atomic():
             self._view.show_proposals([each.path() for each in others], [each.clear for each in others])
-        self._panels.show_proposals(self._proposals, self._picked, decision.maker, decision.seconds)
-        self._panels.show_plots(plan_profile(self._task, self._fitted, plan.plan), executed)
+            self._panels.show_proposals(others, self._picked, decision.maker, decision.seconds)
+            self._panels.show_plots(profile, executed)
 
     def _pick(self, index: int) -> None:
         """Show another proposal as the plan."""
