@@ -22,11 +22,11 @@ PANELS = (
     (LEFT, 150),
     (LEFT, 270),
     (LEFT, 550),
-    (RIGHT, 122),
-    (RIGHT, 170),
-    (RIGHT, 255),
-    (RIGHT, 365),
-    (RIGHT, 500),
+    (RIGHT, 125),
+    (RIGHT, 181),
+    (RIGHT, 278),
+    (RIGHT, 395),
+    (RIGHT, 545),
 )
 """Places of the numbers of the panels' parts, [pixels]."""
 ASIDE = 24
@@ -37,7 +37,7 @@ def main() -> None:
     """Write both pictures."""
     sys.path.append(str(ROOT / "tests" / "training"))
     import browser
-    from test_live_page import on_screen
+    from test_live_page import on_screen, steady
 
     browser.SIZE = SIZE
     window = browser.Browser()
@@ -55,7 +55,8 @@ def main() -> None:
         tab.run(
             "document.querySelectorAll('.mantine-Notification-closeButton').forEach(each => each.click())"
         )
-        time.sleep(2.0)
+        time.sleep(1.0)
+        browser.wait_for(lambda: steady(tab))
         via = on_screen(tab, session, session.proposal.plan.waypoints[1])
         obstacle = on_screen(tab, session, session.scene.obstacles[0, :3])
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")

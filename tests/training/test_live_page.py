@@ -130,9 +130,31 @@ def test_what_a_user_does_changes_the_plan(opened):
     settled(session)
     assert "touches the arm at the start" in tab.text(MESSAGE)
     assert session.proposal is None
-    tab.press("button", "Test")
+    tab.press("button", "Reset")
     wait_for(lambda: "plan" in tab.text(MESSAGE))
     assert session.proposal is not None
+    np.testing.assert_array_equal(session.scene.goal, goal)
+    np.testing.assert_array_equal(session.scene.obstacles[0, :2], obstacle)
+
+
+def test_scenes_that_the_agent_does_not_know_are_searched(opened):
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page("viapoint/PandaObstacles-v0"))
+    tab.press("button", "Benchmark")
+    wait_for(lambda: "MotionBenchMaker" in tab.text("body") and "geometry search decides" in tab.text("body"))
+    settled(session)
+    assert session.proposal.predicted is None
+    tab.press("button", "Random")
+    wait_for(lambda: "MotionBenchMaker" not in tab.text("body"))
+    settled(session)
+    assert session.proposal.predicted is not None
+    number = len(session.scene.obstacles)
+    tab.press("button", "cylinder")
+    wait_for(lambda: "trained without cylinder obstacles" in tab.text("body"))
+    settled(session)
+    assert session.scene.shapes[number:] == ["cylinder"]
+    tab.press("button", "Execute")
+    wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
 
 
 def test_tabs_are_independent_and_leave_nothing_behind(opened):

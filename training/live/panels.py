@@ -27,6 +27,8 @@ SHOWN_CLEARANCE = 0.25
 """Greatest clearance in the plot, [m]."""
 SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
 """Speeds of the playback."""
+RESET = "Reset"
+"""Name of the button that undoes all changes of a scene."""
 CHECKS = {"none": 0, "16": 16, "64": 64}
 """Numbers of proposals that the agent checks with computed geometry."""
 GOOD, BAD, PLAIN = "#1b7f4b", "#c4202b", "#4a4f58"
@@ -242,7 +244,7 @@ class Panels:
         self._execute.on_click(lambda _: actions.execute())
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/2 x")
         with gui.add_folder("Scene"):
-            kinds = gui.add_button_group("", facts.scene_kinds)
+            kinds = gui.add_button_group("", (*facts.scene_kinds, RESET))
             kinds.on_click(lambda event: actions.scene(event.target.value))
         with gui.add_folder("Decision"):
             self._build_decision_controls()

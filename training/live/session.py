@@ -24,7 +24,7 @@ from viapoint.training.live.movements import (
     plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
-from viapoint.training.live.panels import BAD, GOOD, PLAIN, Actions, Panels
+from viapoint.training.live.panels import BAD, GOOD, PLAIN, RESET, Actions, Panels
 from viapoint.training.live.playback import Playback, png
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
@@ -196,11 +196,12 @@ class Session:
     # Scenes
 
     def _draw_scene(self, kind: str) -> None:
-        self._take(*self._kinds[kind]())
+        self._take(*(self._drawn if kind == RESET else self._kinds[kind]()))
 
     def _take(self, scene: LiveScene, origin: str) -> None:
         """Go to another scene, of which a sentence says where it comes from."""
         self._by_hand = self._duration = self._selected = None
+        self._drawn = scene, origin
         self._set_scene(scene, changed=True, origin=origin)
         self._panels.show_selected("", None)
 
