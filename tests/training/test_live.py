@@ -5,6 +5,7 @@ import socket
 from pathlib import Path
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -27,7 +28,7 @@ from viapoint.training import load_agent
 from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
 from viapoint.training.config.checks import SHIPPED_IDS
-from viapoint.training.live import drawing, movements, obstacle_editing
+from viapoint.training.live import drawing, movements, obstacle_editing, playback
 from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
 from viapoint.training.live.scene_draws import (
@@ -179,6 +180,17 @@ def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevati
     for name in ("half-length", *values):
         row = obstacle_editing.resized(row, name, values[name])
     assert obstacle_editing.sizes_of(row) == pytest.approx(values, abs=1e-6)
+
+
+def test_films_have_every_frame(tmp_path):
+    frames = [np.full((48, 64, 3), 40 * k, dtype=np.uint8) for k in range(5)]
+    path = tmp_path / "film.mp4"
+    path.write_bytes(playback.mp4(frames, 25.0))
+    number, seconds = imageio_ffmpeg.count_frames_and_secs(path)
+    assert number == 5
+    assert seconds == pytest.approx(0.2, abs=0.05)
+    with pytest.raises(ValueError, match="at least one frame"):
+        playback.mp4([], 25.0)
 
 
 @pytest.mark.parametrize(

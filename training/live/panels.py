@@ -187,8 +187,8 @@ class Panels:
                 "<button onclick=\"const code=document.getElementById('viapoint-code').textContent;"
                 "const done=()=>{this.textContent='Copied'};"
                 "navigator.clipboard?navigator.clipboard.writeText(code).then(done):done()"
-                '" style="padding:0.5em 1.2em;border:0;border-radius:6px;background:#2f6fb3;color:white;'
-                'cursor:pointer">Copy</button>'
+                '" style="padding:0.5em 1.2em;margin-bottom:0.8em;border:0;border-radius:6px;background:#2f6fb3;'
+                'color:white;cursor:pointer">Copy</button>'
             )
             self._gui.add_button("Close").on_click(lambda _: modal.close())
 
