@@ -68,14 +68,21 @@ class Playback:
                 self._show(segment, shown - 1)
                 yield min(TICK, max((float(segment.time[shown - 1]) - elapsed) / speed, 0.0))
 
-    def film(self, segments: Iterator[Segment], speed: float) -> bytes:
-        """Return a movement as an MP4 file; the browser renders it in the present view."""
+    def film(self, segments: Iterator[Segment], speed: float, tell: Callable[[str], None]) -> bytes:
+        """Return a movement as an MP4 file; the browser renders it in the present view.
+
+        Args:
+            segments: Movement.
+            speed: Speed relative to real time.
+            tell: Function that shows the user how far it is.
+        """
         frames, step, due = list[Any](), speed / FILM_FPS, 0.0
         for segment in self._each(segments):
             for row in np.flatnonzero(segment.time >= due):
                 if segment.time[row] >= due:
                     due += step
                     self._show(segment, int(row))
+                    tell(f"Rendering the film: {segment.time[row]:.2f} s of the movement so far.")
                     frames.append(self.photograph("jpeg"))
         frames += frames[-1:] * round(LINGER * FILM_FPS)
         return mp4(frames, FILM_FPS)

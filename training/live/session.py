@@ -24,7 +24,7 @@ from viapoint.training.live.movements import (
     plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
-from viapoint.training.live.panels import BAD, GOOD, PLAIN, RESET, Actions, Panels
+from viapoint.training.live.panels import BAD, GOOD, RESET, Actions, Panels
 from viapoint.training.live.playback import Playback, png
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
@@ -451,9 +451,8 @@ class Session:
         if self.proposal is None:
             raise ValueError("there is no plan to film: move what stands in the way first")
         self._stop()
-        self._panels.tell("Rendering the film.", PLAIN)
-        self._client.flush()
-        self._download("viapoint.mp4", self._playback.film(self._segments(), self._panels.speed))
+        film = self._playback.film(self._segments(), self._panels.speed, self._panels.tell)
+        self._download("viapoint.mp4", film)
         self._finish()
 
     def _download(self, name: str, content: bytes) -> None:
