@@ -31,7 +31,7 @@ Number: TypeAlias = Any
 SHORTEST = 1e-50
 """Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
-_STEPS = 5
+STEPS = 5
 """Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
 
 _FLOOR = 1e-5
@@ -88,7 +88,7 @@ def _dot(x: Array, y: Array) -> Array:
     return functools.reduce(operator.add, x * y)
 
 
-def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> Number:
+def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS, steps: int = STEPS) -> Number:
     """Return the root of F (Eq. 1) in [0, 1/2], for E from the nearer end, so that a <= b / 2.
 
     Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
@@ -100,7 +100,7 @@ def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS) -> N
     bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
     t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
     t = f.minimum(f.maximum(t, 0.0), 0.5)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         value, slope, _ = _residual(t, a, b, c)
         t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
     return t

@@ -162,10 +162,11 @@ class PairMinimum(nn.Module):
         columns = [described[:, i] for i in range(described.shape[1])]
         distance = self.geometry.gap(apart, axis, columns, poses)
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
-        flat = (distance <= (nearest + NEAR)[:, None]).flatten().nonzero()[:, 0]
         bodies, rows, _, instants = distance.shape
-        of_body, pose = flat // (plans * instants), flat % (plans * instants)
-        plan = pose // instants
+        near = (distance <= (nearest + NEAR)[:, None]).flatten(0, 1)
+        of_body, plan, instant = near.nonzero(as_tuple=True)
+        pose = plan * instants + instant
+        flat = of_body * (plans * instants) + pose
         body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(flat), of_body)
         along = None if axis is None else body * (plans * instants) + pose
         features = self.geometry.features(

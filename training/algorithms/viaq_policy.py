@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import is_vectorized_observation
 from torch import Tensor
 
 from viapoint.envs.actions.via_points import frame
@@ -170,6 +171,8 @@ class ViaQPolicy(BasePolicy):
         actions: Numbers,
         scene: SceneInputs | None = None,
         shares: Numbers | None = None,
+        *,
+        coarse: bool = False,
     ) -> PlanInputs:
         """Return the critic's inputs for H actions in each of B scenes.
 
@@ -178,9 +181,10 @@ class ViaQPolicy(BasePolicy):
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
             shares: Fractions of the duration at which the pair networks are evaluated; those of training if not given.
+            coarse: See :func:`plan_movements`.
         """
         shares = self.shares if shares is None else shares
-        moves = plan_movements(observation, actions, self.task, shares)
+        moves = plan_movements(observation, actions, self.task, shares, coarse=coarse)
         relative = moves.duration / self.task.action.centre_duration
         spare = np.zeros_like(relative)
         if self.replanning:
@@ -214,7 +218,7 @@ class ViaQPolicy(BasePolicy):
         """
         fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
         shares = self.shares[::fewer] if coarse else self.shares
-        inputs = self.inputs(observation, actions, scene, shares)
+        inputs = self.inputs(observation, actions, scene, shares, coarse=coarse)
         values: Numbers = self.critic.merit(self.critic(inputs, near=coarse)).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
@@ -325,9 +329,14 @@ class ViaQPolicy(BasePolicy):
             ValueError: The observation is not a dict with the parts of the observation space, is not finite, or the
                 hand is at the goal already.
         """
-        if not isinstance(observation, tuple):
-            self._check_parts(observation)
-        return super().predict(observation, state, *args, **kwargs)
+        if isinstance(observation, tuple):
+            return super().predict(cast(Any, observation), state, *args, **kwargs)  # it explains the mistake
+        self._check_parts(observation)
+        parts: Any = self.observation_space
+        several = is_vectorized_observation(observation, parts)
+        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        actions = np.clip(np.asarray(self.decide(batch), np.float32), -1.0, 1.0)
+        return (actions if several else actions[0]), state
 
     def _check_parts(self, observation: Any) -> None:
         space: Any = self.observation_space

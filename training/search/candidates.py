@@ -32,8 +32,15 @@ def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     size, at = task.action.size, task.action.n_via * task.action.dimension
     if replanning or not at:
         return sobol_actions(number, size)
-    actions = np.insert(sobol_actions(number, size - 1), at, np.float32(best_duration(task)), axis=1)
+    return _with_duration(number, size, at, best_duration(task))
+
+
+@functools.cache
+def _with_duration(number: int, size: int, at: int, duration: float) -> Single:
+    """Return Sobol points in all components but one, which is the duration."""
+    actions: Single = np.insert(sobol_actions(number, size - 1), at, np.float32(duration), axis=1)
     actions[0] = 0.0
+    actions.flags.writeable = False
     return actions
 
 
