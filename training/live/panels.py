@@ -338,7 +338,9 @@ def _table(
         for i, row in enumerate(rows)
     )
     return (
-        '<div style="padding:0.2em 0.7em"><table style="width:100%;border-collapse:collapse;font-size:0.8em;'
+        "<style>.viapoint-table tbody tr:hover{background:#fbf8b4}</style>"
+        '<div style="padding:0.2em 0.7em"><table class="viapoint-table" '
+        'style="width:100%;border-collapse:collapse;font-size:0.8em;'
         f'line-height:1.25"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     )
 

@@ -27,6 +27,9 @@ FADE_STEPS = 8
 """Steps in which an old plan fades."""
 PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032
 """Radii of the plan, of other proposals, and of the executed path, [m]."""
+SHRUNK = 0.05
+"""Factor of the vertices of proposals, which their nodes undo. The client outlines what the pointer is over; it merges
+the vertices of meshes with radii above 0.1 in cubes of 0.01, which leaves gaps in the outline of a thin tube."""
 RADII = {"start": 0.012, "goal": 0.017, "via": 0.012}
 """Radii of the handles, [m]."""
 OPACITY = 0.45
@@ -159,15 +162,19 @@ class SceneView:
             self._paths["plan"] = self._add_mesh(f"/plans/{self._count}", mesh, _rgb(colour), shadow=False)
 
     def show_proposals(self, paths: Sequence[Float], clear: Sequence[bool] = ()) -> None:
-        """Show proposals as thin lines that can be clicked, those that touch something in red."""
+        """Show proposals as thin lines that can be clicked, those that touch something in red.
+
+        The client outlines the line under the pointer.
+        """
         for handle in self._thin[len(paths) :]:
             handle.remove()
         del self._thin[len(paths) :]
         for i, (path, free) in enumerate(zip(paths, clear, strict=False)):
-            mesh = tube(in_space(path, LEVEL - 0.002), PROPOSAL)
+            mesh = tube(SHRUNK * in_space(path, LEVEL - 0.002), SHRUNK * PROPOSAL)
             colour = _rgb(_lighter(PALETTE.plan if free else PALETTE.contact))
             if i == len(self._thin):
                 handle = self._add_mesh(f"/proposals/{i}", mesh, colour, opacity=0.8, shadow=False)
+                handle.scale = 1.0 / SHRUNK
                 handle.on_click(lambda _, index=i: self._on_pick(index))
                 self._thin.append(handle)
             else:
