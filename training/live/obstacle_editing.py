@@ -9,6 +9,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
 from viapoint.envs.geometry.rows import (
     dimension_of,
     obstacles_from_rows,
@@ -29,6 +30,8 @@ LEAST_SIZE = 1e-4
 """Least size of an obstacle, [m]; a capsule of this half length has no direction."""
 STEEPEST = 89.99
 """Greatest elevation that is set, [deg]: the heading is kept."""
+WALL = 0.15
+"""Distance of a new wall from the movement, [m]."""
 STEP, PLACES = 0.02, 16
 """Distance and number of the places to either side that are tried for a new obstacle, [m]."""
 
@@ -48,12 +51,14 @@ KINDS: dict[int, dict[str, NewObstacle]] = {
         "post": NewObstacle("capsule", (0.025, 0.025, 0.025)),
         "bar": NewObstacle("capsule", (0.025, 0.025, 0.085), across=True),
         "box": NewObstacle("box", (0.03, 0.03, TALL)),
+        "wall": NewObstacle("half_space", (EXTENT, EXTENT, EXTENT)),
     },
     3: {
         "sphere": NewObstacle("capsule", (0.035, 0.035, 0.035)),
         "bar": NewObstacle("capsule", (0.035, 0.035, 0.115)),
         "box": NewObstacle("box", (0.03, 0.03, 0.03)),
         "cylinder": NewObstacle("cylinder", (0.03, 0.03, 0.06)),
+        "wall": NewObstacle("half_space", (EXTENT, EXTENT, EXTENT)),
     },
 }
 """Kinds of new obstacles by the dimension of the arm's space."""
@@ -61,6 +66,8 @@ KINDS: dict[int, dict[str, NewObstacle]] = {
 
 def new_obstacle(scene: LiveScene, kind: str) -> Float:
     """Return the row of a new obstacle beside the middle of the movement, clear of the others if there is room.
+
+    A half-space is a wall along the movement, on the side away from the base of the arm.
 
     Args:
         scene: Scene.
@@ -72,6 +79,12 @@ def new_obstacle(scene: LiveScene, kind: str) -> Float:
     aside[:2] = -line[1], line[0]
     aside /= max(float(np.linalg.norm(aside)), 1e-9)
     shape, half, across = KINDS[d][kind]
+    if shape == HalfSpace.kind:
+        side = aside if aside[:d] @ (scene.start + scene.goal) >= 0.0 else -aside
+        wall = HalfSpace.facing(-side, in_space(0.5 * (scene.start + scene.goal)) + WALL * side)
+        centre, sizes = wall.box()
+        (row,) = shape_rows(shape, centre[None, :d], wall.quaternion[None], sizes[None])
+        return np.asarray(row)
     steps = np.outer(np.arange(1, PLACES) * STEP, aside[:d])
     places = 0.5 * (scene.start + scene.goal) + np.stack((steps, -steps), axis=1).reshape(-1, d)
     others = obstacles_from_rows(scene.obstacles)
@@ -94,7 +107,7 @@ def sizes_of(row: Float) -> dict[str, float]:
         names = BOX_SIZES if len(value) == len(BOX_SIZES) else (name.replace("_", "-"),)
         sizes |= dict(zip(names, map(float, value), strict=True))
     first, _, third = rotation_axes(shape_columns(row).quaternion)
-    if dimension_of(row) == 2 and shape_columns(row).half[2] == TALL:
+    if sizes and dimension_of(row) == 2 and shape_columns(row).half[2] == TALL:
         sizes.popitem()
     if not shape.round:
         sizes["heading"] = (_heading(first) + 90.0) % 180.0 - 90.0
