@@ -9,6 +9,7 @@ import logging
 import socket
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any, Self
 
@@ -73,6 +74,8 @@ class LivePage:
         check_registered(env)
         self._shared = Shared(env, loaded, model_file=model_file, seed=seed, env_kwargs=env_kwargs)
         self._sessions: dict[int, Session] = {}
+        # A tab may be closed while its session still draws.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._server = _serve(host, port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         _light(self._server.scene)
