@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from viapoint.envs import Box, Cylinder, Shape
 from viapoint.envs.arms import PANDA, PANDA_FINE
@@ -155,8 +156,7 @@ def obstacle(primitive: Mapping[str, Any], pose: Mapping[str, Any], frame: Mappi
 
 def matrix(orientation: Any) -> Any:
     """Return the rotation matrix of a quaternion x, y, z, w."""
-    x, y, z, w = orientation
-    return Box((1.0, 1.0, 1.0), quaternion=(w, x, y, z)).rotation
+    return Rotation.from_quat(orientation).as_matrix()
 
 
 def rounded(value: Any) -> Any:

@@ -12,6 +12,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
 from viapoint.envs.geometry.rows import (
     dimension_of,
+    obstacle_rows,
     obstacles_from_rows,
     quaternion_of_axes,
     rotation_axes,
@@ -74,19 +75,17 @@ def new_obstacle(scene: LiveScene, kind: str) -> Float:
         kind: Key of :data:`KINDS` in the dimension of the scene.
     """
     d = len(scene.start)
-    line = scene.goal - scene.start
+    line, middle = scene.goal - scene.start, 0.5 * (scene.start + scene.goal)
     aside = np.zeros(3)
     aside[:2] = -line[1], line[0]
     aside /= max(float(np.linalg.norm(aside)), 1e-9)
     shape, half, across = KINDS[d][kind]
     if shape == HalfSpace.kind:
-        side = aside if aside[:d] @ (scene.start + scene.goal) >= 0.0 else -aside
-        wall = HalfSpace.facing(-side, in_space(0.5 * (scene.start + scene.goal)) + WALL * side)
-        centre, sizes = wall.box()
-        (row,) = shape_rows(shape, centre[None, :d], wall.quaternion[None], sizes[None])
-        return np.asarray(row)
+        side = aside if aside[:d] @ middle >= 0.0 else -aside
+        wall = HalfSpace.facing(-side, in_space(middle) + WALL * side)
+        return np.asarray(obstacle_rows([wall], d, tuple(SHAPES))[0])
     steps = np.outer(np.arange(1, PLACES) * STEP, aside[:d])
-    places = 0.5 * (scene.start + scene.goal) + np.stack((steps, -steps), axis=1).reshape(-1, d)
+    places = middle + np.stack((steps, -steps), axis=1).reshape(-1, d)
     others = obstacles_from_rows(scene.obstacles)
     free = nearest_distance(others, in_space(places), radius=max(half[:2]), most=1.0) > 0.0
     centre = places[free.argmax()]

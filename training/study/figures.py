@@ -155,7 +155,7 @@ def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:
             first = next(iter(numbers["sets"]))
             here = [each for each in rows if first in each["sets"]]
             checks = [max(each["checks"], 0.5) for each in here]
-            rates = [float(np.mean(each["sets"][first]["each"])) for each in here]
+            rates = [each["sets"][first]["success"][0] for each in here]
             failures = [max(100.0 * (1.0 - rate), LEAST_FAILURE) for rate in rates]
             jerk = [each["sets"][first].get("jerk_ratio") or np.nan for each in here]
             times = [1e3 * (each["decision_time"] or np.nan) for each in here]

@@ -204,7 +204,7 @@ def interval(values: Sequence[float]) -> str:
 
 
 def spread(measured: Numbers) -> str:
-    """Return the success in a set in percent, with the seeds of the least and of the greatest success."""
+    """Return the success in a set in percent, with the least and the greatest of its seeds."""
     each, estimate = measured["each"], percent(measured["success"][0])
     return estimate if len(each) == 1 else f"{estimate} ({100.0 * min(each):.1f}-{100.0 * max(each):.1f})"
 
