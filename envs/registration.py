@@ -19,7 +19,8 @@ TASKS: dict[str, dict[str, Any]] = {
     "viapoint/PandaObstacles-v0": {
         "arm": "panda",
         "whole_arm": True,
-        "n_obstacles": (1, 6),
+        "n_obstacles": (1, 8),
+        "shapes": ("capsule", "box"),
         "duration_range": (1.0, 2.0),
     },
 }

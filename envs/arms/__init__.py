@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from viapoint.envs.arms.base import Arm
-from viapoint.envs.arms.panda import PANDA, PANDA_FINE
+from viapoint.envs.arms.panda import PANDA
 from viapoint.envs.arms.planar import ADULT
 
-ARMS: dict[str, Arm] = {arm.name: arm for arm in (ADULT, PANDA, PANDA_FINE)}
+ARMS: dict[str, Arm] = {arm.name: arm for arm in (ADULT, PANDA)}
 """Registered arms by name."""
 
 REGISTER_HINT = "viapoint.envs.register_arm registers an arm of your own under its name"
@@ -58,4 +58,4 @@ def _check_arm(arm: Any) -> None:
         )
 
 
-__all__ = ["ADULT", "ARMS", "PANDA", "PANDA_FINE", "Arm", "arm_of", "register_arm"]
+__all__ = ["ADULT", "ARMS", "PANDA", "Arm", "arm_of", "register_arm"]

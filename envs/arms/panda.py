@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from viapoint.envs.arms.serial_arm import SerialArm, serial_arm
+from viapoint.envs.arms.serial_arm import serial_arm
 from viapoint.envs.common.arrays import clamp, cosine_and_sine, dot
 from viapoint.primitives.array_api import Array, namespace_of
 
@@ -139,20 +139,16 @@ def _shoulder(lean: Array, rise: Array, height: Array) -> tuple[Array, Array, Ar
     return (up * rise + ahead * lean) * share, (ahead * rise - up * lean) * share, ahead
 
 
-def _panda(model_file: str, name: str, may_touch_itself: bool) -> SerialArm:
-    return serial_arm(
-        model_file,
-        name=name,
-        joint_names=tuple(f"joint{number}" for number in range(1, 8)),
-        hand_site="hand",
-        ik=PandaInverseKinematics(),
-        workspace=((0.36, -0.36, 0.06), (0.64, 0.36, 0.50)),
-        hand_gains=(10000.0, 300.0),
-        may_touch_itself=may_touch_itself,
-    )
+PANDA = serial_arm(
+    "panda.xml",
+    name="panda",
+    joint_names=tuple(f"joint{number}" for number in range(1, 8)),
+    hand_site="hand",
+    ik=PandaInverseKinematics(),
+    workspace=((0.36, -0.36, 0.06), (0.64, 0.36, 0.50)),
+    hand_gains=(10000.0, 300.0),
+)
+"""Franka Emika Panda on a table, its base at the origin, x forwards and z up.
 
-
-PANDA = _panda("panda.xml", "panda", may_touch_itself=False)
-"""Franka Emika Panda on a table, its base at the origin, x forwards and z up."""
-PANDA_FINE = _panda("panda_fine.xml", "panda-fine", may_touch_itself=True)
-"""Panda whose capsules contain Franka's collision geometry."""
+Its capsules contain Franka's collision geometry.
+"""
