@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from viapoint.envs import load_arm
-from viapoint.envs.arms import ADULT, PANDA, PANDA_FINE, Arm
+from viapoint.envs.arms import ADULT, PANDA, Arm
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.serial_arm import SerialArm
 from viapoint.envs.common.types import Bool, Float
@@ -61,7 +61,7 @@ def arms() -> list[Arm]:
     )  # fmt: skip
     package = find_spec("gymnasium_robotics")
     if package is None or not package.submodule_search_locations:
-        return [ADULT, PANDA, PANDA_FINE, ur5e]
+        return [ADULT, PANDA, ur5e]
     names = (
         "shoulder_pan",
         "shoulder_lift",
@@ -77,7 +77,7 @@ def arms() -> list[Arm]:
         joint_range=[(-1.6, 1.6), (-1.2, 1.5), (-3.1, 3.1), (-2.2, 2.2), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)],
         torque_limit=(33.8, 131.7, 76.9, 66.1, 29.3, 25.7, 7.3), home=(0.0, -0.5, 0.0, 1.3, 0.0, 0.77, 0.0),
     )  # fmt: skip
-    return [ADULT, PANDA, PANDA_FINE, ur5e, fetch]
+    return [ADULT, PANDA, ur5e, fetch]
 
 
 def random_poses(arm: Arm, number: int, generator: np.random.Generator) -> tuple[Float, Float, Float]:

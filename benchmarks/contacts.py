@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs import SHAPES
-from viapoint.envs.arms import ADULT, ARMS, PANDA
+from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.rows import shape_rows
 from viapoint.envs.scenes.scene import Scenes, rest_clearance
@@ -24,7 +24,6 @@ BATCH = 2000
 KINDS = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 MODELS = {
     "panda": CollisionModel(PANDA, whole_arm=True),
-    "panda-fine": CollisionModel(ARMS["panda-fine"], whole_arm=True),
     "planar": CollisionModel(ADULT, whole_arm=True),
     "planar hand": CollisionModel(ADULT, whole_arm=False),
 }

@@ -1,20 +1,23 @@
-"""Fit the capsules of the arm `panda-fine` to Franka's collision geometry, and measure how well they contain it.
+"""Fit the capsules of the Panda to Franka's collision geometry, and measure how well they contain it.
 
     git clone https://github.com/frankaemika/franka_ros
     python benchmarks/panda_collision.py franka_ros/franka_description/meshes/collision --out docs/panda-collision.json
 
 The folder holds Franka's collision meshes (Apache-2.0): link0.stl to link7.stl and hand.stl, all of them convex. The
 fingers are boxes of the same description; their sizes stand below. They are closed, as in the environments.
-`--write` writes `envs/assets/panda_fine.xml` anew: `panda.xml` with other geoms. `--spheres FILE` also measures the
-spheres of a URDF of the Panda, such as VAMP's (github.com/KavrakiLab/vamp, Apache-2.0), as if they were the geometry.
+`--write` replaces the geoms of `envs/assets/panda.xml`. `--spheres FILE` also measures the spheres of a URDF of the
+Panda, such as VAMP's (github.com/KavrakiLab/vamp, Apache-2.0), as if they were the geometry.
 
 Columns, for each link and all that moves with it, the base first:
 
     outside    greatest distance of a point of the geometry from the capsules, [mm]; 0 if they contain it
     excess     greatest distance of a point of the capsules from the geometry, [mm]
 
-Both are measured at points on the surfaces. The excess that the fit prints is exact, but that of single capsules: parts
-of the same link may fill it.
+    forearm_and_flange   least distances within reach of geometry and capsules of forearm and flange, which are not
+                         compared, [mm], and share of the positions in which their capsules touch, [%]
+
+Outside and excess are measured at points on the surfaces. The excess that the fit prints is exact, but that of single
+capsules: parts of the same link may fill it.
 """
 
 from __future__ import annotations
@@ -28,11 +31,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import coal
 import numpy as np
 
 from viapoint.envs import ConvexMesh
 from viapoint.envs.arm_import.capsule_fit import cover_points, cut_polytope
-from viapoint.envs.arms import PANDA, PANDA_FINE
+from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.serial_arm import LinkCapsule, serial_arm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.convex_mesh import hull_triangles
@@ -64,23 +68,29 @@ FLANGE = 0.107
 """Height of the gripper's frame in that of link 7, [m]."""
 LINKS = ("link0", "link1", "link2", "link3", "link4", "link5", "link6", "link7")
 """Names of links and meshes, the base first."""
-SELF_BITS, TABLE_BIT, FIRST_OFF_TABLE = 4, 4, 3
-"""First contact bit of links among themselves, bit of the table, and first joint whose link must not touch it."""
+BODIES = (*LINKS, "gripper")
+"""Names of bodies in the model file; the gripper moves with link 7."""
+SELF_BITS, TABLE_BIT = 4, 4
+"""First contact bit of bodies among themselves, and bit of the table."""
+OFF_TABLE, DARK = BODIES[4:], BODIES[6:]
+"""Bodies that must not touch the table, and those with the darker colour."""
+FOREARM, FLANGE_LINK = "link5", "link7"
+"""Links that are not compared although their capsules touch within reach; :func:`forearm_and_hand` measures why not."""
 HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
-"""Configuration in which links that touch may touch anywhere, [rad]."""
+"""Configuration in which bodies that touch may touch anywhere, [rad]."""
 SAMPLES = 100_000
-"""Random configurations; links that touch in none of them are not compared."""
-
-FIRST_DARK = 5
-"""First joint whose link has the darker colour."""
+"""Random configurations; bodies that touch in none of them are not compared."""
+REACH_POSITIONS, NEAREST = 300_000, 3000
+"""Random positions of the hand, of which those within reach are checked, and those whose meshes are compared."""
 COMMENT = """\
   Collision: capsules that contain Franka's collision meshes and the boxes of the closed fingers (franka_description of
   franka_ros, Apache-2.0), written by benchmarks/panda_collision.py. Joints are frictionless, as an inner torque loop
   makes them.
 
   The base stands at the origin, x points forwards, z up, and the table top is the plane z = 0.
-  Contact bits: 1 links against obstacles, 4 links against the table, 16 the base and twice as much for each link after
-  it, against the links that must not touch it. Neighbours and links that never touch are not compared.
+  Contact bits: 1 links against obstacles, 4 links against the table, 16 the base and twice as much for each body after
+  it, against the bodies that must not touch it. Neighbours, bodies that never touch, and forearm and flange, whose
+  capsules overlap where the real ones are apart, are not compared.
 -->"""
 """Words on collisions in the model file."""
 
@@ -160,8 +170,8 @@ def fit(folder: Path) -> dict[str, list[LinkCapsule]]:
     return found
 
 
-def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> set[tuple[int, int]]:
-    """Return the pairs of links, by their joints, that need not be compared: they touch at HOME, or never.
+def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> set[tuple[str, str]]:
+    """Return the pairs of bodies, the one nearer to the base first, that need not be compared.
 
     Neighbours, which may touch, are not among them: MuJoCo leaves them out.
     """
@@ -169,33 +179,32 @@ def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> set[tuple[int, int]
         model_text(capsules, set()), name="all", joint_names=PANDA.joint_names, hand_site="hand", ik=PANDA.ik,
         workspace=PANDA.workspace,
     )  # fmt: skip
-    every = (*arm.shape, *arm.base)
+    names = [each.name.split("_")[0] for each in (*arm.shape, *arm.base)]
     joints = np.random.default_rng(0).uniform(*np.array(arm.joint_range).T, (SAMPLES, 7))
-    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    pairs: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for i, j in arm.self_pairs:
-        one, other = sorted((every[i].joint, every[j].joint))
+        one, other = sorted((names[i], names[j]), key=BODIES.index)
         pairs.setdefault((one, other), []).append((i, j))
-    skipped = set()
-    for links, some in pairs.items():
+    skipped = {(FOREARM, FLANGE_LINK)}
+    for bodies, some in pairs.items():
         pair = replace(arm, self_pairs=tuple(some), off_table=())
         if pair.self_clearance(np.array(HOME)) < 0.0 or (pair.self_clearance(joints) > 0.0).all():
-            skipped.add(links)
+            skipped.add(bodies)
     return skipped
 
 
-def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[int, int]]) -> str:
-    """Return `panda.xml` with other capsules; all links collide but neighbours and some pairs.
+def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[str, str]]) -> str:
+    """Return `panda.xml` with other capsules; all bodies collide but neighbours and some pairs.
 
-    Link k, counted from the base, has the contact bit SELF_BITS + k, and collides with the bits of the links before it
+    Body k, counted from the base, has the contact bit SELF_BITS + k, and collides with the bits of the bodies before it
     that it must not touch.
 
     Args:
         capsules: Capsules of each body, in its frame.
-        skipped: Pairs of links, by their joints.
+        skipped: Pairs of bodies.
     """
     whole = (ASSETS / "panda.xml").read_text(encoding="utf-8")
     whole = re.sub(r"  Collision: .*?-->", COMMENT, whole, flags=re.DOTALL)
-    whole = re.sub(r'    <default class="near">.*\n  </default>', "  </default>", whole, flags=re.DOTALL)
     lines, body = [], "link0"
     for line in whole.splitlines():
         name = re.search(r'<body name="(\w+)"', line)
@@ -208,13 +217,14 @@ def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[int, i
     return "\n".join(lines) + "\n"
 
 
-def geom_lines(body: str, capsules: list[LinkCapsule], skipped: set[tuple[int, int]]) -> list[str]:
+def geom_lines(body: str, capsules: list[LinkCapsule], skipped: set[tuple[str, str]]) -> list[str]:
     """Return the geoms of a body."""
-    joint = 6 if body == "gripper" else LINKS.index(body) - 1
-    contype = 1 << (SELF_BITS + joint + 1) | (joint >= 0) | (TABLE_BIT if joint >= FIRST_OFF_TABLE else 0)
-    others = [other for other in range(-1, joint - 1) if (other, joint) not in skipped]
-    conaffinity = sum(1 << (SELF_BITS + other + 1) for other in others)
-    shown = ' rgba="0.66 0.71 0.78 1"' if joint >= FIRST_DARK else ""
+    place = BODIES.index(body)
+    contype = 1 << (SELF_BITS + place) | (place > 0) | (TABLE_BIT if body in OFF_TABLE else 0)
+    neighbours = 2 if body == "gripper" else 1  # the gripper is fixed to link 7
+    others = [other for other in range(max(place - neighbours, 0)) if (BODIES[other], body) not in skipped]
+    conaffinity = sum(1 << (SELF_BITS + other) for other in others)
+    shown = ' rgba="0.66 0.71 0.78 1"' if body in DARK else ""
     bits = f'contype="{contype}" conaffinity="{conaffinity}"'
     found = []
     for number, capsule in enumerate(capsules):
@@ -286,7 +296,7 @@ def measure(bodies: Bodies, spheres: dict[int, list[LinkCapsule]] | None) -> lis
     """Return a row for each link of the arm."""
     found = []
     for joint in range(-1, 7):
-        capsules = [each for each in (*PANDA_FINE.shape, *PANDA_FINE.base) if each.joint == joint]
+        capsules = [each for each in (*PANDA.shape, *PANDA.base) if each.joint == joint]
         row: dict[str, Any] = {"link": LINKS[joint + 1], "capsules": len(capsules)}
         rows = rows_of(capsules)
         outer, surface = capsule_surface(rows), np.concatenate([mesh_surface(each) for each in bodies[joint]])
@@ -302,6 +312,51 @@ def measure(bodies: Bodies, spheres: dict[int, list[LinkCapsule]] | None) -> lis
     return found
 
 
+def forearm_and_flange(bodies: Bodies) -> dict[str, float]:
+    """Return the least distance of forearm and flange within reach, of their geometry and of their capsules, [mm].
+
+    The geometry of the flange includes the hand. It is compared where the capsules are nearest.
+    """
+    hand = np.random.default_rng(0).uniform((-1.0, -1.0, 0.0), 1.0, (REACH_POSITIONS, 3))
+    joints = PANDA.inverse_kinematics(hand[np.asarray(PANDA.reach_margin(hand)) >= 0.0])
+    names = [each.name.split("_")[0] for each in PANDA.shape]
+    pairs = [
+        (i, j)
+        for i, one in enumerate(names)
+        for j, other in enumerate(names)
+        if (one, other) == (FOREARM, FLANGE_LINK)
+    ]
+    clearance = np.asarray(replace(PANDA, self_pairs=tuple(pairs), off_table=()).self_clearance(joints))
+    forearm, *others = (convex(each) for joint in (4, 6) for each in bodies[joint])
+    least = np.inf
+    for some in joints[np.argsort(clearance)[:NEAREST]]:
+        frames = PANDA.chain.frames(some)
+        first, second = (placed(frames[joint]) for joint in (4, 6))
+        for other in others:
+            request, result = coal.DistanceRequest(), coal.DistanceResult()
+            least = min(least, coal.distance(forearm, first, other, second, request, result))
+    share = 100.0 * float((clearance < 0.0).mean())
+    return {
+        "geometry": round(1e3 * least, 1),
+        "capsules": round(1e3 * float(clearance.min()), 1),
+        "touching": round(share, 1),
+    }
+
+
+def convex(body: ConvexMesh) -> coal.ConvexBase:
+    """Return a convex mesh for coal."""
+    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    points.extend(list(np.asarray(body.vertices)))
+    triangles.extend([coal.Triangle(*map(int, each)) for each in hull_triangles(body.vertices)])
+    return coal.Convex(points, triangles)
+
+
+def placed(frame: Any) -> coal.Transform3s:
+    """Return the pose of a frame for coal."""
+    origin, *axes = (np.array(frame.transform(point)) for point in ((0.0, 0.0, 0.0), *np.eye(3)))
+    return coal.Transform3s(np.stack(axes, axis=-1) - origin[:, None], origin)
+
+
 def main() -> None:
     """Fit, measure, and write files."""
     parser = argparse.ArgumentParser(
@@ -309,12 +364,12 @@ def main() -> None:
     )
     parser.add_argument("meshes", type=Path, help="folder of Franka's collision meshes")
     parser.add_argument("--spheres", type=Path, help="URDF with spheres")
-    parser.add_argument("--write", action="store_true", help="write envs/assets/panda_fine.xml")
+    parser.add_argument("--write", action="store_true", help="write envs/assets/panda.xml")
     parser.add_argument("--out", type=Path, help="JSON file of the results")
     options = parser.parse_args()
-    capsules, file = fit(options.meshes), ASSETS / "panda_fine.xml"
+    capsules, file = fit(options.meshes), ASSETS / "panda.xml"
     skipped = skipped_pairs(capsules)
-    print(f"links that are not compared, by their joints: {sorted(skipped)}")
+    print(f"bodies that are not compared: {sorted(skipped)}")
     text = model_text(capsules, skipped)
     if options.write:
         file.write_text(text, encoding="utf-8")
@@ -326,8 +381,11 @@ def main() -> None:
     found = measure(bodies, spheres)
     for row in found:
         print("  ".join(f"{name} {x}" for name, x in row.items()))
+    apart = forearm_and_flange(bodies)
+    print(f"forearm and flange within reach: {apart}")
     if options.out:
-        options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        text = json.dumps({"links": found, "forearm_and_flange": apart}, indent=1)
+        options.out.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -51,6 +51,8 @@ MIN_REACH, MAX_REACH = 0.31, 0.69
 """Least and greatest distance of the wrist from the shoulder, [m]: joint 4 within its range, the arm never straight."""
 MIN_HEIGHT = 0.025
 """Least height of the hand above the table, [m]: its radius and the tracking error."""
+MAX_HEIGHT = 0.73
+"""Greatest height of the hand, [m]: the gripper stays clear of the forearm, which then points upwards."""
 MIN_DISTANCE = 0.34
 """Least distance of the hand from the axis of joint 1, [m]: forearm and hand stay clear of the column."""
 MAX_AZIMUTH = 1.4
@@ -101,7 +103,8 @@ class PandaInverseKinematics:
     def margin(self, hand: Array) -> Array:
         """Return the least distance to the bounds of the reach, shape (...,), [m].
 
-        The bounds are a shell about the shoulder, a column and a wedge about the axis of joint 1, and the table.
+        The bounds are a shell about the shoulder, a column and a wedge about the axis of joint 1, the table, and a
+        greatest height.
         """
         xp = namespace_of(hand)
         x, y, height = hand[..., 0], hand[..., 1], hand[..., 2]
@@ -109,7 +112,8 @@ class PandaInverseKinematics:
         reach = xp.sqrt((column - WRIST) ** 2 + (height + (HAND_DROP - SHOULDER)) ** 2)
         arc = (MAX_AZIMUTH - xp.abs(xp.atan2(y, x))) * column
         shell = xp.minimum(reach - MIN_REACH, MAX_REACH - reach)
-        return xp.minimum(xp.minimum(shell, arc), xp.minimum(column - MIN_DISTANCE, height - MIN_HEIGHT))
+        level = xp.minimum(height - MIN_HEIGHT, MAX_HEIGHT - height)
+        return xp.minimum(xp.minimum(shell, arc), xp.minimum(column - MIN_DISTANCE, level))
 
 
 def _elbow(square: Array) -> tuple[Array, Array, Array]:
@@ -147,6 +151,7 @@ PANDA = serial_arm(
     ik=PandaInverseKinematics(),
     workspace=((0.36, -0.36, 0.06), (0.64, 0.36, 0.50)),
     hand_gains=(10000.0, 300.0),
+    may_touch_itself=False,
 )
 """Franka Emika Panda on a table, its base at the origin, x forwards and z up.
 

@@ -19,6 +19,7 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
+from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.envs.geometry.shape import Shape, frame_axes
 from viapoint.envs.geometry.shapes import SHAPES, as_obstacles
 from viapoint.primitives.array_api import Array, to_numpy
@@ -133,14 +134,22 @@ def pair_distance(rows: Float, first: Float, second: Float | None = None) -> Flo
     found, shapes = np.empty(len(rows)), shape_columns(rows)
     for number in np.unique(shapes.kind):
         some = np.flatnonzero(shapes.kind == number)
-        centre, quaternion, half = (part[some] for part in shapes[1:])
-        shape = list(SHAPES.values())[number].from_box(centre, quaternion, half)
-        points = first[some].astype(np.float64, copy=False)
-        if second is None:
-            found[some] = shape.distance(points)
-        else:
-            found[some] = shape.segment_distance(points, second[some].astype(np.float64, copy=False))
+        ends = [end[some].astype(np.float64, copy=False) for end in (first, second) if end is not None]
+        kind = list(SHAPES.values())[number]
+        if issubclass(kind, Capsule) and second is not None:
+            found[some] = _capsule_distance(rows[some], *ends)
+            continue
+        shape = kind.from_box(*(part[some] for part in shapes[1:]))
+        found[some] = shape.distance(*ends) if second is None else shape.segment_distance(*ends)
     return found
+
+
+def _capsule_distance(rows: Float, first: Float, second: Float) -> Float:
+    """Return the distance of M segments, each from the capsule of one row, shape (M,), [m]."""
+    d = dimension_of(rows)
+    centre, axis = in_space(rows[:, :d]).T, in_space(rows[:, d : 2 * d]).T
+    gap, link = first.T - (centre - axis), (second - first).T
+    return np.asarray(np.sqrt(segment_axis_squared(gap, link, 2.0 * axis)) - rows[:, -1])
 
 
 def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSULES) -> Any:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from viapoint.envs.actions.via_points import ActionLayout
-from viapoint.envs.arms import PANDA, PANDA_FINE
+from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import SELF_MARGIN, CollisionModel
 from viapoint.envs.arms.serial_arm import LIMIT_SHARE, NEAR, serial_arm
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
@@ -21,10 +21,27 @@ from viapoint.envs.sim.simulator import Simulator
 from viapoint.envs.single_env import ReachVectorEnv
 
 PANDA_FILE = files("viapoint.envs") / "assets" / "panda.xml"
-CAPSULE, BALL = 'fromto="0 0 -0.06 0 0 0.06" size="0.065"', 'type="sphere" pos="0 0 0.02" size="0.08"'
+CAPSULE = 'fromto="0 0.0421 -0.1081 0 0.064 0.0008" size="0.068"'
+BALL = 'type="sphere" pos="0 0.053 -0.054" size="0.08"'
 WITH_SPHERES = serial_arm(
     PANDA_FILE.read_text(encoding="utf-8").replace(CAPSULE, BALL), name="with-spheres", ik=PANDA.ik,
     joint_names=PANDA.joint_names, hand_site="hand", workspace=PANDA.workspace,
+)  # fmt: skip
+LINKS = (*(f"link{number}" for number in range(8)), "gripper")
+BODIES_OF = {
+    (i, j): tuple(sorted((one.name.split("_")[0], other.name.split("_")[0]), key=LINKS.index))
+    for (i, one), (j, other) in itertools.combinations(enumerate((*PANDA.shape, *PANDA.base)), 2)
+}
+TOUCHING = ("link5", "link7")
+"""Forearm and flange, whose capsules overlap within reach."""
+NOT_COMPARED = {
+    ("link0", "link2"), ("link0", "link3"), ("link1", "link3"), ("link1", "link4"), ("link2", "link4"),
+    ("link3", "link5"), ("link3", "link6"), ("link3", "link7"), ("link3", "gripper"),
+    ("link4", "link6"), ("link4", "link7"), ("link4", "gripper"), TOUCHING,
+}  # fmt: skip
+SELF_TOUCHING = dataclasses.replace(
+    PANDA, name="self-touching", may_touch_itself=True,
+    self_pairs=(*PANDA.self_pairs, *(pair for pair, bodies in BODIES_OF.items() if bodies == TOUCHING)),
 )  # fmt: skip
 LAYOUT = ActionLayout(dimension=3, duration_range=(1.0, 2.0))
 
@@ -88,14 +105,18 @@ def test_the_hand_points_down_and_keeps_its_heading_and_nothing_touches_itself_o
         assert data.ncon == 0
 
 
-def test_in_any_posture_the_far_half_touches_the_near_half_the_table_and_the_hand_the_forearm():
+def test_in_any_posture_bodies_touch_one_another_and_the_table_but_for_those_that_are_not_compared():
     model = PANDA.compile(0, whole_arm=True)
     data, rng = mujoco.MjData(model), np.random.default_rng(4)
-    hand = ["gripper", "fingers", "hand"]
-    far = ["forearm", "wrist", "flange", *hand]
-    pairs = {(a, b) for a in far for b in ("base", "shoulder", "upper_arm", "table")}
-    pairs |= {("elbow", b) for b in ("base", "shoulder", "table")}
-    pairs |= {(a, b) for a in hand for b in ("forearm", "elbow")}
+    geoms = {
+        body: [model.geom(g).name for g in range(model.ngeom) if model.geom(g).name.startswith(body)]
+        for body in LINKS
+    }
+    geoms["gripper"].append("hand")
+    bodies = {(a, b) for a, b in itertools.combinations(LINKS, 2) if LINKS.index(b) > LINKS.index(a) + 1}
+    bodies -= {("link6", "gripper"), *NOT_COMPARED}
+    pairs = {(g, h) for a, b in bodies for g in geoms[a] for h in geoms[b]}
+    pairs |= {(g, "table") for body in LINKS[4:] for g in geoms[body]}
     seen = set()
     for joints in rng.uniform(*np.array(PANDA.joint_range).T, (400, 7)):
         data.qpos[:] = joints
@@ -108,7 +129,7 @@ def test_in_any_posture_the_far_half_touches_the_near_half_the_table_and_the_han
         }
         assert touching == {frozenset(pair) for pair, distance in apart.items() if distance < 0.0}
         seen |= touching
-    assert {frozenset(("gripper", "forearm")), frozenset(("forearm", "table"))} <= seen
+    assert {frozenset(("gripper_0", "link5_0")), frozenset(("link5_0", "table"))} <= seen
 
 
 def test_postures_are_differentiable_and_change_smoothly():
@@ -190,7 +211,7 @@ def test_torque_limits_act():
     assert (greatest[:4] > 86.9).any()
 
 
-@pytest.mark.parametrize("arm", [PANDA, PANDA_FINE, WITH_SPHERES], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("arm", [PANDA, WITH_SPHERES], ids=lambda arm: arm.name)
 def test_contact_exactly_where_a_link_reaches_into_an_obstacle(arm):
     number, rng = 2000, np.random.default_rng(4)
     places = rng.uniform(*np.array(arm.workspace), (number, 3))
@@ -208,7 +229,7 @@ def test_contact_exactly_where_a_link_reaches_into_an_obstacle(arm):
     assert 0.1 < contact.mean() < 0.9
 
 
-@pytest.mark.parametrize("arm", [PANDA, PANDA_FINE, WITH_SPHERES], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("arm", [PANDA, WITH_SPHERES], ids=lambda arm: arm.name)
 def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itself_is_negative(arm):
     model, rng = arm.compile(0, whole_arm=True), np.random.default_rng(7)
     data, joints = mujoco.MjData(model), rng.uniform(*np.array(arm.joint_range).T, (600, 7))
@@ -227,60 +248,41 @@ def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itse
         np.testing.assert_allclose(batch.ravel(), clearance, atol=1e-12)
 
 
-def test_the_fine_panda_differs_from_the_other_in_its_geoms_alone():
-    fine, panda = PANDA_FINE.compile(2, True), PANDA.compile(2, True)
-    for name in (
-        "body_mass",
-        "body_inertia",
-        "body_ipos",
-        "body_pos",
-        "body_quat",
-        "jnt_range",
-        "jnt_actfrcrange",
-    ):
-        np.testing.assert_array_equal(getattr(fine, name), getattr(panda, name))
-    joints = np.random.default_rng(3).uniform(*np.array(PANDA.joint_range).T, (20, 7))
-    np.testing.assert_array_equal(PANDA_FINE.hand_position(joints), PANDA.hand_position(joints))
-    assert PANDA_FINE.link_joints == (0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 6, 6, 6, 6)
-
-
-def test_links_of_the_fine_panda_are_compared_unless_they_are_neighbours_or_never_touch():
-    every = (*PANDA_FINE.shape, *PANDA_FINE.base)
-    compared = {tuple(sorted((every[i].joint, every[j].joint))) for i, j in PANDA_FINE.self_pairs}
-    others = {(a, b) for b in range(7) for a in range(-1, b - 1)} - compared
-    pairs = [
-        (i, j)
-        for i, j in itertools.combinations(range(len(every)), 2)
-        if tuple(sorted((every[i].joint, every[j].joint))) in others
-    ]
-    arm = dataclasses.replace(PANDA_FINE, self_pairs=tuple(pairs), off_table=())
+def test_links_are_compared_unless_they_are_neighbours_or_never_touch_but_forearm_and_flange():
+    compared = {BODIES_OF[pair] for pair in PANDA.self_pairs}
+    every = {(LINKS[a], LINKS[b]) for b in range(len(LINKS)) for a in range(b - 1)}
+    assert every - compared == {*NOT_COMPARED, ("link6", "gripper")}  # the gripper is fixed to link 7
+    never = tuple(pair for pair, bodies in BODIES_OF.items() if bodies in NOT_COMPARED - {TOUCHING})
+    arm = dataclasses.replace(PANDA, self_pairs=never, off_table=())
     joints = np.random.default_rng(5).uniform(*np.array(PANDA.joint_range).T, (5000, 7))
-    assert others == {(-1, 1), (-1, 2), (0, 2), (0, 3), (1, 3), (2, 4), (2, 5), (2, 6), (3, 5), (3, 6)}
     assert arm.self_clearance(joints).min() > 0.0
 
 
-def test_measured_bounds_of_the_fine_panda():
+def test_measured_bounds_of_the_capsules():
     """benchmarks/panda_collision.py: Franka's geometry is inside, and the links reach at most 25 mm beyond it."""
     found = json.loads(
         (Path(__file__).parents[2] / "docs" / "panda-collision.json").read_text(encoding="utf-8")
     )
-    joints = [capsule.joint for capsule in (*PANDA_FINE.shape, *PANDA_FINE.base)]
+    joints = [capsule.joint for capsule in (*PANDA.shape, *PANDA.base)]
+    apart, found = found["forearm_and_flange"], found["links"]
     assert [row["capsules"] for row in found] == [joints.count(joint) for joint in range(-1, 7)]
+    assert PANDA.link_joints == (0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 6, 6, 6, 6)
     assert max(row["outside"] for row in found) == 0.0
     assert max(row["excess"] for row in found[1:]) <= 25.0
+    assert apart["capsules"] < 0.0 < 10.0 < apart["geometry"]
 
 
 def test_within_reach_a_few_pairs_of_links_suffice():
     hand = np.random.default_rng(6).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (20_000, 3))
-    joints = PANDA_FINE.inverse_kinematics(hand[PANDA_FINE.reach_margin(hand) >= 0.0])
+    joints = SELF_TOUCHING.inverse_kinematics(hand[SELF_TOUCHING.reach_margin(hand) >= 0.0])
     every, some = (
-        PANDA_FINE.self_clearance(joints),
-        PANDA_FINE.planned_self_clearance(PANDA_FINE.links(joints)),
+        SELF_TOUCHING.self_clearance(joints),
+        SELF_TOUCHING.planned_self_clearance(SELF_TOUCHING.links(joints)),
     )
     near = every < NEAR
     np.testing.assert_array_equal(some[near], every[near])
     assert (some[~near] >= NEAR).all()
-    assert len(PANDA_FINE._pairs_within_reach) < len(PANDA_FINE.self_pairs) / 2
+    assert len(SELF_TOUCHING._pairs_within_reach) < len(SELF_TOUCHING.self_pairs) / 2
 
 
 def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
@@ -291,15 +293,15 @@ def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
 def test_plans_of_an_arm_that_touches_itself_have_a_negative_clearance():
     """Executed movements, other arms and the hand alone are compared with obstacles only."""
     places = np.random.default_rng(9).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (4000, 3))
-    hand = places[PANDA_FINE.reach_margin(places) >= 0.0][:400].reshape(100, 4, 3)
+    hand = places[SELF_TOUCHING.reach_margin(places) >= 0.0][:400].reshape(100, 4, 3)
     far = np.concatenate(
         (np.full((100, 1, 3), 0.95), np.zeros((100, 1, 3)), np.full((100, 1, 1), 0.01)), axis=-1
     )
-    joints, present = PANDA_FINE.inverse_kinematics(hand), np.ones((100, 1), dtype=bool)
-    own, there = PANDA_FINE.self_clearance(joints) - SELF_MARGIN, np.repeat(far[:, None], 4, axis=1)
-    without = dataclasses.replace(PANDA_FINE, may_touch_itself=False)
+    joints, present = SELF_TOUCHING.inverse_kinematics(hand), np.ones((100, 1), dtype=bool)
+    own, there = SELF_TOUCHING.self_clearance(joints) - SELF_MARGIN, np.repeat(far[:, None], 4, axis=1)
+    without = dataclasses.replace(SELF_TOUCHING, may_touch_itself=False)
     for whole_arm, given in ((True, None), (True, joints), (False, None)):
-        model, other = CollisionModel(PANDA_FINE, whole_arm), CollisionModel(without, whole_arm)
+        model, other = CollisionModel(SELF_TOUCHING, whole_arm), CollisionModel(without, whole_arm)
         least, profile = (
             other.least_clearance(hand, far, present),
             other.clearance_profile(hand, there, present),
@@ -318,7 +320,7 @@ def test_the_arm_collides_with_itself_and_with_the_table():
     model = PANDA.compile(0, whole_arm=True)
     data = mujoco.MjData(model)
     for joints, second in (
-        ([0, 0, 0, -3.05, 0, 0.0, 0], {"shoulder", "upper_arm", "base"}),  # folded onto itself
+        ([0, 0, 0, -3.05, 0, 0.0, 0], {"link0", "link1", "link2", "link3"}),  # folded onto itself
         ([0, 1.2, 0, -1.2, 0, 2.4, 0], {"table"}),
     ):
         data.qpos[:] = joints

@@ -126,7 +126,7 @@ def test_a_distribution_that_cannot_be_sampled_is_refused(bad, message):
 
 
 def test_an_arm_may_be_named_and_a_task_is_plain_values():
-    with pytest.raises(ValueError, match=r"one of planar, panda, panda-fine, got 'ur5'"):
+    with pytest.raises(ValueError, match=r"one of planar, panda, got 'ur5'"):
         ReachVectorEnv(1, arm="ur5")
     task = ReachVectorEnv(1, arm="panda", whole_arm=True).task
     assert Task.from_dict(task.as_dict(), {"panda": PANDA}) == task

@@ -23,7 +23,7 @@ import viapoint.envs.sim.outcome
 import viapoint.training.search.geometry_search
 import viapoint.training.search.plan_checks
 import viapoint.training.search.planned_clearance
-from viapoint.envs.arms import PANDA, PANDA_FINE
+from viapoint.envs.arms import PANDA
 from viapoint.envs.registration import TASKS
 from viapoint.training.algorithms import pair_networks, viaq_policy
 from viapoint.training.algorithms.obstacle_parts import (
@@ -240,8 +240,9 @@ def test_spheres_have_no_axis_and_arms_of_many_capsules_share_networks():
     )
     assert along == 0.0
     assert away == pytest.approx(0.5)
-    assert networks_of(task) == list(range(8))  # a network for each capsule
-    assert networks_of(dataclasses.replace(task, arm=PANDA_FINE)) == list(PANDA_FINE.link_joints)
+    assert networks_of(task) == list(PANDA.link_joints)  # capsules of a joint share a network
+    eight = dataclasses.replace(PANDA, shape=PANDA.shape[:8])
+    assert networks_of(dataclasses.replace(task, arm=eight)) == list(range(8))  # one for each capsule
     assert networks_of(gym.make(PLANE).unwrapped.task) == []
 
 
