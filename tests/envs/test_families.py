@@ -186,7 +186,7 @@ def test_each_family_of_space_is_drawn_by_its_name(name):
 
 @pytest.fixture(scope="module")
 def boxes():
-    envs = gym.make_vec(SPACE, num_envs=3, threads=1, shapes=("capsule", "box"), n_obstacles=(1, 8)).unwrapped
+    envs = gym.make_vec(SPACE, num_envs=3, threads=1).unwrapped
     yield envs
     envs.close()
 
@@ -200,7 +200,7 @@ def test_each_family_of_boxes_is_in_the_way(name, boxes):
     info = boxes.execute_actions(np.zeros(boxes.action_space.shape)).info
     assert (info["collision"] | ~info["reachable"]).all()
     with pytest.raises(ValueError, match=f"{name} needs a task with the shapes box, this one has capsule"):
-        family_sampler(task_of(SPACE, n_obstacles=8), name)
+        family_sampler(task_of(SPACE, shapes="capsule"), name)
 
 
 def test_families_of_boxes_are_trained_or_held_out(boxes):
@@ -208,7 +208,7 @@ def test_families_of_boxes_are_trained_or_held_out(boxes):
     trained = set(boxes.task.scenes.families)
     assert {name for name in BOX_FAMILIES if name in trained} == {"table", "bin", "notch", "cupboard"}
     assert all(families[name].hard != families[name].trained for name in BOX_FAMILIES)
-    assert trained - set(BOX_FAMILIES) == set(task_of(SPACE).scenes.families)
+    assert trained - set(BOX_FAMILIES) == set(task_of(SPACE, shapes="capsule").scenes.families)
 
 
 @pytest.fixture
@@ -245,7 +245,7 @@ def ball(uniforms, site):
 
 @pytest.mark.parametrize("env_id", [HAND, WHOLE_ARM, SPACE])
 def test_one_function_makes_scenes_in_the_plane_and_in_space(env_id, registry):
-    task = task_of(env_id)
+    task = task_of(env_id, shapes="capsule")
     register_scene_family("ball", ball, dimension=task.arm.dimension, n_obstacles=1)
     sampler = family_sampler(task, "ball")
     scenes = sampler([np.random.default_rng(seed) for seed in range(12)])

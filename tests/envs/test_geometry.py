@@ -462,7 +462,7 @@ def test_a_batch_takes_a_list_of_obstacles_for_each_scene():
         ValueError,
         match=r"options\['obstacles'\]: scene 1: obstacle 0: the scenes of this environment have the shapes",
     ):
-        envs.reset(options={"obstacles": [[], [Box((0.1, 0.1, 0.1))], []]})
+        envs.reset(options={"obstacles": [[], [Cylinder(0.1, 0.1)], []]})
     envs.close()
 
 

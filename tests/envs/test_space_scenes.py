@@ -106,7 +106,7 @@ def test_the_hand_alone_may_be_what_must_clear():
     env.reset(seed=0)
     _, _, info = env.execute_actions(np.zeros((32, 4)))
     assert info["collision"].all()
-    assert not env.model.geom("forearm").contype
+    assert not env.model.geom("link5_0").contype
 
 
 @pytest.mark.parametrize(

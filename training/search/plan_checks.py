@@ -66,7 +66,14 @@ class PlanChecks(NamedTuple):
     """Reward if the physics follows the plan."""
 
 
-def check_plans(observation: Observation, actions: Numbers, task: Task, until: float = np.inf) -> PlanChecks:
+def check_plans(
+    observation: Observation,
+    actions: Numbers,
+    task: Task,
+    until: float = np.inf,
+    *,
+    max_refined: float = MAX_REFINED,
+) -> PlanChecks:
     """Compute clearance, reach margin and reward of the plans of H actions in each of B scenes.
 
     Obstacles with velocities are extrapolated with them. The reward has the terms of
@@ -80,6 +87,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
         actions: Shape (B, H, m), in [-1, 1].
         task: Task of the environment.
         until: Time after which clearance does not matter, [s].
+        max_refined: Clearance above which no instant is refined, [m].
 
     Example:
         >>> import gymnasium, numpy, viapoint.envs
@@ -94,7 +102,7 @@ def check_plans(observation: Observation, actions: Numbers, task: Task, until: f
     for rows in _blocks(obstacles.number, max(1, CHECK_BLOCK // (actions.shape[1] * NODES))):
         some = take_rows(observation, rows)
         moves = plan_movements(some, actions[rows], task, FRACTIONS)
-        clearance = least_clearance(moves, obstacles.take(rows), task, until, (MIN_REFINED, MAX_REFINED))
+        clearance = least_clearance(moves, obstacles.take(rows), task, until, (MIN_REFINED, max_refined))
         reach = _least_reach_margin(task.arm, moves.path)
         found.clearance[rows], found.reach_margin[rows] = clearance, reach
         found.reward[rows] = _reward(some, moves, clearance, reach, task)
@@ -138,7 +146,8 @@ def pruned_merit(
         merit, within the margins or not.
     """
     if actions.shape[1] <= FIRST_BATCH:
-        merits = merit(check_plans(observation, actions, task, until), *margins)
+        most = max(CLEARANCE_RANGE[1], *margins)  # beyond it merits do not depend on clearance
+        merits = merit(check_plans(observation, actions, task, until, max_refined=most), *margins)
         merits[:, 0] += np.where(merits[:, 0] > 0.5 * INFEASIBLE, bonus, 0.0)
         return merits
     merits = np.full(actions.shape[:2], -np.inf)
@@ -178,7 +187,7 @@ def _branch_and_bound(
     while open_scenes.size and first < bound.shape[1]:
         these = open_scenes[:, None], order[open_scenes, first : first + count]
         some = PlannedMovements(*(field[these] for field in moves))
-        exact = margin, CLEARANCE_RANGE[1]  # beyond it the reward does not depend on clearance
+        exact = margin, max(CLEARANCE_RANGE[1], margin)  # beyond it merits do not depend on clearance
         clearance = least_clearance(some, obstacles.take(open_scenes), task, until, exact)
         lost = np.clip(clearance, *CLEARANCE_RANGE) - CLEARANCE_RANGE[1]
         reward = bound[these] + task.weights.clearance * lost / CLEARANCE_UNIT
