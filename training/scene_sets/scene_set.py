@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.rows import CAPSULES, SHAPE_SIZE, has_shapes
 from viapoint.envs.registration import OWN_ARM_TASKS, REPLANNING_TASKS
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
@@ -164,8 +165,12 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
     """Raise ValueError unless all arrays are of N > 0 scenes in the same D dimensions."""
     number, d = content["start"].shape if content["start"].ndim == 2 else (0, 0)
     obstacles = content["obstacles"].shape[1:2]
+    shapes = SHAPE_SIZE * (content["obstacles"].ndim == 3 and has_shapes(content["obstacles"]))
     wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("start", "goal"), (number, d))
-    wanted |= dict.fromkeys(("obstacles", "courses"), (number, *obstacles, 2 * d + 1))
+    wanted |= {
+        "obstacles": (number, *obstacles, 2 * d + 1 + shapes),
+        "courses": (number, *obstacles, 2 * d + 1),
+    }
     wanted |= {"jumps": (number, *content.get("jumps", content["goal"]).shape[1:2], d + 1)}
     wanted |= dict.fromkeys(("share", "family", "number"), (number,))
     wanted |= {"solution": (number, *content["solution"].shape[1:2])}
@@ -235,8 +240,13 @@ def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) ->
 def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
     """Raise ValueError if the scenes of a file have another shape than those of the environment."""
     simulation = new_simulation(frozen.env_id, 1, **env_kwargs)
-    layout = simulation.task.observation
+    layout, shapes = simulation.task.observation, simulation.task.scenes.shapes
     simulation.close()
+    if has_shapes(frozen.scenes.obstacles) is (shapes == CAPSULES):
+        raise ValueError(
+            f"{frozen.name} holds scenes of {'several shapes' if shapes == CAPSULES else 'capsules'}; the environment, "
+            f"made with {dict(env_kwargs)}, has {', '.join(shapes)}"
+        )
     mine = layout.n_rows, layout.dimension
     theirs = frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]
     if mine != theirs:
