@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Container
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -35,12 +36,27 @@ BEYOND_LIMIT = 0.1
 
 
 class ObstacleRows(NamedTuple):
-    """Obstacles of an observation by name, shape (..., n, .) each, [m]; absent rows are zero."""
+    """Capsules of an observation by name, shape (..., n, .) each, [m]; absent rows are zero."""
 
     centre: Array
     half_axis: Array
     radius: Array
     present: Array
+
+
+class ShapeRows(NamedTuple):
+    """Obstacles of any shape of an observation by name, shape (..., n, .) each; absent rows are zero."""
+
+    shape: Array
+    """One-hot vectors of the shapes of the environment."""
+    centre: Array
+    """[m]"""
+    rotation: Array
+    """First two axes of the obstacles' frames."""
+    half_lengths: Array
+    """Half lengths of the bounding boxes along the axes of the frames, [m]."""
+    present: Array
+    """1 for obstacles, shape (..., n)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +134,21 @@ class ObservationLayout:
         rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1)
         return np.asarray(rows.reshape(len(rows), -1))
 
-    def obstacles(self, flat: Array) -> ObstacleRows:
-        """Return views of the `obstacles` part, shape (..., n (2 D + 2)), by name, in NumPy or torch."""
+    def obstacles(self, part: Array) -> ObstacleRows | ShapeRows:
+        """Return views of the `obstacles` part by name, in NumPy or torch.
+
+        Args:
+            part: Shape (..., n (2 D + 2)), or (..., n, .) where obstacles may have other shapes than capsules.
+        """
+        if self.shapes == CAPSULES:
+            return self.capsules(part)
+        k = len(self.shapes)
+        ends = (0, k, k + 3, k + 9, k + 12)
+        columns = (part[..., first:last] for first, last in itertools.pairwise(ends))
+        return ShapeRows(*columns, part[..., -1])
+
+    def capsules(self, flat: Array) -> ObstacleRows:
+        """Return views of the `obstacles` part of an environment with capsules alone, shape (..., n (2 D + 2))."""
         rows = flat.reshape((*flat.shape[:-1], flat.shape[-1] // self.row_size, self.row_size))
         d = self.dimension
         return ObstacleRows(rows[..., :d], rows[..., d : 2 * d], rows[..., 2 * d], rows[..., 2 * d + 1])
@@ -128,7 +157,7 @@ class ObservationLayout:
         """Return the `obstacles` part as rows of scenes, shape (..., n, .), see :mod:`viapoint.envs.geometry.rows`."""
         if self.shapes != CAPSULES:
             return rows_of_observed(part, self.shapes, self.dimension)
-        seen = self.obstacles(part)
+        seen = self.capsules(part)
         radius = np.where(seen.present > 0.5, seen.radius, 0.0)[..., None]
         return np.concatenate((seen.centre, seen.half_axis, radius), axis=-1)
 

@@ -389,7 +389,7 @@ def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbe
         return together, np.zeros((len(start), 1, width)), np.zeros((len(start), 1), dtype=bool)
     if task.scenes.shapes != CAPSULES:
         return together, *_shapes_from_line(observation, axes, len(task.scenes.shapes))
-    rows = task.observation.obstacles(observation["obstacles"])
+    rows = task.observation.capsules(observation["obstacles"])
     centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
     half = rows.half_axis @ axes
     half = np.where(half[..., 1:2] < 0.0, -half, half)  # the sign of a half-axis has no meaning
