@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,8 +31,8 @@ FIRST_OFF_TABLE = 2
 """Index of the first joint whose link must not come near the table."""
 MIN_LENGTH = 0.3
 """Least length of the reach along its longest axis, [m]: movements must fit in."""
-TABLE_CHECKS = 16
-"""Positions along each axis at which a table is checked."""
+TABLE_CHECKS, TABLE_SPACING = 16, 0.025
+"""Least number of positions along each axis at which a table is checked, and their greatest distance, [m]."""
 TABLE_MARGIN_FACTOR = 2.0
 """Factor by which margins may be smaller, and rotations greater, between the nodes of a table than at them."""
 MAX_JOINT_SLOPE = 25.0
@@ -195,7 +196,10 @@ def fit_feasible_table(check: Feasibility, box: Box, required: Float) -> IKTable
 
 def infeasible_positions(table: IKTable, check: Feasibility) -> Float:
     """Return hand positions of a grid at which a table is infeasible or turns a joint too fast, shape (M, 3), [m]."""
-    axes = [np.linspace(low, high, TABLE_CHECKS) for low, high in zip(*table.box, strict=True)]
+    sides = [
+        (low, high, math.ceil((high - low) / TABLE_SPACING) + 1) for low, high in zip(*table.box, strict=True)
+    ]
+    axes = [np.linspace(low, high, max(number, TABLE_CHECKS)) for low, high, number in sides]
     positions = grid(axes)
     joints = np.asarray(table(positions))
     flat = joints.reshape(-1, joints.shape[-1])

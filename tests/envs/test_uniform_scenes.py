@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs.geometry.rows import CAPSULES, shape_columns, shape_number
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.draws import Uniforms
 from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler, scene_sampler
@@ -71,8 +72,12 @@ def test_numbers_and_sizes_are_those_of_the_task(env, scenes):
     some = scenes.obstacles[scenes.present]
     radii = [env.task.scenes.post_radius, env.task.scenes.bar_radius]
     radii += [env.task.scenes.sphere_radius] if d == 3 else []
-    assert some[:, -1].min() >= min(low for low, _ in radii)
-    assert some[:, -1].max() <= max(high for _, high in radii)
+    capsule = shape_columns(some).kind == shape_number("capsule")
+    assert capsule.all() == (env.task.scenes.shapes == CAPSULES)
+    assert some[capsule, -1].min() >= min(low for low, _ in radii)
+    assert some[:, -1].max() <= max(
+        high for _, high in radii
+    )  # other shapes are inside capsules of these sizes
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
