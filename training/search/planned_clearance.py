@@ -23,7 +23,6 @@ from viapoint.envs.geometry.distance import MAX_CLEARANCE, point_distance_square
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
 
 if TYPE_CHECKING:
-    from viapoint.envs.arms.base import Arm
     from viapoint.envs.mdp.task import Task
     from viapoint.training.search.planned_movements import Observation, PlannedMovements
 
@@ -86,47 +85,46 @@ def parabola_minimum(before: Numbers, middle: Numbers, after: Numbers, within: f
     return np.where(inside, middle - drop, middle)
 
 
-class _Body(NamedTuple):
-    """One capsule of an arm, or the hand, during B H movements."""
+class _Bodies(NamedTuple):
+    """L capsules of an arm, or its hand, during B H movements, as if they were P = L H bodies with a movement each."""
 
     first: Numbers
-    """One end of the axis, shape (B, T, H, D), [m]."""
+    """One end of the axis, shape (B, T, P, D), [m]."""
     second: Numbers | None
-    """The other end; None where the body is a sphere."""
-    radius: float
-    """[m]."""
+    """The other end; None where the bodies are spheres."""
+    radius: Single
+    """Shape (P,), [m]."""
 
     def distance_squared(self, rows: Numbers, drift: Numbers | None) -> Numbers:
-        """Return the squared distance from obstacles, for ends of shape (B, T H, D)."""
+        """Return the squared distance from obstacles, for ends of shape (B, T P, D)."""
         if self.second is None:
             return np.asarray(point_distance_squared(self.first, rows, drift))
         return np.asarray(segment_distance_squared(self.first, self.second, rows, drift))
 
-    def map(self, function: Any) -> _Body:
-        """Return the body with both ends transformed."""
+    def map(self, function: Any) -> _Bodies:
+        """Return the bodies with both ends transformed."""
         second = None if self.second is None else function(self.second)
         return self._replace(first=function(self.first), second=second)
 
 
-def _bodies(hand: Numbers, task: Task) -> list[_Body]:
+def _bodies(hand: Numbers, task: Task) -> _Bodies:
     """Return the bodies that must clear the obstacles, with the hand at positions of shape (B, T, H, D)."""
-    arm, sphere = task.arm, _Body(hand, None, task.arm.hand_radius)
+    arm, plans = task.arm, hand.shape[2]
     if not task.whole_arm:
-        return [sphere]
-    quick = getattr(arm, "links_at", None)
-    links = _links(arm, hand) if quick is None else quick(hand)
-    bodies = [
-        _Body(first, second, radius) for (first, second), radius in zip(links, arm.link_radii, strict=True)
-    ]
+        return _Bodies(hand, None, np.full(plans, arm.hand_radius, np.float32))
+    quick, radii = getattr(arm, "links_at", None), arm.link_radii
+    if quick is None:
+        links = np.asarray(arm.links(arm.inverse_kinematics(hand))).transpose(4, 5, 0, 1, 3, 2)
+    else:
+        links = np.array(quick(hand)).transpose(1, 5, 2, 3, 0, 4)
     # The last link ends at the hand and encloses it, unless the hand is thicker.
-    return bodies if arm.hand_radius <= arm.link_radii[-1] else [*bodies, sphere]
-
-
-def _links(arm: Arm, hand: Numbers) -> list[tuple[Numbers, Numbers]]:
-    """Return both ends of each link of an arm in space, shape (B, T, H, 3) each, components contiguous in memory."""
-    ends = np.moveaxis(np.asarray(arm.links(arm.inverse_kinematics(hand))), (-3, -2, -1), (0, 1, 2))
-    single = np.moveaxis(np.ascontiguousarray(ends, np.float32), 2, -1)
-    return [(first, second) for first, second in single]
+    if arm.hand_radius > radii[-1]:
+        sphere = np.moveaxis(hand, -1, 0)[None, :, :, :, None]
+        links = np.concatenate((links, np.repeat(sphere, 2, axis=0)), axis=4)
+        radii = (*radii, arm.hand_radius)
+    single = np.ascontiguousarray(links, np.float32)  # (2, D, B, T, L, H): components are apart in memory
+    first, second = np.moveaxis(single.reshape(*single.shape[:4], -1), 1, -1)
+    return _Bodies(first, second, np.repeat(np.array(radii, np.float32), plans))
 
 
 def least_clearance(
@@ -145,117 +143,100 @@ def least_clearance(
     number, instants, plans, _ = hand.shape
     least: Single = np.full((number, plans), MAX_CLEARANCE, np.float32)
     bodies = _bodies(hand, task)
+    count = len(bodies.radius) // plans
     if task.collision_model.may_touch_itself:
-        parts = [(each.first, each.second) for each in bodies if each.second is not None]
-        # Components stay contiguous in memory.
-        ends = np.stack([[np.moveaxis(end, -1, 0) for end in part] for part in parts])
-        links = np.moveaxis(ends, (0, 1, 2), (-3, -2, -1))
+        assert bodies.second is not None
+        ends = np.stack((bodies.first, bodies.second)).reshape(2, number, instants, count, plans, 3)
+        links = np.moveaxis(ends[:, :, :, : len(task.arm.link_radii)], (3, 0), (-3, -2))
         least = task.collision_model.with_self_clearance(least, links, time_axis=1)
     if not obstacles.rows.shape[1]:
         return least
     drift, elapsed = None, moves.duration[:, None].astype(np.float32) * FRACTIONS[:, None].astype(np.float32)
     if obstacles.velocity is not None:
-        drift = obstacles.velocity[:, :, None] * elapsed.reshape(number, 1, -1, 1)
-    profiles = []
-    flat = [body.map(lambda ends: ends.reshape(number, instants * plans, -1)) for body in bodies]
-    every = [each.distance_squared(obstacles.rows, drift) for each in flat]
+        drift = obstacles.velocity[:, :, None] * np.tile(elapsed, count).reshape(number, 1, -1, 1)
+    flat = bodies.map(lambda ends: ends.reshape(number, instants * count * plans, -1))
+    squared = flat.distance_squared(obstacles.rows, drift)
     if until < np.inf:
-        for squared in every:
-            late = np.broadcast_to((elapsed > until)[:, None], (number, 1, instants, plans))
-            np.copyto(squared.reshape(number, -1, instants, plans), np.float32(np.inf), where=late)
+        late = np.broadcast_to((elapsed > until)[:, None, :, None], (number, 1, instants, count, plans))
+        np.copyto(squared.reshape(number, -1, instants, count, plans), np.float32(np.inf), where=late)
     if obstacles.shapes is not None:
-        every = _sharpened(every, flat, obstacles.rows, obstacles.shapes, drift, least, exact)
-    for body, squared in zip(bodies, every, strict=True):
-        radii = (obstacles.rows[..., -1] + np.float32(body.radius))[..., None]
-        squared = squared.reshape(number, -1, instants, plans)
-        profile = _DistanceProfile(body, radii, squared, convex=obstacles.shapes is not None)
-        profiles.append(profile)
-        np.minimum(least, (np.sqrt(profile.lowest) - profile.radii).min(axis=1), out=least)  # (1)
+        _sharpen(squared, flat, obstacles, drift, least, exact)
+    radii = obstacles.rows[..., -1:] + bodies.radius
+    squared = squared.reshape(number, -1, instants, count * plans)
+    profile = _DistanceProfile(bodies, radii, squared, convex=obstacles.shapes is not None)
+    nearest = (np.sqrt(profile.lowest) - radii).min(axis=1)  # (1)
+    np.minimum(least, nearest.reshape(number, count, plans).min(axis=1), out=least)
     limit = np.where(
         least > exact[0], np.minimum(least, np.float32(exact[1])), np.float32(-2.0 * MAX_CLEARANCE)
     )
-    for profile in profiles:
-        minima = profile.local_minima(limit)
-        if len(minima[0]):
-            refined = _refined_clearance(profile.body, minima, obstacles, moves.duration, limit)
-            np.minimum.at(least, (minima[0], minima[3]), refined)
+    minima = profile.local_minima(np.tile(limit, count))
+    if len(minima[0]):
+        refined = _refined_clearance(bodies, minima, obstacles, moves.duration, limit)
+        np.minimum.at(least, (minima[0], minima[3] % plans), refined)
     return least
 
 
-def _sharpened(
-    squared: list[Numbers],
-    bodies: list[_Body],
-    rows: Numbers,
-    shapes: Float,
+def _sharpen(
+    squared: Numbers,
+    bodies: _Bodies,
+    obstacles: Obstacles,
     drift: Numbers | None,
-    least: Single | None = None,
-    exact: tuple[float, float] = (-np.inf, np.inf),
-) -> list[Numbers]:
-    """Return squared distances from the capsules around shapes, or, where they matter, those from the shapes.
+    least: Single,
+    exact: tuple[float, float],
+) -> None:
+    """Replace squared distances from the capsules around shapes, where they matter, by those from the shapes.
 
     What stands for the distance from a capsule's axis is the signed distance from the shape plus the capsule's radius,
     so that the same clearance follows.
 
     Args:
-        squared: Squared distances of L bodies from the axes of the capsules, shape (B, n, P) each, [m^2].
-        bodies: Bodies with ends of shape (B, P, D).
-        rows: Capsules, shape (B, n, 2 D + 1), [m].
-        shapes: Rows with shapes, shape (B, n, .), [m].
-        drift: Displacements of the obstacles, shape (B, n, P, D), [m]; None if they stand still.
-        least: Least clearance of H movements so far, shape (B, H), [m], which is lowered; P is a multiple of H. Without
-            it, all distances are those from the shapes.
+        squared: Squared distances from the axes of the capsules, shape (B, n, T P), [m^2].
+        bodies: Bodies with ends of shape (B, T P, D).
+        obstacles: Obstacles with shapes.
+        drift: Displacements of the obstacles, shape (B, n, T P, D), [m]; None if they stand still.
+        least: Least clearance of H movements so far, shape (B, H), [m], which is lowered; P is a multiple of H.
         exact: Range of clearance of interest, [m].
     """
-    found = np.stack(squared, axis=1)
-    first, second = (
-        np.stack([in_space(each) for each in ends], axis=1)
-        for ends in (
-            [body.first for body in bodies],
-            [body.first if body.second is None else body.second for body in bodies],
-        )
-    )
-    radii = np.array([body.radius for body in bodies])
+    assert obstacles.shapes is not None
+    shapes, (number, _, places), plans = obstacles.shapes, squared.shape, least.shape[1]
+    radii = np.tile(bodies.radius, places // len(bodies.radius))
 
-    def clearance(scene: Index, body: Index, obstacle: Index, place: Index) -> Float:
-        ends: list[Any] = [end[scene, body, place] for end in (first, second)]
+    def clearance(scene: Index, obstacle: Index, place: Index) -> Float:
+        ends = [end[scene, place] for end in (bodies.first, bodies.second) if end is not None]
         if drift is not None:
-            ends = [end - in_space(drift[scene, obstacle, place]) for end in ends]
-        distance = pair_distance(shapes[scene, obstacle], *ends)
-        found[scene, body, obstacle, place] = np.square(np.maximum(distance + rows[scene, obstacle, -1], 0.0))
-        return np.asarray(distance - radii[body])
+            ends = [end - drift[scene, obstacle, place] for end in ends]
+        distance = pair_distance(shapes[scene, obstacle], *map(in_space, ends))
+        from_axis = distance + obstacles.rows[scene, obstacle, -1]
+        squared[scene, obstacle, place] = np.square(np.maximum(from_axis, 0.0))
+        return np.asarray(distance - radii[place])
 
-    if least is None:
-        clearance(*np.nonzero(found >= 0.0))
-        return list(np.moveaxis(found, 1, 0))
-    plans, instants = least.shape[1], found.shape[3] // least.shape[1]
-    bound = np.sqrt(found) - (rows[:, None, :, -1:] + radii.astype(np.float32)[:, None, None])
-    each = bound.reshape(len(bound), -1, plans)
+    bound = np.sqrt(squared) - (obstacles.rows[..., -1:] + radii)
+    each = bound.reshape(number, -1, plans)
     nearest = each.argmin(axis=1)  # the least bound of each movement, whose exact value excludes most others
     scene, plan = np.nonzero(each.min(axis=1) < np.minimum(least, exact[1]))
-    body, rest = np.divmod(nearest[scene, plan], instants * rows.shape[1])
-    obstacle, instant = np.divmod(rest, instants)
-    np.minimum.at(least, (scene, plan), clearance(scene, body, obstacle, instant * plans + plan))
+    obstacle, rest = np.divmod(nearest[scene, plan], places // plans)
+    place = rest * plans + plan
+    np.minimum.at(least, (scene, plan), clearance(scene, obstacle, place))
     limit = np.where(least > exact[0], np.minimum(least, np.float32(exact[1])), -np.inf)
-    some = bound < np.tile(limit, instants)[:, None, None]
-    some[scene, body, obstacle, instant * plans + plan] = False
-    scene, body, obstacle, place = np.nonzero(some)
-    np.minimum.at(least, (scene, place % plans), clearance(scene, body, obstacle, place))
-    return list(np.moveaxis(found, 1, 0))
+    some = bound < np.tile(limit, places // plans)[:, None]
+    some[scene, obstacle, place] = False
+    scene, obstacle, place = np.nonzero(some)
+    np.minimum.at(least, (scene, place % plans), clearance(scene, obstacle, place))
 
 
 class _DistanceProfile:
-    """Squared distances of one body from n obstacles at T instants of H movements in each of B scenes."""
+    """Squared distances of bodies from n obstacles at T instants of P movements in each of B scenes."""
 
-    def __init__(self, body: _Body, radii: Numbers, squared: Numbers, *, convex: bool) -> None:
-        self.body = body
+    def __init__(self, bodies: _Bodies, radii: Numbers, squared: Numbers, *, convex: bool) -> None:
+        self.bodies = bodies
         self.convex = convex
         """False if all obstacles are capsules."""
         self.radii = radii
-        """Sums of the radii of body and obstacles, shape (B, n, 1), [m]."""
+        """Sums of the radii of bodies and obstacles, shape (B, n, P), [m]."""
         self.squared = squared
-        """Squared distances of axes, shape (B, n, T, H), [m^2]."""
+        """Squared distances of axes, shape (B, n, T, P), [m^2]."""
         self.lowest = squared.min(axis=2)
-        """Least of the instants, shape (B, n, H), [m^2]."""
+        """Least of the instants, shape (B, n, P), [m^2]."""
 
     def local_minima(self, limit: Numbers) -> tuple[Index, Index, Index, Index]:
         """Return the scenes, obstacles, instants and movements of nearest approaches, shape (M,) each.
@@ -280,8 +261,8 @@ class _DistanceProfile:
         return np.asarray(bound + steps + across)
 
     def _steps_squared(self) -> Numbers:
-        """Return the square of STEP_REACH of the longer step to a neighbouring instant, shape (B, T, H), [m^2]."""
-        ends = [each for each in (self.body.first, self.body.second) if each is not None]
+        """Return the square of STEP_REACH of the longer step to a neighbouring instant, shape (B, T, P), [m^2]."""
+        ends = [each for each in (self.bodies.first, self.bodies.second) if each is not None]
         squares = [squared_length(each[:, 1:] - each[:, :-1]) for each in ends]
         square: Numbers = np.float32(STEP_REACH**2) * functools.reduce(np.maximum, squares)
         longer = np.empty((len(square), square.shape[1] + 1, square.shape[2]), square.dtype)
@@ -291,12 +272,12 @@ class _DistanceProfile:
 
 
 def _refined_clearance(
-    body: _Body, minima: tuple[Index, ...], obstacles: Obstacles, duration: Numbers, limit: Numbers
+    bodies: _Bodies, minima: tuple[Index, ...], obstacles: Obstacles, duration: Numbers, limit: Numbers
 ) -> Single:
     """Return the least clearance between the instants around local minima, shape (M,), [m].
 
     Args:
-        body: Body of the distance profile.
+        bodies: Bodies of the distance profile.
         minima: Scenes, obstacles, instants and movements, shape (M,) each.
         obstacles: Obstacles of the scenes.
         duration: Durations of the movements, shape (B, H), [s].
@@ -304,27 +285,29 @@ def _refined_clearance(
     """
     scene, which, instant, movement = minima
     first, weights, times = _interpolation(NODES)
-    nodes = first[instant, None] + np.arange(STENCIL)
-    ends = body.map(lambda end: weights[instant] @ end[scene[:, None], nodes, movement[:, None]])  # (2)
-    row = obstacles.rows[scene, which, None]
+    nodes, plan = first[instant, None] + np.arange(STENCIL), movement % duration.shape[1]
+    ends = bodies.map(lambda end: weights[instant] @ end[scene[:, None], nodes, movement[:, None]])  # (2)
+    row, radius = obstacles.rows[scene, which, None], bodies.radius[movement]
     drift = None
     if obstacles.velocity is not None:
-        elapsed = duration[scene, movement, None] * times[instant]
+        elapsed = duration[scene, plan, None] * times[instant]
         drift = (obstacles.velocity[scene, which, None] * elapsed[..., None].astype(np.float32))[:, None]
-    squared = ends.distance_squared(row, drift)
+    squared = ends.distance_squared(row, drift)[:, 0]
     if obstacles.shapes is not None:
-        clearance = np.sqrt(squared.min(axis=(1, 2))) - row[:, 0, -1] - np.float32(body.radius)
-        near = np.flatnonzero(clearance < limit[scene, movement])
-        shapes, some = obstacles.shapes[scene[near], which[near], None], ends.map(lambda end: end[near])
-        moved = None if drift is None else drift[near]
-        (squared[near],) = _sharpened([squared[near]], [some], row[near], shapes, moved)
-    squared = squared[:, 0]
+        clearance = np.sqrt(squared.min(axis=1)) - row[:, 0, -1] - radius
+        near = np.flatnonzero(clearance < limit[scene, plan])
+        shapes = np.repeat(obstacles.shapes[scene[near], which[near]], squared.shape[1], axis=0)
+        moved = 0.0 if drift is None else drift[near, 0]
+        points = [end[near] - moved for end in (ends.first, ends.second) if end is not None]
+        distance = pair_distance(shapes, *(in_space(each.reshape(-1, each.shape[-1])) for each in points))
+        from_axis = distance.reshape(len(near), -1) + row[near, 0, -1:]
+        squared[near] = np.square(np.maximum(from_axis, 0.0))
     each = np.arange(len(squared))
     at = squared[:, 1:-1].argmin(axis=-1)
     before, middle, after = (squared[each, at + i] for i in range(3))
     lowest = np.minimum(parabola_minimum(before, middle, after), np.minimum(before, after))  # (3)
     distance = np.sqrt(np.maximum(lowest, 0.0))
-    return np.asarray(distance - (row[:, 0, -1] + np.float32(body.radius)))  # (1)
+    return np.asarray(distance - (row[:, 0, -1] + radius))  # (1)
 
 
 @functools.cache
