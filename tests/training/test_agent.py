@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from viapoint.envs.arms import ARMS
+from viapoint.envs.geometry.rows import has_shapes, quaternion_of_axes, rotation_axes, shape_columns
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.algorithms import viaq_policy
@@ -106,6 +107,9 @@ def test_a_scene_is_seen_along_its_line(simulation):
     turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
     rows = scenes.obstacles.copy()
     rows[..., :d], rows[..., d : 2 * d] = rows[..., :d] @ turn.T, rows[..., d : 2 * d] @ turn.T
+    if has_shapes(rows):
+        first, second, _ = rotation_axes(shape_columns(rows).quaternion)
+        rows[..., 2 * d + 1 : 2 * d + 5] = quaternion_of_axes(first @ turn.T, second @ turn.T)
     other = Scenes(scenes.start @ turn.T, scenes.goal @ turn.T, rows)
     here, there = (_seen(simulation, each) for each in (scenes, other))
     np.testing.assert_array_equal(here[2], there[2])
@@ -116,9 +120,7 @@ def test_a_scene_is_seen_along_its_line(simulation):
 
 
 def _seen(simulation, scenes):
-    rows = np.concatenate((scenes.obstacles, scenes.present[..., None]), axis=-1).reshape(
-        len(scenes.start), -1
-    )
+    rows = simulation.task.observation.observed_obstacles(scenes)
     observation = {"hand": scenes.start, "goal": scenes.goal}
     return seen_from_line({**observation, "obstacles": rows} if rows.size else observation, simulation.task)
 

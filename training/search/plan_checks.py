@@ -56,9 +56,9 @@ class PlanChecks(NamedTuple):
     clearance: Single
     """Least clearance over the movement, [m], at most MAX_CLEARANCE.
 
-    Between MIN_REFINED and MAX_REFINED its error is below half a millimetre, if the movement stays within reach. Beyond
-    them it is the least of NODES instants, and slightly too large; for other obstacles than capsules, above MAX_REFINED
-    a lower bound.
+    Between MIN_REFINED and MAX_REFINED its error is below half a millimetre, if the movement stays within reach; among
+    boxes it is up to 2 mm in one plan of fifty. Beyond them it is the least of NODES instants, and slightly too large;
+    for other obstacles than capsules, above MAX_REFINED a lower bound.
     """
     reach_margin: Single
     """Least distance inside the arm's reach, [m]; negative where the movement leaves it."""

@@ -300,7 +300,7 @@ def _refined_clearance(
         moved = 0.0 if drift is None else drift[near, 0]
         points = [end[near] - moved for end in (ends.first, ends.second) if end is not None]
         distance = pair_distance(shapes, *(in_space(each.reshape(-1, each.shape[-1])) for each in points))
-        from_axis = distance.reshape(len(near), -1) + row[near, 0, -1:]
+        from_axis = distance.reshape(len(near), squared.shape[1]) + row[near, 0, -1:]
         squared[near] = np.square(np.maximum(from_axis, 0.0))
     each = np.arange(len(squared))
     at = squared[:, 1:-1].argmin(axis=-1)
