@@ -22,7 +22,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from viapoint.envs import Box, Cylinder, Shape
-from viapoint.envs.arms import PANDA, PANDA_FINE
+from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
@@ -44,8 +44,8 @@ MARGIN = 0.01
 """Least clearance of the arm, and least distance from the border of its reach, at start and goal, [m]."""
 BLOCK = 256
 """Hand positions whose clearance is computed together."""
-MODELS = [CollisionModel(arm, True) for arm in (PANDA, PANDA_FINE)]
-"""Arms that can rest at start and goal."""
+MODEL = CollisionModel(PANDA, True)
+"""Arm that can rest at start and goal."""
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 SOURCE = (
     "MotionBenchMaker (C. Chamzas et al., MotionBenchMaker: a tool to generate and benchmark motion planning datasets, "
@@ -109,7 +109,7 @@ def problem(scene: bytes, request: bytes) -> dict[str, Any] | None:
 
 
 def nearest_free(point: Float, rows: Float, away_from: Float | None = None) -> Float | None:
-    """Return the nearest position to a point at which the arms rest clear of obstacles, shape (3,), [m].
+    """Return the nearest position to a point at which the arm rests clear of obstacles, shape (3,), [m].
 
     Args:
         point: Position of the hand, shape (3,), [m].
@@ -117,12 +117,12 @@ def nearest_free(point: Float, rows: Float, away_from: Float | None = None) -> F
         away_from: Position from which a movement to the result must be long enough, shape (3,), [m].
 
     Returns:
-        The position; None if there is none on a grid within MOST_MOVED and the arms' reach.
+        The position; None if there is none on a grid within MOST_MOVED and the arm's reach.
     """
     steps = np.arange(-MOST_MOVED, MOST_MOVED, GRID)
     grid = np.round(point / GRID) * GRID + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     candidates = np.concatenate((point[None], grid))
-    reach = np.min([model.arm.reach_margin(candidates) for model in MODELS], axis=0)
+    reach = np.asarray(PANDA.reach_margin(candidates))
     near = (reach > MARGIN) & (norm(candidates - point) <= MOST_MOVED)
     if away_from is not None:
         near &= norm(candidates - away_from) > MIN_GOAL_DISTANCE
@@ -131,7 +131,7 @@ def nearest_free(point: Float, rows: Float, away_from: Float | None = None) -> F
     for first in range(0, len(candidates), BLOCK):
         some = candidates[first : first + BLOCK]
         scenes = Scenes(some, some, np.broadcast_to(rows, (len(some), *rows.shape)))
-        clear = np.min([rest_clearance(scenes, some, model).min(axis=-1) for model in MODELS], axis=0)
+        clear = rest_clearance(scenes, some, MODEL).min(axis=-1)
         if (clear > MARGIN).any():
             return np.asarray(some[(clear > MARGIN).argmax()])
     return None

@@ -19,7 +19,6 @@ from viser import transforms
 
 import viapoint.envs as ve
 from viapoint.envs.arms import PANDA as PANDA_ARM
-from viapoint.envs.arms import PANDA_FINE
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.rows import widened
 from viapoint.envs.registration import ENV_IDS
@@ -392,18 +391,17 @@ def test_scenes_that_exceed_the_environment_of_the_agent_go_to_a_wider_one(share
         some.setting_of(crowded)
 
 
-@pytest.mark.parametrize("arm", [PANDA_ARM, PANDA_FINE], ids=lambda arm: arm.name)
-def test_problems_of_the_benchmark_are_possible_near_its_ends(arm):
-    draw = scene_kinds(PANDA, {}, Setting(PANDA, None, {"arm": arm}).task)["Benchmark"]
+def test_problems_of_the_benchmark_are_possible_near_its_ends():
+    draw = scene_kinds(PANDA, {}, Setting(PANDA, None, {}).task)["Benchmark"]
     problems = benchmark_problems()
     assert len({(each["set"], each["number"]) for each in problems}) == len(problems) == 20
     for record in problems:
         scene, origin = draw()
         assert record["set"] in origin
         assert {each["shape"] for each in record["obstacles"]} == set(scene.shapes)
-        check_scenes(scene.batch(), CollisionModel(arm, True))
+        check_scenes(scene.batch(), CollisionModel(PANDA_ARM, True))
         for name, end in (("start", scene.start), ("goal", scene.goal)):
-            moved = np.linalg.norm(arm.hand_position(np.array(record[f"{name}_joints"])) - end)
+            moved = np.linalg.norm(PANDA_ARM.hand_position(np.array(record[f"{name}_joints"])) - end)
             assert moved <= 0.2001
             assert f" {100 * moved:.0f} " in origin
 

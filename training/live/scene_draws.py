@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.arms import PANDA, PANDA_FINE, Arm
+from viapoint.envs.arms import PANDA, Arm
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.geometry.rows import obstacle_rows
 from viapoint.envs.scenes.scene import rows_of_lights
@@ -42,7 +42,7 @@ def scene_kinds(
             kinds[label] = _next_of(name, env_id)
     if not (task.spatial or task.whole_arm or task.replanning) and task.observation.n_rows:
         kinds["Lights 1985"] = _lights()
-    if task.arm in (PANDA, PANDA_FINE):
+    if task.arm == PANDA:
         kinds["Benchmark"] = _benchmark(task.arm)
     return kinds
 
