@@ -78,7 +78,7 @@ def _raise_to_boxes(
     bounds: Single, points: Single, around: Single, obstacles: NDArray[np.floating], rounding: np.float32
 ) -> None:
     """Raise bounds, in place, to the clearance of balls from the bounding boxes of shapes."""
-    kind, centre, quaternion, half = shape_columns(obstacles)
+    kind, centre, quaternion, half = shape_columns(np.asarray(obstacles, np.float64))
     ends = np.array([bool(shape.sizes) for shape in SHAPES.values()])  # a half-space has no bounding box
     scene, row = np.nonzero((obstacles[..., -1] > half.min(axis=-1)) & ends[kind])
     axes = np.stack(rotation_axes(quaternion[scene, row]), axis=1)  # shape (boxes, axes, 3)

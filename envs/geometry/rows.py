@@ -149,7 +149,8 @@ def _capsule_distance(rows: Float, first: Float, second: Float) -> Float:
     d = dimension_of(rows)
     centre, axis = in_space(rows[:, :d]).T, in_space(rows[:, d : 2 * d]).T
     gap, link = first.T - (centre - axis), (second - first).T
-    return np.asarray(np.sqrt(segment_axis_squared(gap, link, 2.0 * axis)) - rows[:, -1])
+    squared = segment_axis_squared(list(gap), list(link), list(2.0 * axis))
+    return np.asarray(np.sqrt(squared) - rows[:, -1])
 
 
 def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSULES) -> Any:

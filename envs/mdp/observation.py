@@ -142,10 +142,9 @@ class ObservationLayout:
         """
         if self.shapes == CAPSULES:
             return self.capsules(part)
-        k = len(self.shapes)
-        ends = (0, k, k + 3, k + 9, k + 12)
-        columns = (part[..., first:last] for first, last in itertools.pairwise(ends))
-        return ShapeRows(*columns, part[..., -1])
+        ends = np.cumsum((len(self.shapes), 3, 6, 3))
+        shape, centre, rotation, half = (part[..., a:b] for a, b in itertools.pairwise((0, *ends)))
+        return ShapeRows(shape, centre, rotation, half, part[..., -1])
 
     def capsules(self, flat: Array) -> ObstacleRows:
         """Return views of the `obstacles` part of an environment with capsules alone, shape (..., n (2 D + 2))."""

@@ -202,7 +202,7 @@ def _sharpen(
     radii = np.tile(bodies.radius, places // len(bodies.radius))
 
     def clearance(scene: Index, obstacle: Index, place: Index) -> Float:
-        ends = [end[scene, place] for end in (bodies.first, bodies.second) if end is not None]
+        ends: list[Any] = [end[scene, place] for end in (bodies.first, bodies.second) if end is not None]
         if drift is not None:
             ends = [end - drift[scene, obstacle, place] for end in ends]
         distance = pair_distance(shapes[scene, obstacle], *map(in_space, ends))
