@@ -7,6 +7,8 @@ from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
+from viapoint.envs.geometry.rows import obstacles_from_rows, pair_distance, shape_rows
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.scenes import sampler as sampling
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.feasible_path import DRAW_ORDER
@@ -115,3 +117,48 @@ def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_
         found.append((*scenes, [each.random() for each in generators]))
     for other in found[1:]:
         assert all(np.array_equal(mine, theirs) for mine, theirs in zip(found[0], other, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere", "half_space"])
+def test_balls_are_bounded_from_below_by_shapes_and_closely_by_boxes(kind, generator):
+    centres = generator.uniform(-1.0, 1.0, (N, 3, 50)).astype(np.float32)
+    radii = generator.uniform(0.0, 0.2, 50).astype(np.float32)
+    rows = shapes(kind, generator, (N, ROWS))
+    rows[generator.random((N, ROWS)) < 0.2] = 0.0
+    present = rows[..., -1] > 0.0
+    scene, row, ball = (each.ravel() for each in np.indices((N, ROWS, 50)))
+    distance = pair_distance(rows[scene, row], centres[scene, :, ball]).reshape(N, ROWS, 50)
+    clearance = np.where(present[..., None], distance - radii, np.inf)
+    bounds = ball_bounds(lift_quadratic(centres), radii, rows)
+    assert (bounds <= clearance + 1e-6)[clearance > -1.0].all()  # no arm is deeper in a half-space
+    if kind == "box":
+        assert (bounds >= clearance - 1e-4)[present].all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere"])
+def test_distances_of_rows_are_those_of_their_shapes(kind, dimension, generator):
+    rows = shapes(kind, generator, (30,), dimension)
+    first, second = generator.uniform(-0.5, 0.5, (2, 30, 3)) * (np.arange(3) < dimension)
+    found = pair_distance(rows, first, second), pair_distance(rows, first)
+    for i, shape in enumerate(obstacles_from_rows(rows)):
+        assert found[0][i] == pytest.approx(shape.segment_distance(first[i], second[i]), abs=1e-9)
+        assert found[1][i] == pytest.approx(shape.distance(first[i]), abs=1e-9)
+
+
+def shapes(kind, generator, shape, dimension=3):
+    """Rows with shapes of one kind, in any pose; in the plane turned about the vertical."""
+    half = generator.uniform(0.02, 0.3, (*shape, 3))
+    quaternion = generator.normal(size=(*shape, 4)) * ((1, 1, 1, 1) if dimension == 3 else (1, 0, 0, 1))
+    if SHAPES[kind].round:
+        half[..., 1] = half[..., 0]
+    half[..., 2] += half[..., 0] if kind == "capsule" else 0.0
+    half = (
+        half[..., :1] + 0.0 * half
+        if kind == "sphere"
+        else np.ones_like(half)
+        if kind == "half_space"
+        else half
+    )
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return shape_rows(kind, generator.uniform(-0.5, 0.5, (*shape, dimension)), quaternion, half)

@@ -14,6 +14,7 @@ from viapoint.training.plotting.top_view import widened_outline
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.search.candidates import candidate_actions
 from viapoint.training.search.plan_checks import check_plans
+from viapoint.training.search.planned_movements import take_rows
 
 PANDA, PLANE, WHOLE, MOVING = (
     "viapoint/PandaObstacles-v0",
@@ -46,6 +47,19 @@ def test_computed_clearance_is_that_of_densely_sampled_movements(env_id):
         assert np.abs(checks.clearance[:, h] - dense)[near].max(initial=0.0) < 1e-3
         assert (checks.clearance[:, h][inside & (dense < -0.06)] < -0.05).all()
         assert (checks.clearance[:, h][inside & (dense > 0.1)] > 0.09).all()
+    envs.close()
+
+
+def test_checks_of_one_plan_are_those_of_a_batch():
+    envs = gym.make_vec(PANDA, num_envs=24, threads=1).unwrapped
+    observation, _ = envs.reset(seed=2)
+    actions = 0.3 * np.random.default_rng(0).uniform(-1.0, 1.0, (24, 1, 4)).astype(np.float32)
+    together = check_plans(observation, actions, envs.task, max_refined=0.01).clearance
+    alone = [
+        check_plans(take_rows(observation, slice(i, i + 1)), actions[i, None], envs.task, max_refined=0.01)
+        for i in range(24)
+    ]
+    np.testing.assert_allclose(np.concatenate([each.clearance for each in alone]), together, atol=1e-6)
     envs.close()
 
 
