@@ -25,7 +25,7 @@ import viapoint.training.search.plan_checks
 import viapoint.training.search.planned_clearance
 from viapoint.envs.arms import PANDA
 from viapoint.envs.registration import TASKS
-from viapoint.training.algorithms import pair_networks, viaq_policy
+from viapoint.training.algorithms import viaq_policy
 from viapoint.training.algorithms.obstacle_parts import (
     PART,
     Poses,
@@ -275,7 +275,7 @@ def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_mi
             whole = network(poses, parts)
         least = []
         for near in (0.0, 0.12, np.inf):
-            monkeypatch.setattr(pair_networks, "NEAR", near)
+            monkeypatch.setattr(network.geometry, "near", near)
             least.append(network.of_near_pairs(poses, parts))
             assert (least[-1] >= whole - 1e-6).all()
         assert not networks or (least[0] > whole + 1e-3).any()  # one pair of links is not enough
@@ -495,6 +495,27 @@ def test_round_shapes_may_turn_about_their_axis():
     wanted, again = (torch.stack(pairs.features(apart, axis, each)) for each in (columns, other))
     changed = (wanted - again).abs().amax(dim=0).reshape(len(KINDS), -1).amax(dim=1) > 1e-4
     assert [kind for kind, each in zip(KINDS, changed, strict=True) if each] == ["box"]
+
+
+@pytest.mark.parametrize("instants", [1, 6, 7])
+def test_gaps_of_shapes_are_those_of_the_axis_at_its_point_nearest_to_the_part(instants):
+    poses, _, _ = scene(number=1, instants=instants)
+    pairs, (_, _, columns) = ShapePairs(len(KINDS), True), shape_pairs(1)
+    columns = [each[:, None, None] for each in columns]
+    apart, axis = (
+        torch.stack([each[:, i, 0, None].expand(-1, len(KINDS), -1, -1) for i in range(3)])
+        for each in (-poses.centre, poses.axis)
+    )
+    gap = pairs.gap([*apart], [*axis], columns, poses)
+    length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
+    points = torch.stack([apart - t * length * axis for t in np.linspace(-1.0, 1.0, 2001)])
+    nearest = points.norm(dim=1).argmin(dim=0)
+    points = points.gather(0, nearest[None, None].expand(1, 3, *nearest.shape))[0]
+    wanted = pairs.gap([*points], None, columns, poses) - radius
+    np.testing.assert_allclose(gap[..., ::2], wanted[..., ::2], atol=1e-3)
+    for t in range(1, instants, 2):
+        neighbours = gap[..., range(t - 1, min(t + 2, instants), 2)]
+        assert torch.equal(gap[..., t], neighbours.amin(dim=-1))
 
 
 def test_the_nearest_shapes_are_among_the_near_pairs():

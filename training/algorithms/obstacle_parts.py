@@ -141,6 +141,8 @@ class PairGeometry(Protocol):
 
     inputs: int
     """Number of features."""
+    near: float
+    """Estimated clearance beyond that of the nearest pair of a plan up to which a pair counts as near, [m]."""
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return invariants of the pose of a part relative to a body."""
@@ -161,6 +163,8 @@ class CapsulePairs:
         dimension: Spatial dimension D.
         links: True if the bodies are capsules, False for the spherical hand alone.
     """
+
+    near = 0.12
 
     def __init__(self, dimension: int, links: bool) -> None:
         self.inputs = 4 if not links else 2 * dimension + (1 if dimension == 2 else 0)
@@ -204,6 +208,7 @@ class ShapePairs:
     """Depth below a face, and half length, beyond which features stay the same, [m]."""
     UNIT = 0.125
     """Factor of features without a unit, in the networks' scale of lengths, [m]."""
+    near = 0.09
 
     def __init__(self, n_shapes: int, links: bool) -> None:
         self.inputs = 6 + 3 * links + n_shapes
@@ -239,20 +244,23 @@ class ShapePairs:
     def gap(
         self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor], poses: Poses
     ) -> Tensor:
-        """Return the distance of the body's axis from the box, less the body's radius: two alternating projections."""
+        """Return the distance from the box of the point of the body's axis nearest to the part, less the radius.
+
+        It is computed at every second instant. In between it is the smaller one of the neighbours.
+        """
         frame, half = columns[:9], columns[9:12]
-        centre = _in_frame(apart, frame)  # of the part, seen from the body
+        centre = _in_frame([each[..., ::2] for each in apart], frame)  # of the part, seen from the body
         if axis is None or poses.half_length is None or poses.radius is None:
-            return _box_distance(centre, half)[0]
-        along = _in_frame(axis, frame)
-        length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
-        target = centre
-        for _ in range(2):
-            t = torch.minimum(torch.maximum(_dot(target, along), -length), length)
-            place = [c - t * u for c, u in zip(centre, along, strict=True)]
-            distance, beyond = _box_distance(place, half)
-            target = [t * u + e for u, e in zip(along, beyond, strict=True)]
-        return distance - radius
+            found = _box_distance(centre, half)
+        else:
+            along = _in_frame([each[..., ::2] for each in axis], frame)
+            length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
+            t = torch.minimum(torch.maximum(_dot(centre, along), -length), length)
+            found = _box_distance([c - t * u for c, u in zip(centre, along, strict=True)], half) - radius
+        gap = found.repeat_interleave(2, dim=-1)[..., : poses.time.shape[-1]]
+        between = gap[..., 1:-1:2]
+        torch.minimum(between, gap[..., 2::2], out=between)
+        return gap
 
 
 def pair_features(
@@ -318,10 +326,10 @@ def _in_frame(vector: list[Tensor], frame: list[Tensor]) -> list[Tensor]:
     return [_dot(vector, frame[3 * i : 3 * i + len(vector)]) for i in range(3)]
 
 
-def _box_distance(place: list[Tensor], half: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-    """Return the distance of a point from a box around the origin, and the vector from the box to the point."""
-    beyond = [p - torch.minimum(torch.maximum(p, -h), h) for p, h in zip(place, half, strict=True)]
-    return _root(_dot(beyond, beyond)), beyond
+def _box_distance(place: list[Tensor], half: list[Tensor]) -> Tensor:
+    """Return the distance of a point from a box around the origin."""
+    beyond = [(p.abs() - h).clamp_min_(0.0) for p, h in zip(place, half, strict=True)]
+    return _root(_dot(beyond, beyond))
 
 
 def _sign(values: Tensor) -> Tensor:

@@ -35,8 +35,6 @@ NO_OBSTACLE = 1.0
 """Margin in a scene without obstacles, [m]."""
 ROWS = 65_536
 """Pairs whose inputs are computed together, so that they stay in the cache."""
-NEAR = 0.12
-"""Distance beyond that of the nearest pair of a plan up to which a pair counts as near, [m]."""
 
 
 class PairNetworks(nn.Module):
@@ -141,7 +139,8 @@ class PairMinimum(nn.Module):
         """Return the minimum over near pairs for each plan, shape (B, H), [m]; NO_OBSTACLE without obstacles.
 
         This takes a fraction of the time of the minimum over all pairs, and is never less. A pair is near if its
-        distance exceeds the least one of the plan by at most NEAR. Distance means here the rough one of
+        distance exceeds the least one of the plan by at most
+        :attr:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.near`. Distance means here the rough one of
         :meth:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.gap`.
         """
         return torch.stack([self._of_near_pairs(poses, parts, scene) for scene in range(len(parts.present))])
@@ -163,16 +162,16 @@ class PairMinimum(nn.Module):
         distance = self.geometry.gap(apart, axis, columns, poses)
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
         bodies, rows, _, instants = distance.shape
-        near = (distance <= (nearest + NEAR)[:, None]).flatten(0, 1)
+        near = (distance <= (nearest + self.geometry.near)[:, None]).flatten(0, 1)
         of_body, plan, instant = near.nonzero(as_tuple=True)
         pose = plan * instants + instant
         flat = of_body * (plans * instants) + pose
         body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(flat), of_body)
-        along = None if axis is None else body * (plans * instants) + pose
+        along = body * (plans * instants) + pose
         features = self.geometry.features(
-            [each.expand_as(distance).flatten()[flat] for each in apart],
-            None if axis is None else [each.flatten()[along] for each in axis],
-            [each[:, 0, 0][row] for each in columns],
+            [each.expand_as(distance).flatten().index_select(0, flat) for each in apart],
+            None if axis is None else [each.flatten().index_select(0, along) for each in axis],
+            [each[:, 0, 0].index_select(0, row) for each in columns],
         )
         features += self._sizes(poses, body)
         if len(self.networks.nearness) == 1:

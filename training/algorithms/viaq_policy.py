@@ -215,11 +215,13 @@ class ViaQPolicy(BasePolicy):
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
             coarse: Evaluate the pair networks for near pairs and at most CHECKED_INSTANTS instants a via-point only.
+                Among obstacles of any shape only near pairs are evaluated in any case.
         """
         fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
         shares = self.shares[::fewer] if coarse else self.shares
         inputs = self.inputs(observation, actions, scene, shares, coarse=coarse)
-        values: Numbers = self.critic.merit(self.critic(inputs, near=coarse)).numpy()
+        near = coarse or self.task.scenes.shapes != CAPSULES
+        values: Numbers = self.critic.merit(self.critic(inputs, near=near)).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
