@@ -53,7 +53,9 @@ from viapoint.training.scene_sets.scene_set import (
 
 SEEDS = {"validation": 1_000_003, "test": 2_000_003, "hard": 3_000_017, "uniform": 4_000_037}
 """First seeds of the sets; training draws from seeds below a million."""
-SIZES = {"validation": 500, "test": 1000, "hard": 500, "uniform": 500}
+SIZES = {"validation": 500, "test": 1000, "uniform": 500}
+OF_FAMILY = 100
+"""Number of hard scenes of each family."""
 WITHOUT_OBSTACLES = 100
 """Number of scenes of a set without obstacles."""
 HARDEST = BAND_EDGES[1]
@@ -123,6 +125,13 @@ def hard_families(task: Task) -> dict[str, SceneSampler]:
     }
 
 
+def size_of(task: Task, name: str) -> int:
+    """Return the number of scenes of a set."""
+    if name == "hard":
+        return OF_FAMILY * len(hard_families(task))
+    return SIZES[name] if task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES
+
+
 def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> FrozenScenes:
     """Search for the scenes of a set, measure and certify them.
 
@@ -136,7 +145,7 @@ def make(env_id: str, name: str, size: int | None = None, threads: int = 0) -> F
         RuntimeError: Scenes of some kind are too rare.
     """
     simulation = SceneSimulation(env_id, threads=threads)
-    size = size or (SIZES[name] if simulation.task.scenes.n_obstacles[1] else WITHOUT_OBSTACLES)
+    size = size or size_of(simulation.task, name)
     parts = lots(simulation.task, name, size)
     found = []
     for lot in parts:

@@ -11,11 +11,10 @@ from scene_sets.difficulty import planned_share, solution_share
 from scene_sets.generate import (
     SEEDS,
     SETS,
-    SIZES,
-    WITHOUT_OBSTACLES,
     hard_families,
     lots,
     remake,
+    size_of,
 )
 from scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
 
@@ -62,8 +61,8 @@ def results():
         each.close()
 
 
-def test_shipped_sets_are_whole_and_distinct_and_shares_are_known_unless_uniform(shipped):
-    size = WITHOUT_OBSTACLES if "Reach" in shipped.env_id else SIZES[shipped.name]
+def test_shipped_sets_are_whole_and_distinct_and_shares_are_known_unless_uniform(shipped, results):
+    size = size_of(results(shipped.env_id).task, shipped.name)
     assert len(shipped.share) == len(shipped.family) == size
     known = (shipped.share > 0.0) & (shipped.share <= 1.0)
     assert np.isnan(shipped.share).all() if shipped.name == "uniform" else known.all()
@@ -75,7 +74,7 @@ def test_drawn_sets_hold_a_quarter_of_each_band_and_hard_ones_as_many_of_each_fa
         names, counts = np.unique(shipped.family, return_counts=True)
         families = hard_families(results(shipped.env_id).task)
         assert set(names) == set(families)
-        assert set(counts) == {len(shipped.share) // len(families)}
+        assert set(counts) == {100}
         assert set(shipped.family[: len(families)]) == set(families)  # in turn, so that any part is mixed
         assert (shipped.share < 0.05).all()
     else:
