@@ -263,7 +263,7 @@ def test_bodies_that_share_a_network_differ_by_their_size(size):
 
 
 @pytest.mark.parametrize("networks", [(), (0, 1), (0, 0, 1)])
-def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_minimum(networks, monkeypatch):
+def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_minimum(networks):
     poses, rows, network = scene(networks=networks)
     if not networks:
         poses = Poses(poses.centre, None, poses.time)
@@ -275,8 +275,7 @@ def test_near_pairs_give_an_upper_bound_of_the_minimum_and_all_pairs_give_the_mi
             whole = network(poses, parts)
         least = []
         for near in (0.0, 0.12, np.inf):
-            monkeypatch.setattr(network.geometry, "near", near)
-            least.append(network.of_near_pairs(poses, parts))
+            least.append(network.of_near_pairs(poses, parts, near))
             assert (least[-1] >= whole - 1e-6).all()
         assert not networks or (least[0] > whole + 1e-3).any()  # one pair of links is not enough
         assert torch.allclose(least[-1], whole, atol=1e-6)
@@ -527,7 +526,7 @@ def test_the_nearest_shapes_are_among_the_near_pairs():
     with torch.no_grad():
         inputs = policy.inputs(observation, actions)
         whole = policy.critic.pairs(inputs.poses, inputs.scene.parts)
-        near = policy.critic.pairs.of_near_pairs(inputs.poses, inputs.scene.parts)
+        near = policy.critic.pairs.of_near_pairs(inputs.poses, inputs.scene.parts, ShapePairs.near)
     assert (near >= whole - 1e-6).all()
     assert (near - whole < 1e-6).float().mean() > 0.5
     env.close()

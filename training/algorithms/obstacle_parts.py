@@ -141,8 +141,10 @@ class PairGeometry(Protocol):
 
     inputs: int
     """Number of features."""
-    near: float
-    """Estimated clearance beyond that of the nearest pair of a plan up to which a pair counts as near, [m]."""
+    near: float | None
+    """Gap beyond that of the nearest pair of a plan up to which pairs determine its value, [m]; None for all pairs."""
+    near_coarse: float
+    """The same for values that only select plans to check."""
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return invariants of the pose of a part relative to a body."""
@@ -164,7 +166,8 @@ class CapsulePairs:
         links: True if the bodies are capsules, False for the spherical hand alone.
     """
 
-    near = 0.12
+    near: float | None = None
+    near_coarse = 0.12
 
     def __init__(self, dimension: int, links: bool) -> None:
         self.inputs = 4 if not links else 2 * dimension + (1 if dimension == 2 else 0)
@@ -208,7 +211,8 @@ class ShapePairs:
     """Depth below a face, and half length, beyond which features stay the same, [m]."""
     UNIT = 0.125
     """Factor of features without a unit, in the networks' scale of lengths, [m]."""
-    near = 0.09
+    near: float | None = 0.09
+    near_coarse = 0.06
 
     def __init__(self, n_shapes: int, links: bool) -> None:
         self.inputs = 6 + 3 * links + n_shapes

@@ -135,17 +135,17 @@ class PairMinimum(nn.Module):
         )
 
     @torch.no_grad()
-    def of_near_pairs(self, poses: Poses, parts: Parts) -> Tensor:
+    def of_near_pairs(self, poses: Poses, parts: Parts, near: float) -> Tensor:
         """Return the minimum over near pairs for each plan, shape (B, H), [m]; NO_OBSTACLE without obstacles.
 
         This takes a fraction of the time of the minimum over all pairs, and is never less. A pair is near if its
-        distance exceeds the least one of the plan by at most
-        :attr:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.near`. Distance means here the rough one of
+        distance exceeds the least one of the plan by at most `near`, [m]. Distance means here the rough one of
         :meth:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.gap`.
         """
-        return torch.stack([self._of_near_pairs(poses, parts, scene) for scene in range(len(parts.present))])
+        scenes = range(len(parts.present))
+        return torch.stack([self._of_near_pairs(poses, parts, near, scene) for scene in scenes])
 
-    def _of_near_pairs(self, poses: Poses, parts: Parts, scene: int) -> Tensor:
+    def _of_near_pairs(self, poses: Poses, parts: Parts, near: float, scene: int) -> Tensor:
         """Return the minimum over near pairs for each plan of one scene, shape (H,), [m]."""
         plans, number = poses.centre.shape[3], int(parts.present[scene].sum())
         if not number:
@@ -162,8 +162,8 @@ class PairMinimum(nn.Module):
         distance = self.geometry.gap(apart, axis, columns, poses)
         nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
         bodies, rows, _, instants = distance.shape
-        near = (distance <= (nearest + self.geometry.near)[:, None]).flatten(0, 1)
-        of_body, plan, instant = near.nonzero(as_tuple=True)
+        evaluated = (distance <= (nearest + near)[:, None]).flatten(0, 1)
+        of_body, plan, instant = evaluated.nonzero(as_tuple=True)
         pose = plan * instants + instant
         flat = of_body * (plans * instants) + pose
         body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(flat), of_body)

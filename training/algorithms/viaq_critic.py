@@ -142,17 +142,18 @@ class ViaQCritic(nn.Module):
         )
         """w_s, w_c, w_g and w_m, initialised from the reward weights and adapted to the rewards."""
 
-    def forward(self, inputs: PlanInputs, *, near: bool = False) -> Values:
+    def forward(self, inputs: PlanInputs, *, near: float | None = None) -> Values:
         """Return the predictions for each plan.
 
         Args:
             inputs: Inputs of the plans.
-            near: Evaluate near pairs only, see :meth:`PairMinimum.of_near_pairs`; without gradients.
+            near: Gap up to which pairs are evaluated, without gradients, see :meth:`PairMinimum.of_near_pairs`, [m];
+                None for all pairs.
         """
         ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         plan = torch.cat((ends, inputs.actions), dim=-1)
-        if self.form == "poses" and near:
-            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts)
+        if self.form == "poses" and near is not None:
+            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts, near)
         elif self.form == "poses":
             margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
         else:

@@ -214,13 +214,17 @@ class ViaQPolicy(BasePolicy):
             observation: Parts of B observations, shape (B, .) each.
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
-            coarse: Evaluate the pair networks for near pairs and at most CHECKED_INSTANTS instants a via-point only.
-                Among obstacles of any shape only near pairs are evaluated in any case.
+            coarse: Evaluate the pair networks for few pairs, see
+                :class:`~viapoint.training.algorithms.obstacle_parts.PairGeometry`, and at most CHECKED_INSTANTS
+                instants a via-point.
         """
         fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
         shares = self.shares[::fewer] if coarse else self.shares
         inputs = self.inputs(observation, actions, scene, shares, coarse=coarse)
-        near = coarse or self.task.scenes.shapes != CAPSULES
+        near = None
+        if self.settings["form"] == "poses":
+            geometry = self.critic.pairs.geometry
+            near = geometry.near_coarse if coarse else geometry.near
         values: Numbers = self.critic.merit(self.critic(inputs, near=near)).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
