@@ -142,7 +142,8 @@ class PairGeometry(Protocol):
     inputs: int
     """Number of features."""
     near: float | None
-    """Gap beyond that of the nearest pair of a plan up to which pairs determine its value, [m]; None for all pairs."""
+    """Gap beyond that of the nearest pair of a plan up to which pairs determine its value in decisions, [m]; None for
+    all pairs, which training always uses."""
     near_coarse: float
     """The same for values that only select plans to check."""
 

@@ -204,6 +204,7 @@ class ViaQPolicy(BasePolicy):
         actions: Numbers,
         scene: SceneInputs | None = None,
         *,
+        near: float | None = None,
         coarse: bool = False,
     ) -> Numbers:
         """Return the ranking criterion of H actions in each of B scenes, shape (B, H); see :meth:`ViaQCritic.merit`.
@@ -214,17 +215,12 @@ class ViaQPolicy(BasePolicy):
             observation: Parts of B observations, shape (B, .) each.
             actions: Shape (B, H, m).
             scene: Inputs that belong to the scenes; computed if not given.
-            coarse: Evaluate the pair networks for few pairs, see
-                :class:`~viapoint.training.algorithms.obstacle_parts.PairGeometry`, and at most CHECKED_INSTANTS
-                instants a via-point.
+            near: See :meth:`ViaQCritic.forward`.
+            coarse: Evaluate the pair networks at no more than CHECKED_INSTANTS instants a via-point.
         """
         fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
         shares = self.shares[::fewer] if coarse else self.shares
         inputs = self.inputs(observation, actions, scene, shares, coarse=coarse)
-        near = None
-        if self.settings["form"] == "poses":
-            geometry = self.critic.pairs.geometry
-            near = geometry.near_coarse if coarse else geometry.near
         values: Numbers = self.critic.merit(self.critic(inputs, near=near)).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
@@ -249,11 +245,16 @@ class ViaQPolicy(BasePolicy):
         coarse, rounds, size = self.checks > 0, self.refinements, self.per_refinement
         if coarse and rounds and self.task.action.n_via <= 1 and not (self.task.whole_arm or self.replanning):
             rounds, size = 1, rounds * size
-        values = self.values(observation, actions, scene, coarse=coarse)
+        near = None
+        if self.settings["form"] == "poses":
+            geometry = self.critic.pairs.geometry
+            near = geometry.near_coarse if coarse else geometry.near
+        values = self.values(observation, actions, scene, near=near, coarse=coarse)
         for each in range(rounds):
-            near = self._near(actions, values, each, size)
-            actions = np.concatenate((actions, near), axis=1)
-            values = np.concatenate((values, self.values(observation, near, scene, coarse=coarse)), axis=1)
+            some = self._near(actions, values, each, size)
+            actions = np.concatenate((actions, some), axis=1)
+            others = self.values(observation, some, scene, near=near, coarse=coarse)
+            values = np.concatenate((values, others), axis=1)
         return actions, values
 
     def _near(self, actions: Numbers, values: Numbers, each: int, size: int) -> Numbers:
