@@ -36,6 +36,7 @@ from viapoint.training.live.scene_draws import (
 )
 from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
 from viapoint.training.live.setting import Setting, Shared
+from viapoint.training.plotting.video import write_mp4
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
@@ -184,12 +185,12 @@ def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevati
 def test_films_have_every_frame(tmp_path):
     frames = [np.full((48, 64, 3), 40 * k, dtype=np.uint8) for k in range(5)]
     path = tmp_path / "film.mp4"
-    path.write_bytes(playback.mp4(frames, 25.0))
+    assert write_mp4(path, frames, 25.0) == 5
     number, seconds = imageio_ffmpeg.count_frames_and_secs(path)
     assert number == 5
     assert seconds == pytest.approx(0.2, abs=0.05)
     with pytest.raises(ValueError, match="at least one frame"):
-        playback.mp4([], 25.0)
+        playback.Playback(None, None, None).film(iter(()), 1.0, print)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_every_link_of_the_whole_arm_clears():
     assert not (done.success & (done.info["min_clearance"] <= 0.0)).any()
 
 
-def test_where_there_is_no_way_it_gives_up():
+def test_where_there_is_no_way_it_gives_up(monkeypatch):
     """A ring of bars around the start."""
     pytest.importorskip("ompl")
     start, goal = np.array([-0.25, 0.35]), np.array([0.15, 0.35])
@@ -57,8 +57,9 @@ def test_where_there_is_no_way_it_gives_up():
     rows = np.array([[*(start + bar[:2]), *bar[2:], 0.01] for bar in ring])
     simulation = SceneSimulation(WHOLE, 1)
     scenes = Scenes(start[None], goal[None], np.concatenate((rows, np.zeros((1, 5))))[None])
-    budget = ompl_planner.MotionPlannerBudget(attempts=1, seconds=0.05)
-    method = ompl_planner.MotionPlannerMethod(simulation, budget=budget)
+    monkeypatch.setattr(ompl_planner, "MARGINS", ompl_planner.MARGINS[:1])
+    monkeypatch.setattr(ompl_planner, "PATIENCE", 0.05)
+    method = ompl_planner.MotionPlanner(simulation)
     done = method.execute(scenes, method.decide({}, scenes))
     assert not done.success.any()
 

@@ -105,7 +105,7 @@ def test_planners_solve_a_scene_with_a_box():
     pytest.importorskip("ompl")
     from viapoint.training.planners.ompl_planner import MotionPlanner
 
-    plan = MotionPlanner(simulation.task)(scenes)
+    plan = MotionPlanner(simulation).plan(scenes)
     assert simulation.execute_plan(scenes, plan).success.all()
     simulation.close()
     env.close()

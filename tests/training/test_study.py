@@ -302,8 +302,8 @@ def test_a_search_of_equal_time_takes_nearly_the_whole_time(tmp_path, monkeypatc
     study = study_of(tmp_path)
     (baseline,) = (each for each in study.baselines if each.name == "in-time")
     monkeypatch.setattr(timing, "method_of", lambda search, *_, **__: search.checks)
-    monkeypatch.setattr(timing, "median_time", lambda _, __, checks: 0.001 + 1e-5 * checks**power)
-    checks, took = timing.checks_within(study, study.environments[0], baseline, seconds)
+    monkeypatch.setattr(timing, "median_time", lambda _, checks: 0.001 + 1e-5 * checks**power)
+    checks, took = timing.checks_within(study.environments[0], baseline, seconds)
     assert took == pytest.approx(0.001 + 1e-5 * checks**power)
     if took > seconds:
         assert checks == timing.FEWEST_CHECKS

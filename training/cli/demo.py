@@ -46,7 +46,7 @@ def run(config: DemoConfig) -> None:
     frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
     record = _measured(config, agent, frozen)
     pictures: dict[str, Callable[[Path], Any]] = {
-        "learning_curve.png": lambda path: plots.learning_curve(path, {"agent": trained.curve}),
+        "learning_curve.png": lambda path: plots.learning_curve(path, trained.curve),
         "success_by_band.png": lambda path: plots.success_by_band(path, record),
         "gallery.png": lambda path: gallery(
             path,

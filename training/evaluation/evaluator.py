@@ -395,19 +395,27 @@ def _distances(scenes: Scenes | ChangingScenes) -> Float:
 def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:
     """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch."""
     times: list[float] = []
+    for seconds in single_decision_times(method, scenes, simulation, TIMED_DECISIONS + 1, TIMING_BUDGET):
+        times.append(seconds)
+        usual = float(np.median(times[1:] or [seconds / 20.0]))  # the first may warm up
+        if usual > SLOW_DECISION:
+            return np.array([in_batch])
+    return np.array(times[1:] or times)
+
+
+def single_decision_times(
+    method: Method, scenes: Scenes, simulation: SceneSimulation, most: int, budget: float
+) -> Iterator[float]:
+    """Yield the wall times of up to `most` single decisions, [s]; none begins when the budget, [s], is spent."""
     began = time.perf_counter()
-    for row in range(min(TIMED_DECISIONS + 1, len(scenes.start))):
+    for row in range(min(most, len(scenes.start))):
         one = scenes.take(slice(row, row + 1))
         observation = simulation.observe(one)
         before = time.perf_counter()
         method.decide(observation, one)
-        times.append(time.perf_counter() - before)
-        usual = float(np.median(times[1:])) if row else times[0] / 20.0  # the first may warm up
-        if usual > SLOW_DECISION:
-            return np.array([in_batch])
-        if time.perf_counter() - began > TIMING_BUDGET:
+        yield time.perf_counter() - before
+        if time.perf_counter() - began > budget:
             break
-    return np.array(times[1:] or times)
 
 
 @contextmanager

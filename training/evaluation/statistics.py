@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +11,9 @@ from scipy import stats
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import whole_number
+
+CONFIDENCE = 0.95
+"""Confidence of all intervals."""
 
 
 class Interval(NamedTuple):
@@ -35,20 +37,19 @@ class Comparison(NamedTuple):
     """Two-sided p-value of the exact McNemar test."""
 
 
-def wilson(successes: int, trials: int, confidence: float = 0.95) -> Interval:
+def wilson(successes: int, trials: int) -> Interval:
     """Return Wilson's score interval of a success rate; without trials it is (nan, 0, 1).
 
     Recommended by Brown, Cai and DasGupta 2001, Stat. Sci. 16; computed by `scipy.stats.binomtest`.
 
     Raises:
-        ValueError: Not 0 <= successes <= trials, or not 0 < confidence < 1.
+        ValueError: Not 0 <= successes <= trials.
         TypeError: A count is not an integer.
     """
-    _check_confidence(confidence)
     if successes == trials == 0:
         return Interval(math.nan, 0.0, 1.0)
     test = stats.binomtest(successes, trials)
-    low, high = test.proportion_ci(confidence, method="wilson")
+    low, high = test.proportion_ci(CONFIDENCE, method="wilson")
     return Interval(test.statistic, float(low), float(high))
 
 
@@ -96,15 +97,9 @@ def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:
 
 
 def across_seeds(
-    scores: ArrayLike,
-    strata: ArrayLike,
-    generator: np.random.Generator,
-    *,
-    statistic: Callable[..., Any] = interquartile_mean,
-    confidence: float = 0.95,
-    samples: int = 2_000,
+    scores: ArrayLike, strata: ArrayLike, generator: np.random.Generator, *, samples: int = 2_000
 ) -> Interval:
-    """Return an aggregate over seeds of each seed's mean over scenes, with a two-way bootstrap interval.
+    """Return the interquartile mean over seeds of each seed's mean over scenes, with a two-way bootstrap interval.
 
     The interval is for other seeds in other scenes of the same distribution. All agents meet the same scenes, so a draw
     takes seeds as whole rows and scenes as whole columns, scenes within their strata. Were the entries drawn one by
@@ -120,14 +115,12 @@ def across_seeds(
         scores: Scores, shape (seeds, scenes).
         strata: Stratum of each scene, such as its band, shape (scenes,).
         generator: Random generator of the draws.
-        statistic: Aggregate of the seeds' means, a function of an array and of the axis of the seeds.
-        confidence: Confidence of the interval.
         samples: Number of draws.
 
     Raises:
         ValueError: The scores or the strata have another shape, or a score is no number.
     """
-    _check_draws(confidence, samples)
+    whole_number("samples", samples, 1)
     table, groups = _scores(scores), np.asarray(strata)
     if table.ndim != 2 or not table.size:
         raise ValueError(f"scores must have shape (seeds, scenes), got {table.shape}")
@@ -136,25 +129,20 @@ def across_seeds(
     seeds, scenes = table.shape
     _, at, group = np.unique(groups, return_index=True, return_inverse=True)
     if (table == table[0, at][group]).all() and np.isin(table[0], (0.0, 1.0)).all():
-        return wilson(int(table[0].sum()), scenes, confidence)
+        return wilson(int(table[0].sum()), scenes)
     times_drawn = np.zeros((scenes, samples))
     for each in range(group.max() + 1):
         rows = np.flatnonzero(group == each)
         times_drawn[rows] = generator.multinomial(len(rows), np.full(len(rows), 1 / len(rows)), samples).T
     means = table @ times_drawn / scenes
     chosen = generator.integers(seeds, size=(seeds, samples))
-    draws = statistic(np.take_along_axis(means, chosen, axis=0), axis=0)
-    low, high = np.quantile(draws, (0.5 - confidence / 2.0, 0.5 + confidence / 2.0))
-    return Interval(float(statistic(table.mean(axis=1), axis=0)), float(low), float(high))
+    draws = interquartile_mean(np.take_along_axis(means, chosen, axis=0), axis=0)
+    low, high = np.quantile(draws, (0.5 - CONFIDENCE / 2.0, 0.5 + CONFIDENCE / 2.0))
+    return Interval(float(interquartile_mean(table.mean(axis=1))), float(low), float(high))
 
 
 def probability_of_improvement(
-    first: ArrayLike,
-    second: ArrayLike,
-    generator: np.random.Generator,
-    *,
-    confidence: float = 0.95,
-    samples: int = 2_000,
+    first: ArrayLike, second: ArrayLike, generator: np.random.Generator, *, samples: int = 2_000
 ) -> Interval:
     """Return the probability that a run of the first method beats one of the second, with a bootstrap interval.
 
@@ -167,13 +155,12 @@ def probability_of_improvement(
         first: Scores of the runs, shape (N,).
         second: Scores of the runs, shape (M,).
         generator: Random generator of the draws.
-        confidence: Confidence of the interval.
         samples: Number of draws.
 
     Raises:
         ValueError: The scores have other shapes, or one is no number.
     """
-    _check_draws(confidence, samples)
+    whole_number("samples", samples, 1)
     x, y = _scores(first), _scores(second)
     if x.ndim != 1 or y.ndim != 1 or not x.size or not y.size:
         raise ValueError(f"both must have shape (runs,), got {x.shape} and {y.shape}")
@@ -182,7 +169,7 @@ def probability_of_improvement(
         [np.repeat(each, 2 if each.size == 1 else 1) for each in (x, y)],
         _superiority,
         n_resamples=samples,
-        confidence_level=confidence,
+        confidence_level=CONFIDENCE,
         method="percentile",
         vectorized=True,
         rng=generator,
@@ -223,13 +210,3 @@ def _scores(values: ArrayLike) -> Float:
     if np.isnan(scores := np.asarray(values, dtype=np.float64)).any():
         raise ValueError(f"scores and lengths must be numbers, got nan in an array of shape {scores.shape}")
     return scores
-
-
-def _check_draws(confidence: float, samples: int) -> None:
-    _check_confidence(confidence)
-    whole_number("samples", samples, 1)
-
-
-def _check_confidence(confidence: float) -> None:
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")

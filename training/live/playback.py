@@ -5,16 +5,16 @@ from __future__ import annotations
 import io
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
 from viapoint.envs.common.types import Float, Frame
 from viapoint.training.live.job_thread import TICK
+from viapoint.training.plotting.video import write_mp4
 
 if TYPE_CHECKING:
     import viser
@@ -85,7 +85,11 @@ class Playback:
                     tell(f"Rendering the film: {segment.time[row]:.2f} s of the movement so far.")
                     frames.append(self.photograph("jpeg"))
         frames += frames[-1:] * round(LINGER * FILM_FPS)
-        return mp4(frames, FILM_FPS)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            if not write_mp4(path, (frame[..., :3] for frame in frames), FILM_FPS):
+                raise ValueError("a film needs at least one frame")
+            return path.read_bytes()
 
     def photograph(self, kind: Any) -> Any:
         """Return a picture of the present view, rendered by the browser."""
@@ -124,24 +128,3 @@ def png(picture: Frame) -> bytes:
     file = io.BytesIO()
     ground.convert("RGB").save(file, "PNG", optimize=True)
     return file.getvalue()
-
-
-def mp4(frames: Iterable[Frame], fps: float) -> bytes:
-    """Return frames of equal size, with even numbers of pixels, as an MP4 file (H.264)."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        writer = None
-        for frame in frames:
-            if writer is None:
-                height, width = frame.shape[:2]
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
-                    output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1,
-                    ffmpeg_log_level="error",
-                )  # fmt: skip
-                writer.send(None)
-            writer.send(np.ascontiguousarray(frame[..., :3]))
-        if writer is None:
-            raise ValueError("a film needs at least one frame")
-        writer.close()
-        return path.read_bytes()

@@ -13,7 +13,7 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner
-from viapoint.training.planners.ompl_planner import MotionPlannerMethod
+from viapoint.training.planners.ompl_planner import MotionPlanner
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
 from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation
 from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
@@ -53,15 +53,14 @@ class Constant:
     """Action that succeeds in most scenes of the training distribution."""
 
     name = "best constant action"
+    n_candidates = n_scenes = 256
 
-    def __init__(
-        self, simulation: SceneSimulation, *, seed: int = 0, candidates: int = 256, number: int = 256
-    ) -> None:
-        generator = np.random.default_rng(seed)
-        scenes = simulation.task.sampler()([generator] * number)
-        actions = generator.uniform(-1.0, 1.0, (candidates, simulation.task.action.size))
+    def __init__(self, simulation: SceneSimulation) -> None:
+        generator = np.random.default_rng(0)
+        scenes = simulation.task.sampler()([generator] * self.n_scenes)
+        actions = generator.uniform(-1.0, 1.0, (self.n_candidates, simulation.task.action.size))
         progress = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
-        solved = [simulation(scenes, np.tile(action, (number, 1))).success.sum() for action in progress]
+        solved = [simulation(scenes, np.tile(each, (self.n_scenes, 1))).success.sum() for each in progress]
         self._action = actions[np.argmax(solved)]
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -72,9 +71,9 @@ class Constant:
 class RandomVias:
     """Best of some random actions by simulated reward; a single one is not simulated."""
 
-    def __init__(self, simulation: SceneSimulation, count: int, *, seed: int = 0) -> None:
+    def __init__(self, simulation: SceneSimulation, count: int) -> None:
         self._simulation, self._count = simulation, count
-        self._generator = np.random.default_rng(seed)
+        self._generator = np.random.default_rng(0)
         self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -165,7 +164,7 @@ METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "random16": lambda simulation: RandomVias(simulation, 16),
     "random80": lambda simulation: RandomVias(simulation, 80),
     "planner": Planner,
-    "ompl": MotionPlannerMethod,
+    "ompl": MotionPlanner,
     **SEARCHES,
 }
 """Factories of baselines by their names on the command line."""

@@ -92,18 +92,16 @@ class Planner:
 
     name = "planner"
 
-    def __init__(
-        self, simulation: SceneSimulation, *, seed: int = 0, budget: PlannerBudget | None = None
-    ) -> None:
-        self._simulation, self._budget, self._seed = simulation, budget or PlannerBudget(), seed
+    def __init__(self, simulation: SceneSimulation, *, budget: PlannerBudget | None = None) -> None:
+        self._simulation, self._budget = simulation, budget or PlannerBudget()
         self._size = simulation.task.action.size
 
     def __call__(self, scenes: Scenes) -> PlannedActions:
-        """Return the best action found in each of N scenes; each depends on its scene and the seed alone."""
+        """Return the best action found in each of N scenes; each depends on its scene alone."""
         number = len(scenes.start)
         nothing = np.zeros(number, dtype=bool), np.zeros(number, dtype=np.int64)
         found = PlannedActions(np.zeros((number, self._size)), np.full(number, -np.inf), *nothing)
-        generator = np.random.default_rng(self._seed)
+        generator = np.random.default_rng(0)
         self._try(scenes, np.arange(number), np.zeros((number, 1, self._size)), found)
         count = self._budget.first
         while True:
@@ -146,7 +144,7 @@ class Planner:
         population = self._budget.population
         rows = np.arange(len(found.action))
         searches = [
-            CMA(mean=action, sigma=0.2, bounds=bounds, population_size=population, seed=self._seed)
+            CMA(mean=action, sigma=0.2, bounds=bounds, population_size=population, seed=0)
             for action in found.action
         ]
         for _ in range(self._budget.generations):

@@ -10,8 +10,7 @@ chart of the configuration space, and planning in joint space would find nothing
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +23,13 @@ from viapoint.envs.geometry.rows import has_shapes, pair_distance
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 
-if TYPE_CHECKING:
-    from viapoint.envs.mdp.task import Task
-
 Clear = Callable[[Float, Float], bool]
 """Predicate for a straight line between two hand positions that is clear."""
 
-MARGINS = (0.010, 0.004, 0.001)
-"""Required clearances of a path, tried in this order, [m]."""
+MARGINS = (0.010, 0.004, 0.001, 0.001)
+"""Required clearances of a path in each attempt, until one can be made smooth, [m]."""
+PATIENCE = 0.25
+"""Time limit for each path, [s]."""
 BOX_MARGIN = 0.30
 """Margin of the planning box around start and goal, [m]."""
 CHECK_SPACING = 0.005
@@ -60,28 +58,23 @@ def import_ompl() -> Any:
     return ompl
 
 
-@dataclass(frozen=True, kw_only=True)
-class MotionPlannerBudget:
-    """Budget of the planner in each scene."""
-
-    attempts: int = 4
-    """Greatest number of paths, until one can be made smooth."""
-    seconds: float = 0.25
-    """Time limit for each path, [s]."""
-
-
 class MotionPlanner:
-    """Planner of one movement in one scene; the library has one random generator for all its planners."""
+    """Motion planner as a method of the tables; its movements have as many via-points as they need.
 
-    def __init__(self, task: Task, *, seed: int = 1, budget: MotionPlannerBudget | None = None) -> None:
-        self._task, self._budget, self._ompl = task, budget or MotionPlannerBudget(), import_ompl()
-        self._ompl.util.RNG.setSeed(max(seed, 1))
+    A decision is a row: number of via-points, total duration [s], via-points [m], then zeros. The library has one
+    random generator for all its planners.
+    """
 
-    def __call__(self, scene: Scenes) -> Plan:
+    name = "motion planner (OMPL)"
+
+    def __init__(self, simulation: SceneSimulation) -> None:
+        self._simulation, self._task, self._ompl = simulation, simulation.task, import_ompl()
+        self._ompl.util.RNG.setSeed(1)
+
+    def plan(self, scene: Scenes) -> Plan:
         """Return the first smooth plan of one scene that is clear, or else the one with the most clearance; one row."""
         best, merit = self._smooth(np.concatenate((scene.start, scene.goal))), -np.inf
-        for attempt in range(self._budget.attempts):
-            margin = MARGINS[min(attempt, len(MARGINS) - 1)]
+        for margin in MARGINS:
             path = self._path(scene, margin)
             if path is None:
                 continue
@@ -97,7 +90,7 @@ class MotionPlanner:
     def _path(self, scene: Scenes, margin: float) -> Float | None:
         """Return the corners of a clear path with start and goal, shape (P, D), [m]; None if none is found in time."""
         ends = np.concatenate((scene.start, scene.goal))
-        corners = _search(self._ompl, ends, self._clear(scene, margin), self._budget.seconds)
+        corners = _search(self._ompl, ends, self._clear(scene, margin), PATIENCE)
         return corners if corners is None else np.concatenate((ends[:1], corners[1:-1], ends[1:]))
 
     def _smooth(self, waypoints: Float) -> Plan:
@@ -141,27 +134,12 @@ class MotionPlanner:
 
         return clear
 
-
-class MotionPlannerMethod:
-    """Motion planner as a method of the tables; its movements have as many via-points as they need.
-
-    A decision is a row: number of via-points, total duration [s], via-points [m], then zeros.
-    """
-
-    name = "motion planner (OMPL)"
-
-    def __init__(
-        self, simulation: SceneSimulation, *, seed: int = 1, budget: MotionPlannerBudget | None = None
-    ) -> None:
-        self._simulation = simulation
-        self._planner = MotionPlanner(simulation.task, seed=seed, budget=budget)
-
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return plans as rows, see :class:`~viapoint.training.planners.baselines.Method`."""
         d = scenes.start.shape[-1]
         rows = np.zeros((len(scenes.start), 2 + VIA_COUNTS[-1] * d))
         for i, row in enumerate(rows):
-            plan = self._planner(scenes.take([i]))
+            plan = self.plan(scenes.take([i]))
             vias = plan.waypoints[0, 1:-1]
             row[0], row[1] = len(vias), plan.durations.sum()
             row[2 : 2 + vias.size] = vias.ravel()

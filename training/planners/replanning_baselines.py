@@ -49,9 +49,9 @@ class ReplanningPlanner:
 
     name = "planner, knows all courses"
 
-    def __init__(self, simulation: EpisodeSimulation, seed: int = 0) -> None:
+    def __init__(self, simulation: EpisodeSimulation) -> None:
         self._task, self._limit = simulation.task, simulation.time_limit
-        self._generator = np.random.default_rng(seed)
+        self._generator = np.random.default_rng(0)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
         """Return the best actions, see :class:`viapoint.training.planners.baselines.Method`."""

@@ -23,6 +23,8 @@ TILE = 2.6
 """Width of one picture, [inch]."""
 RESOLUTION = 110
 """Resolution, [dots per inch]."""
+COLUMNS = 4
+"""Greatest number of pictures in a row."""
 LINE = 28
 """Greatest number of characters of the heading above one picture."""
 VIEW = ((-0.53, 0.45), (-0.09, 0.75))
@@ -62,23 +64,15 @@ class Entry:
         return "collision" if self.rollout.contact.any() else "missed"
 
 
-def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, heading: str = "") -> Path:
-    """Draw movements in a grid, each titled with its outcome, and save the page as a PNG.
-
-    Args:
-        path: PNG file; its folder must exist.
-        entries: One or more movements.
-        columns: Pictures in a row.
-        heading: Heading of the page.
+def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
+    """Draw movements in a grid, each titled with its outcome, and save the page as a PNG file in an existing folder.
 
     Raises:
-        ValueError: There is no entry or no column.
+        ValueError: There is no entry.
     """
     if not entries:
         raise ValueError("entries must hold at least one movement")
-    if columns < 1:
-        raise ValueError(f"columns must be 1 or more, got {columns!r}")
-    columns = min(columns, len(entries))
+    columns = min(COLUMNS, len(entries))
     rows = -(-len(entries) // columns)
     tall = TILE * (VIEW[1][1] - VIEW[1][0]) / (VIEW[0][1] - VIEW[0][0]) + 0.3
     lines = textwrap.wrap(heading, LINE * columns)
@@ -97,7 +91,6 @@ def gallery(path: str | Path, entries: Sequence[Entry], columns: int = 4, *, hea
     _legend(figure, columns)
     if lines:
         figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
-    path = Path(path)
     figure.savefig(path)
     return path
 

@@ -21,38 +21,24 @@ AXES = (
 """Axes of the learning curve: key of the record, label, scale; keys that a record lacks are left out."""
 
 
-def learning_curve(
-    path: Path, curves: Mapping[str, Sequence[Mapping[str, Any]]], *, ceiling: float | None = None
-) -> Path:
+def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
     """Draw success on the validation scenes against decisions, simulated and training time, with its Wilson band.
-
-    Args:
-        path: PNG file.
-        curves: Records of the learning curve of each run, by its label.
-        ceiling: Success rate of the planner, drawn as a dashed line.
 
     Raises:
         ValueError: There is no record.
     """
-    if not any(curves.values()):
+    if not curve:
         raise ValueError("there is no learning curve to draw: the run was never evaluated")
-    every = [record for records in curves.values() for record in records]
-    shown = [axis for axis in AXES if all(axis[0] in record for record in every)]
+    shown = [axis for axis in AXES if all(axis[0] in record for record in curve)]
+    rate, low, high = (
+        100.0 * np.array([record["success"][part] for record in curve]) for part in ("rate", "low", "high")
+    )
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
     axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for ax, (key, label, scale) in zip(axes, shown, strict=True):
-        for name, records in curves.items():
-            x = scale * np.array([record[key] for record in records])
-            rate, low, high = (
-                100.0 * np.array([record["success"][part] for record in records])
-                for part in ("rate", "low", "high")
-            )
-            line = ax.plot(
-                x, rate, marker="o", markersize=3.5, label=name, color=BLUE if len(curves) == 1 else None
-            )
-            ax.fill_between(x, low, high, alpha=0.2, linewidth=0.0, color=line[0].get_color())
-        if ceiling is not None:
-            ax.axhline(100.0 * ceiling, color="0.4", linestyle="--", linewidth=1.0, label="planner")
+        x = scale * np.array([record[key] for record in curve])
+        ax.plot(x, rate, marker="o", markersize=3.5, label="agent", color=BLUE)
+        ax.fill_between(x, low, high, alpha=0.2, linewidth=0.0, color=BLUE)
         ax.set_xlabel(label)
         ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 102.0)

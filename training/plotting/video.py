@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,36 +28,18 @@ CAPTION = 48
 """Height of the caption below the picture, [pixels]."""
 BLOCK = 16
 """Encoders need sides that are multiples of this, [pixels]."""
+SPEED = 0.5
+"""Speed of videos relative to real time."""
+PAUSE = 0.8
+"""Time for which each result stays, [s]."""
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Video:
-    """Video file with its properties."""
-
-    path: Path
-    frames: int
-    """Number of frames."""
-    rendered: bool
-    """True if rendered with OpenGL, False if drawn from above."""
-
-    def __str__(self) -> str:
-        """Return the path, with a note if OpenGL is missing."""
-        return f"{self.path}" if self.rendered else f"{self.path} (drawn from above: OpenGL is not available)"
-
-
 def record_video(
-    path: str | Path,
-    env: gym.Env[Any, Any],
-    scenes: Scenes,
-    decide: Decide,
-    *,
-    name: str = "agent",
-    speed: float = 0.5,
-    pause: float = 0.8,
-) -> Video:
-    """Record one movement in each scene as an MP4.
+    path: str | Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, *, name: str = "agent"
+) -> int:
+    """Record one movement in each scene as an MP4, and return the number of frames.
 
     Without an OpenGL library the movements are drawn from above, and one warning names the package to install.
 
@@ -69,8 +49,6 @@ def record_video(
         scenes: Scenes with no more obstacles than the environment has rows.
         decide: Function from observation and scene, of one row each, to actions, shape (1, m).
         name: Name of the method, for the caption.
-        speed: Speed of the video relative to real time.
-        pause: Time for which each result stays, [s].
 
     Raises:
         ValueError: The path has another suffix, the environment has another render mode, or there is no scene.
@@ -85,15 +63,15 @@ def record_video(
     camera = Camera(env)
     part = path.with_name(f".{path.stem}.part.mp4")
     try:
-        count = _write(part, _scenes(camera, scenes, decide, name, pause * speed), camera.fps * speed)
+        count = write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
-    return Video(path=path, frames=count, rendered=camera.rendered)
+    return count
 
 
-def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: float) -> Iterator[Frame]:
-    """Yield the frames of a movement in each scene and of a pause after it, [s] of the movement's time."""
+def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterator[Frame]:
+    """Yield the frames of a movement in each scene and of a pause after it."""
     number = len(scenes.start)
     for i in range(number):
         scene = scenes.take([i])
@@ -104,27 +82,28 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str, pause: fl
             observation, _, terminated, truncated, info = camera.env.step(action.astype(np.float32))
             over = terminated or truncated
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        yield from _with_captions(
-            camera.frames(scene), left, *describe_outcome(info), hold=round(pause * camera.fps)
-        )
+        hold = round(PAUSE * SPEED * camera.fps)
+        yield from _with_captions(camera.frames(scene), left, *describe_outcome(info), hold=hold)
 
 
-def _write(path: Path, frames: Iterator[Frame], fps: float) -> int:
-    """Encode frames of equal size and return their number."""
-    first = next(frames)
-    height, width = first.shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
-        output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1, ffmpeg_log_level="error",
-    )  # fmt: skip
-    count = 0
+def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
+    """Encode frames of equal size, with even numbers of pixels, as an MP4 file (H.264), and return their number."""
+    count, writer = 0, None
     try:
-        writer.send(None)
-        for frame in itertools.chain([first], frames):
+        for frame in frames:
+            if writer is None:
+                height, width = frame.shape[:2]
+                writer = imageio_ffmpeg.write_frames(
+                    str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
+                    output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1,
+                    ffmpeg_log_level="error",
+                )  # fmt: skip
+                writer.send(None)
             writer.send(np.ascontiguousarray(frame))
             count += 1
     finally:
-        writer.close()
+        if writer is not None:
+            writer.close()
     return count
 
 

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, NamedTuple, Self, get_args
 
 from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.model_io import ALGORITHMS, argument_names
@@ -83,6 +83,31 @@ class Entry:
     """True to measure the time of single decisions."""
 
 
+class Mode(NamedTuple):
+    """Decision mode of an agent."""
+
+    checks: int = 0
+    """Number of proposals that are checked with computed geometry."""
+    untrained: bool = False
+    """True for the network before training."""
+    unrevised: bool = False
+    """True for the first plan alone."""
+
+    @property
+    def _parts(self) -> list[str]:
+        parts = {"untrained": self.untrained, "unrevised": self.unrevised, f"{self.checks}": self.checks}
+        return [part for part, there in parts.items() if there]
+
+    @property
+    def name(self) -> str:
+        """Name in files."""
+        return "-".join(self._parts) or "alone"
+
+    def row(self, agent: str) -> str:
+        """Return the id of an agent's row, such as `viaq`, `viaq/16`, `viaq/untrained/16` and `viaq/unrevised`."""
+        return "/".join([agent, *self._parts])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Agent(Entry):
     """Learning algorithm with its settings."""
@@ -103,6 +128,13 @@ class Agent(Entry):
     """Cores of each training."""
     resources: Values = field(default_factory=dict)
     """Resources of each training that a node of the cluster must have, such as {GPU: 1}."""
+
+    def modes(self, env_id: str | None = None) -> list[Mode]:
+        """Return all decision modes, or those in an environment, the network alone first if it is asked for."""
+        revised = env_id is None or env_id in REPLANNING_TASKS
+        found = [Mode(checks) for checks in self.checks]
+        found += [Mode(unrevised=True)] if self.unrevised and revised else []
+        return found + [Mode(checks, untrained=True) for checks in self.checks if self.untrained]
 
     def config(self, env: Environment, seed: int, out: Path) -> TrainConfig:
         """Return the configuration of a training; `policy_kwargs` are merged with those of the preset.
@@ -273,17 +305,9 @@ BASELINE_FIELDS = (*_ENTRY_FIELDS, *_BASELINE_OWN)
 """Fields of a baseline."""
 
 
-def row_id(name: str, checks: int = 0, *, untrained: bool = False, unrevised: bool = False) -> str:
-    """Return the id of a row: `viaq`, `viaq/16`, `viaq/untrained`, `viaq/untrained/16`, `viaq/unrevised`."""
-    parts = [name, *(["untrained"] if untrained else []), *(["unrevised"] if unrevised else [])]
-    return "/".join([*parts, *([str(checks)] if checks else [])])
-
-
 def rows_of(agent: Agent) -> list[str]:
     """Return the ids of an agent's rows."""
-    found = [row_id(agent.name, checks) for checks in agent.checks]
-    found += [row_id(agent.name, unrevised=True)] if agent.unrevised else []
-    return found + [row_id(agent.name, each, untrained=True) for each in agent.checks if agent.untrained]
+    return [mode.row(agent.name) for mode in agent.modes()]
 
 
 def _environments(given: Any, scenes: Any, folder: Path) -> Iterator[Environment]:

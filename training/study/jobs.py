@@ -32,8 +32,8 @@ from viapoint.training.planners.baselines import Method
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
-from viapoint.training.study.config import Agent, Baseline, Environment, Study
-from viapoint.training.study.methods import Mode, method_of, method_of_mode, modes
+from viapoint.training.study.config import Agent, Baseline, Environment, Mode, Study
+from viapoint.training.study.methods import method_of, method_of_mode
 from viapoint.training.study.runner import Job
 
 STORED_OUTCOMES = ("is_success", "collision", "jerk_ratio", "duration")
@@ -68,20 +68,25 @@ class Cell:
         return self.agent.config(self.env, self.seed, root / self.folder)
 
 
-def cells(study: Study) -> list[Cell]:
-    """Return all trainings, ordered by seed, so that every table has its first seed early."""
-    found = [
-        Cell(env=study.environment(name), agent=agent, seed=seed)
-        for agent in study.agents
-        for name in agent.environments
-        for seed in agent.seeds
-    ]
-    return sorted(found, key=lambda cell: cell.seed)
+def cells_of(agent: Agent, env: Environment) -> list[Cell]:
+    """Return the trainings of an agent in an environment."""
+    return [Cell(env=env, agent=agent, seed=seed) for seed in agent.seeds]
+
+
+def trained(study: Study, env: Environment, agent: Agent) -> list[Cell]:
+    """Return the trainings of an agent that have ended."""
+    return [cell for cell in cells_of(agent, env) if state(cell, study.out) == "trained"]
 
 
 def training_jobs(study: Study, steps: Sequence[str]) -> Iterator[Job]:
-    """Yield a job for each training of which something is missing."""
-    for cell in cells(study):
+    """Yield a job for each training of which something is missing, by seed: every table has its first seed early."""
+    every = [
+        cell
+        for agent in study.agents
+        for name in agent.environments
+        for cell in cells_of(agent, study.environment(name))
+    ]
+    for cell in sorted(every, key=lambda cell: cell.seed):
         if is_complete(cell, study.out, steps):
             continue
         yield Job(
@@ -94,9 +99,13 @@ def training_jobs(study: Study, steps: Sequence[str]) -> Iterator[Job]:
         )
 
 
-def baseline_jobs(study: Study, baselines: Sequence[tuple[Baseline, Environment]]) -> Iterator[Job]:
-    """Yield a job for each baseline of which a measurement is missing."""
-    for baseline, env in baselines:
+def baseline_jobs(study: Study, *, of_equal_time: bool) -> Iterator[Job]:
+    """Yield a job for each baseline of which a measurement is missing: searches of equal time, or all others."""
+    pairs = [(each, study.environment(name)) for each in study.baselines for name in each.environments]
+    for each, env in pairs:
+        baseline = with_checks(study, env, each)
+        if baseline is None or (each.time_of is not None) is not of_equal_time:
+            continue
         sets = sets_of(env, baseline)
         if all(baseline_record(study, baseline, env, name, each) for name, each in sets.items()):
             continue
@@ -108,14 +117,12 @@ def baseline_jobs(study: Study, baselines: Sequence[tuple[Baseline, Environment]
         )
 
 
-def pairs(study: Study) -> list[tuple[Baseline, Environment]]:
-    """Return all baselines with their environments, without those whose number of checks a timing decides."""
-    return [
-        (baseline, study.environment(name))
-        for baseline in study.baselines
-        for name in baseline.environments
-        if baseline.time_of is None
-    ]
+def with_checks(study: Study, env: Environment, baseline: Baseline) -> Baseline | None:
+    """Return a baseline with its number of checks; None for a search of equal time that has not been timed."""
+    if baseline.time_of is None:
+        return baseline
+    checks = times_of(study, env).get(baseline.name, {}).get("checks")
+    return None if checks is None else dataclasses.replace(baseline, checks=checks)
 
 
 def is_complete(cell: Cell, root: Path, steps: Sequence[str]) -> bool:
@@ -127,7 +134,7 @@ def is_complete(cell: Cell, root: Path, steps: Sequence[str]) -> bool:
         return "evaluate" not in steps or all(
             stored(root / cell.folder / evaluation_path(name, mode), identity_of(frozen, model, mode))
             for name, frozen in sets_of(cell.env).items()
-            for mode in modes(cell.agent, cell.env)
+            for mode in cell.agent.modes(cell.env.id)
         )
     except (ValueError, OSError):
         return False  # running the job reports the error
@@ -177,7 +184,7 @@ def agent_evaluations(root: Path, cell: Cell, name: str, frozen: FrozenScenes) -
     run = Run(root / cell.folder)
     kwargs = dict(cell.training(root).env_kwargs)
     found, model = {}, None
-    for mode in modes(cell.agent, cell.env):
+    for mode in cell.agent.modes(cell.env.id):
         path, wanted = run.folder / evaluation_path(name, mode), identity_of(frozen, run.best, mode)
         record = stored(path, wanted)
         if record is None:
@@ -287,9 +294,8 @@ def measured_files(
         if isinstance(entry, Baseline):
             yield study.out / path_of(entry, env, name)
         else:
-            for seed in entry.seeds:
-                folder = Cell(env=env, agent=entry, seed=seed).folder
-                yield study.out / folder / evaluation_path(name, mode or Mode())
+            for cell in cells_of(entry, env):
+                yield study.out / cell.folder / evaluation_path(name, mode or Mode())
 
 
 def stored(path: Path, wanted: Record) -> Record | None:
@@ -314,19 +320,3 @@ def times_of(study: Study, env: Environment) -> Record:
     """Return the stored times by row."""
     path = study.out / path_of_times(env)
     return read_json(path) if path.is_file() else {}
-
-
-def of_equal_time(study: Study, env: Environment) -> list[Baseline]:
-    """Return the searches of equal time in an environment."""
-    return [each for each in study.baselines if each.time_of is not None and env.name in each.environments]
-
-
-def equal_time_pairs(study: Study) -> list[tuple[Baseline, Environment]]:
-    """Return the searches of equal time with the numbers of checks that were timed, and their environments."""
-    found = []
-    for env in study.environments:
-        times = times_of(study, env)
-        for baseline in of_equal_time(study, env):
-            if "checks" in times.get(baseline.name, {}):
-                found.append((dataclasses.replace(baseline, checks=times[baseline.name]["checks"]), env))
-    return found

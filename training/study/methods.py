@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import REPLANNING_TASKS
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.planners.baselines import (
     Method,
@@ -22,39 +21,7 @@ from viapoint.training.scene_sets.scene_set import FrozenScenes
 from viapoint.training.search.candidates import candidate_actions
 from viapoint.training.search.geometry_search import GeometrySearch, registered_task, score_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
-from viapoint.training.study.config import Agent, Baseline, Environment, row_id
-
-
-class Mode(NamedTuple):
-    """Decision mode of an agent."""
-
-    checks: int = 0
-    """Number of proposals that are checked with computed geometry."""
-    untrained: bool = False
-    """True for the network before training."""
-    unrevised: bool = False
-    """True for the first plan alone."""
-
-    @property
-    def name(self) -> str:
-        """Name in files."""
-        return (
-            row_id("", *self[:1], untrained=self.untrained, unrevised=self.unrevised)
-            .strip("/")
-            .replace("/", "-")
-            or "alone"
-        )
-
-    def row(self, agent: Agent) -> str:
-        """Return the id of the row of an agent that decides so."""
-        return row_id(agent.name, self.checks, untrained=self.untrained, unrevised=self.unrevised)
-
-
-def modes(agent: Agent, env: Environment) -> list[Mode]:
-    """Return the decision modes of an agent in an environment, the network alone first if it is asked for."""
-    found = [Mode(checks) for checks in agent.checks]
-    found += [Mode(unrevised=True)] if agent.unrevised and env.id in REPLANNING_TASKS else []
-    return found + [Mode(checks, untrained=True) for checks in agent.checks if agent.untrained]
+from viapoint.training.study.config import Baseline, Environment, Mode
 
 
 class RandomOrder:

@@ -19,19 +19,18 @@ from viapoint.training.io.files import read_json
 from viapoint.training.io.installed import versions
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
-from viapoint.training.study.config import Agent, Baseline, Environment, Study
+from viapoint.training.study.config import Agent, Baseline, Environment, Mode, Study
 from viapoint.training.study.jobs import (
     Cell,
     baseline_record,
-    equal_time_pairs,
     evaluation_path,
     identity_of,
     sets_of,
-    state,
     stored,
     times_of,
+    trained,
+    with_checks,
 )
-from viapoint.training.study.methods import Mode, modes
 
 Numbers = dict[str, Any]
 Records = Mapping[str, Sequence[Numbers]]
@@ -49,7 +48,7 @@ class Row:
     @property
     def id(self) -> str:
         """Id of the row."""
-        return self.entry.name if self.mode is None else self.mode.row(self.entry)  # type: ignore[arg-type]
+        return self.entry.name if self.mode is None else self.mode.row(self.entry.name)
 
     def described(self, env: Environment) -> Numbers:
         """Return the entries that say what the row is of."""
@@ -75,18 +74,14 @@ class Row:
         if self.mode is None:
             return self.entry.label
         checks, untrained, unrevised = self.mode
-        parts = [
-            self.entry.label,
-            *(["untrained"] if untrained else []),
-            *(["no revision"] if unrevised else []),
-        ]
-        return ", ".join([*parts, *([f"{checks} checks"] if checks else [])])
+        words = {"untrained": untrained, "no revision": unrevised, f"{checks} checks": checks}
+        return ", ".join([self.entry.label, *(word for word, said in words.items() if said)])
 
 
 def rows_in(study: Study, env: Environment) -> list[Row]:
     """Return the rows of an environment in the order of the study."""
     here = [each for each in study.agents if env.name in each.environments]
-    found = [Row(entry=agent, mode=mode) for agent in here for mode in modes(agent, env)]
+    found = [Row(entry=agent, mode=mode) for agent in here for mode in agent.modes(env.id)]
     return found + [Row(entry=each) for each in study.baselines if env.name in each.environments]
 
 
@@ -100,7 +95,7 @@ def gather(study: Study, before: Numbers | None = None) -> Numbers:
             for env in study.environments
         },
     }
-    plain: Numbers = _rounded(record)
+    plain: Numbers = json.loads(json.dumps(record), parse_float=lambda digits: round(float(digits), 6))
     return plain
 
 
@@ -164,13 +159,12 @@ def _baseline_records(
     study: Study, env: Environment, baseline: Baseline, sets: Mapping[str, FrozenScenes]
 ) -> Records:
     """Return the stored measurements of a baseline by set."""
-    if baseline.time_of is not None:
-        pairs = {(each.name, where.name): each for each, where in equal_time_pairs(study)}
-        if (baseline.name, env.name) not in pairs:
-            return {}
-        baseline = pairs[baseline.name, env.name]
-    own = sets_of(env, baseline)
-    records = {name: baseline_record(study, baseline, env, name, frozen) for name, frozen in own.items()}
+    found = with_checks(study, env, baseline)
+    if found is None:
+        return {}
+    records = {
+        name: baseline_record(study, found, env, name, frozen) for name, frozen in sets_of(env, found).items()
+    }
     return {name: [record] for name, record in records.items() if record is not None and name in sets}
 
 
@@ -179,12 +173,6 @@ def _evaluation(study: Study, cell: Cell, name: str, frozen: FrozenScenes, mode:
     folder = study.out / cell.folder
     record = stored(folder / evaluation_path(name, mode), identity_of(frozen, Run(folder).best, mode))
     return None if record is None else {**record, "seed": cell.seed}
-
-
-def trained(study: Study, env: Environment, agent: Agent) -> list[Cell]:
-    """Return the trainings of an agent that have ended."""
-    cells = [Cell(env=env, agent=agent, seed=seed) for seed in agent.seeds]
-    return [cell for cell in cells if state(cell, study.out) == "trained"]
 
 
 def _measured(
@@ -363,12 +351,3 @@ def _scene_by_scene(first: Sequence[Numbers], second: Sequence[Numbers]) -> Numb
         "difference": [float(np.median(differences)), min(differences), max(differences)],
         "p_value": max(test.p_value for test in tests),
     }
-
-
-def _rounded(value: Any) -> Any:
-    """Round floats of nested values to a millionth."""
-    if isinstance(value, dict):
-        return {str(name): _rounded(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(each) for each in value]
-    return round(float(value), 6) if isinstance(value, float | np.floating) else value

@@ -13,7 +13,7 @@ from viapoint.training.config.configs import StudyConfig
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.study.config import Environment, Study
 from viapoint.training.study.figures import draw_figures
-from viapoint.training.study.jobs import baseline_jobs, equal_time_pairs, measured_files, pairs, training_jobs
+from viapoint.training.study.jobs import baseline_jobs, measured_files, training_jobs
 from viapoint.training.study.page import write_pages
 from viapoint.training.study.results import Row, gather, rows_in
 from viapoint.training.study.runner import Job, Runner, make_runner
@@ -94,7 +94,7 @@ def run_study(
     if redo:
         _remove_measurements(study, redo, steps, report)
     jobs = list(training_jobs(study, only)) if steps & {"train", "evaluate"} else []
-    jobs += baseline_jobs(study, pairs(study)) if "baselines" in steps else []
+    jobs += baseline_jobs(study, of_equal_time=False) if "baselines" in steps else []
     failed = []
     if jobs or steps & {"baselines", "time"}:
         failed = _measure(study, jobs, steps, on, workers, report)
@@ -151,7 +151,7 @@ def _measure(
     if "time" in steps:
         for line in time_decisions(study):
             report(line)
-    later = list(baseline_jobs(study, equal_time_pairs(study))) if "baselines" in steps else []
+    later = list(baseline_jobs(study, of_equal_time=True)) if "baselines" in steps else []
     if later:
         with make_runner(on, study.out, workers) as runner:
             failed += _run(runner, later, report)

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import time
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.training.algorithms.model_io import load_model
-from viapoint.training.evaluation.evaluator import one_thread
+from viapoint.training.evaluation.evaluator import one_thread, single_decision_times
 from viapoint.training.io.files import write_json
 from viapoint.training.planners.baselines import Method
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.study.config import Agent, Baseline, Environment, Study
+from viapoint.training.scene_sets.scene_set import FrozenScenes
+from viapoint.training.study.config import Agent, Baseline, Environment, Mode, Study
 from viapoint.training.study.jobs import (
-    Cell,
     Record,
     identity,
     identity_of,
-    of_equal_time,
     path_of_times,
     sets_of,
-    state,
     times_of,
+    trained,
 )
-from viapoint.training.study.methods import method_of, method_of_mode, modes
+from viapoint.training.study.methods import method_of, method_of_mode
 
 N_TIMED = 100
 """Greatest number of scenes in which decisions are timed."""
@@ -49,30 +48,21 @@ class Timed(NamedTuple):
     """Id of its row."""
     source: Any
     """Plain values; a time is obsolete if they have changed."""
-    method: Any
-    """Function without arguments that returns the method."""
+    measure: Callable[[], Record]
+    """Function that returns the median time [s] as `median`, and the checks of a search of equal time as `checks`."""
 
 
 def time_decisions(study: Study) -> Iterator[str]:
     """Time what has no time yet, and yield a line about each; trained agents are those of the first seed."""
     for env in study.environments:
         times = times_of(study, env)
-        for row, source, make in _to_time(study, env):
+        for row, source, measure in _to_time(study, env, times):
             if times.get(row, {}).get("source") == source:
                 continue
-            times[row] = {"source": source, "median": median_time(study, env, make())}
+            times[row] = {"source": source, **measure()}
             _write(study, env, times)
-            yield f"{env.folder} {row}: {1e3 * times[row]['median']:.2f} ms"
-        for baseline in of_equal_time(study, env):
-            if baseline.time_of not in times:
-                continue
-            source = {"time_of": times[baseline.time_of], **_made(baseline, env)}
-            if times.get(baseline.name, {}).get("source") == source:
-                continue
-            checks, seconds = checks_within(study, env, baseline, times[baseline.time_of]["median"])
-            times[baseline.name] = {"source": source, "median": seconds, "checks": checks}
-            _write(study, env, times)
-            yield f"{env.folder} {baseline.name}: {checks} checks in {1e3 * seconds:.2f} ms"
+            checks = f"{times[row]['checks']} checks in " if "checks" in times[row] else ""
+            yield f"{env.folder} {row}: {checks}{1e3 * times[row]['median']:.2f} ms"
 
 
 def remove_times(study: Study, env: Environment, row: str) -> bool:
@@ -84,35 +74,25 @@ def remove_times(study: Study, env: Environment, row: str) -> bool:
     return True
 
 
-def median_time(study: Study, env: Environment, method: Method) -> float:
+def median_time(env: Environment, method: Method) -> float:
     """Return the median wall time of single decisions on one thread, without the first one, [s]."""
-    frozen = next(iter(sets_of(env).values()))
-    times: list[float] = []
-    began = time.perf_counter()
     opened = new_simulation(env.id, 2, **{**env.env_kwargs, "threads": 1})
     with one_thread(), contextlib.closing(opened) as simulation:
-        for row in range(min(N_TIMED, len(frozen.share))):
-            scene = frozen.scenes.take(slice(row, row + 1))
-            observation = simulation.observe(scene)
-            before = time.perf_counter()
-            method.decide(observation, scene)
-            times.append(time.perf_counter() - before)
-            if time.perf_counter() - began > BUDGET:
-                break
+        scenes = _timed_scenes(env).scenes
+        times = list(single_decision_times(method, scenes, simulation, N_TIMED, BUDGET))
     return float(np.median(times[1:] or times))
 
 
-def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: float) -> tuple[int, float]:
+def checks_within(env: Environment, baseline: Baseline, seconds: float) -> tuple[int, float]:
     """Return the number of checks of a search that takes at most a time, and its own time, [s].
 
     The number is doubled until it takes longer. Then interpolation narrows the interval, until the time is within
     NEARLY of the limit or after TRIES searches. A search that takes longer even with the fewest checks has these.
     """
-    frozen = next(iter(sets_of(env).values()))
 
     def timed(checks: int) -> float:
         search = dataclasses.replace(baseline, checks=checks)
-        return median_time(study, env, method_of(search, env, frozen, threads=1))
+        return median_time(env, method_of(search, env, _timed_scenes(env), threads=1))
 
     low, took = FEWEST_CHECKS, timed(FEWEST_CHECKS)
     high, longer = low, took
@@ -131,41 +111,51 @@ def checks_within(study: Study, env: Environment, baseline: Baseline, seconds: f
     return (high, longer) if longer <= seconds else (low, took)
 
 
-def _to_time(study: Study, env: Environment) -> Iterator[Timed]:
-    """Yield the methods of an environment: agents of the first trained seed, then baselines."""
-    frozen = next(iter(sets_of(env).values()))
+def _timed_scenes(env: Environment) -> FrozenScenes:
+    """Return the first set of an environment, in whose scenes decisions are timed."""
+    return next(iter(sets_of(env).values()))
+
+
+def _to_time(study: Study, env: Environment, times: Record) -> Iterator[Timed]:
+    """Yield the methods of an environment: agents, other baselines, then searches in the time of a row in `times`."""
+    frozen = _timed_scenes(env)
     for agent in (each for each in study.agents if each.timed and env.name in each.environments):
         yield from _agent_to_time(study, env, agent)
-    for baseline in study.baselines:
-        if baseline.timed and baseline.time_of is None and env.name in baseline.environments:
-            yield Timed(
-                baseline.name,
-                _made(baseline, env),
-                lambda baseline=baseline: method_of(baseline, env, frozen, threads=1),
-            )
+
+    def time(baseline: Baseline) -> Record:
+        return {"median": median_time(env, method_of(baseline, env, frozen, threads=1))}
+
+    def search(baseline: Baseline, seconds: float) -> Record:
+        checks, median = checks_within(env, baseline, seconds)
+        return {"median": median, "checks": checks}
+
+    here = [each for each in study.baselines if env.name in each.environments]
+    for baseline in here:
+        if baseline.timed and baseline.time_of is None:
+            source = identity(baseline, env, frozen)
+            yield Timed(baseline.name, source, functools.partial(time, baseline))
+    for baseline in here:
+        if baseline.time_of in times:
+            limit = times[baseline.time_of]
+            source = {"time_of": limit, **identity(baseline, env, frozen)}
+            yield Timed(baseline.name, source, functools.partial(search, baseline, limit["median"]))
 
 
 def _agent_to_time(study: Study, env: Environment, agent: Agent) -> Iterator[Timed]:
-    runs = [Cell(env=env, agent=agent, seed=seed) for seed in agent.seeds]
-    first = next((cell for cell in runs if state(cell, study.out) == "trained"), None)
+    """Yield the decision modes of an agent of the first trained seed."""
+    first = next(iter(trained(study, env, agent)), None)
     if first is None:
         return
     folder = Run(study.out / first.folder).best
-    frozen = next(iter(sets_of(env).values()))
     kwargs = {**first.training(study.out).env_kwargs, "threads": 1}
-    model: Any = None
+    model = functools.cache(lambda: load_model(folder))
 
-    def make(mode: Any) -> Method:
-        nonlocal model
-        model = load_model(folder) if model is None else model
-        return method_of_mode(mode, model, env, kwargs)
+    def measure(mode: Mode) -> Record:
+        return {"median": median_time(env, method_of_mode(mode, model(), env, kwargs))}
 
-    for mode in modes(agent, env):
-        yield Timed(mode.row(agent), identity_of(frozen, folder, mode), lambda mode=mode: make(mode))
-
-
-def _made(baseline: Baseline, env: Environment) -> Record:
-    return identity(baseline, env, next(iter(sets_of(env).values())))
+    for mode in agent.modes(env.id):
+        source = identity_of(_timed_scenes(env), folder, mode)
+        yield Timed(mode.row(agent.name), source, functools.partial(measure, mode))
 
 
 def _write(study: Study, env: Environment, times: Record) -> None:
