@@ -135,7 +135,7 @@ def _references(axes: Axes, data: Data) -> None:
 
 def _controls(axes: Axes, data: Data) -> None:
     """Draw the torque that the references require."""
-    torque = required_torque(data.env.unwrapped.task.arm, data.plan.trajectory(), len(data.time))
+    torque = required_torque(data.plan.trajectory(), len(data.time))
     colours = PALETTE.executed, PALETTE.via
     for column, name, colour in zip(torque.T, ("shoulder", "elbow"), colours, strict=True):
         axes.plot(data.time, column, color=colour, linewidth=2.2, label=name)

@@ -7,6 +7,8 @@ from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polydiv, polyval
+from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
 
@@ -28,25 +30,21 @@ def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Pol
 
 def count_roots(polynomial: Polynomial) -> int:
     """Return the number of different roots in (0, 1) by Sturm's theorem, exactly. Neither end may be a root."""
-    chain = [_trimmed(polynomial), _trimmed([k * each for k, each in enumerate(polynomial)][1:])]
+    chain = [np.array(polynomial), polyder(np.array(polynomial))]
     while len(chain[-1]) > 1:
-        rest = _remainder(chain[-2], chain[-1])
-        if not rest:
+        _, rest = polydiv(chain[-2], chain[-1])
+        if not rest.any():
             break
-        chain.append([-each for each in rest])
-    at_start = _sign_changes([each[0] for each in chain])
-    return at_start - _sign_changes([sum(each, Fraction(0)) for each in chain])
+        chain.append(-rest / abs(rest[-1]))  # scaled, which keeps signs and short numbers
+    return _sign_changes(chain, Fraction(0)) - _sign_changes(chain, Fraction(1))
 
 
-def root_of(polynomial: Polynomial, bits: int = 60) -> float:
+def root_of(polynomial: Polynomial) -> float:
     """Return the root in (0, 1) by exact bisection; the polynomial is positive at 0 and negative at 1."""
     low, high = Fraction(0), Fraction(1)
-    for _ in range(bits):
+    for _ in range(60):
         middle = (low + high) / 2
-        value = Fraction(0)
-        for each in reversed(polynomial):
-            value = value * middle + each
-        low, high = (middle, high) if value > 0 else (low, middle)
+        low, high = (middle, high) if polyval(middle, polynomial) > 0 else (low, middle)
     return float((low + high) / 2)
 
 
@@ -76,22 +74,7 @@ def closed_form(waypoints: Float, share: float, time: Float) -> Float:
     return np.asarray(before + pi * np.maximum(t - s, 0.0) ** 5 / 120)  # Eq. 5
 
 
-def _trimmed(polynomial: Polynomial) -> Polynomial:
-    """Remove leading zeros and scale the leading coefficient to size 1, which keeps signs and short numbers."""
-    last = max((k for k, each in enumerate(polynomial) if each), default=-1)
-    return [each / abs(polynomial[last]) for each in polynomial[: last + 1]]
-
-
-def _remainder(dividend: Polynomial, divisor: Polynomial) -> Polynomial:
-    rest = list(dividend)
-    while len(rest) >= len(divisor):
-        factor, shift = rest[-1] / divisor[-1], len(rest) - len(divisor)
-        for k, each in enumerate(divisor):
-            rest[shift + k] -= factor * each
-        rest.pop()
-    return _trimmed(rest)
-
-
-def _sign_changes(values: list[Fraction]) -> int:
-    signs = [value > 0 for value in values if value]
+def _sign_changes(chain: list[NDArray[np.object_]], place: Fraction) -> int:
+    """Return the number of sign changes along a chain of polynomials at a place."""
+    signs = [value > 0 for value in (polyval(place, each) for each in chain) if value]
     return sum(first != second for first, second in pairwise(signs))

@@ -1,7 +1,8 @@
-"""Reproduction of the paper and the command that runs it."""
+"""Reproduction of the paper, its table as Markdown, as JSON and as an HTML page, and the command that runs it."""
 
 from __future__ import annotations
 
+import base64
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +15,13 @@ from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.paper.claim import Claim, Reproduction
+from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.io.template import load_template, packaged
+from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
 from viapoint.training.paper.figures import double, other
 from viapoint.training.paper.figures import straight as figures_straight
 from viapoint.training.paper.figures.style import STYLE, save
-from viapoint.training.paper.report import summary, write
 from viapoint.training.paper.rows import (
     alternatives,
     curved,
@@ -117,6 +119,82 @@ def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None])
 STEPS = len(ROWS) + 1 + len(DRAWINGS)
 
 
+TITLE = "Flash & Hogan 1985, reproduced"
+HEADINGS = (
+    "row", "claim", "paper's figure", "paper", "model", "expected", "simulated arm", "expected", "hand off plan [mm]",
+    "verdict",
+)  # fmt: skip
+NOTE = (
+    "Model: the minimum-jerk movement, in closed form. Simulated arm: a two-joint arm in MuJoCo that tracks it; "
+    "“hand off plan” is the greatest distance of its hand from the plan. A claim holds if every number of its line "
+    "is in its expected range. Where a statement of the paper is only approximate, the claim says so and its number "
+    "says by how much."
+)
+
+
+def write(reproduction: Reproduction, out: Path) -> list[Path]:
+    """Write table.md, table.json and index.html to a folder."""
+    paths = [out / name for name in ("table.md", "table.json", "index.html")]
+    write_bytes(paths[0], markdown(reproduction.claims).encode())
+    record = {"title": TITLE, "holds": not reproduction.failed}
+    write_json(paths[1], {**record, "claims": [claim.as_json() for claim in reproduction.claims]})
+    write_bytes(paths[2], page(reproduction).encode())
+    return paths
+
+
+def cells(claim: Claim) -> list[str]:
+    """Return the cells of one line."""
+    return [
+        str(claim.row),
+        claim.claim,
+        claim.figure,
+        claim.paper,
+        _number(claim.model, claim.unit),
+        _or_dash(claim.expected),
+        _number(claim.arm, claim.unit),
+        _or_dash(claim.arm_expected),
+        "-" if claim.deviation is None else f"{claim.deviation:.2f}",
+        claim.verdict,
+    ]
+
+
+def markdown(claims: list[Claim]) -> str:
+    """Return the table as a Markdown document."""
+    lines = [list(HEADINGS), ["---"] * 4 + ["---:"] * 5 + ["---"]]
+    lines += [[cell.replace("|", "\\|") for cell in cells(claim)] for claim in claims]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"# {TITLE}\n\n{summary(claims)} {NOTE}\n\n{table}\n"
+
+
+def summary(claims: list[Claim]) -> str:
+    """Return a sentence with the number of claims that hold."""
+    return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
+
+
+def page(reproduction: Reproduction) -> str:
+    """Return an HTML page with embedded pictures."""
+    template = load_template(packaged("paper/templates/page.html.j2"), escape=True)
+    figures = [
+        (base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in reproduction.pictures
+    ]
+    claims = reproduction.claims
+    return template.render(
+        title=TITLE, note=NOTE, summary=summary(claims), headings=HEADINGS[1:], claims=claims, cells=cells,
+        subjects=SUBJECTS, figures=figures,
+    )  # fmt: skip
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None:
+        return "-"
+    text = f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"
+    return f"{text} {unit}".rstrip()
+
+
+def _or_dash(value: object) -> str:
+    return "-" if value is None else str(value)
+
+
 GUIDE_FIGURES = (
     "fig01_model", "fig03_straight", "fig04_joints", "fig05_height", "fig06_place", "fig08_obstacles",
     "fig10_isochrony", "valleys", "alternatives", "limits", "double_step", "double_step_jerk",
@@ -131,12 +209,7 @@ class ClaimsFailedError(Exception):
 
 
 def run(config: PaperConfig) -> None:
-    """Compute the claims, draw and write them, and raise an error if a claim does not hold.
-
-    Raises:
-        ValueError: The agent does not exist or its task is unsuitable; nothing is computed.
-        ClaimsFailedError: A claim does not hold.
-    """
+    """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
     if config.agent is not None:
         check_agent(config.agent)
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():

@@ -132,7 +132,7 @@ def valleys() -> Figure:
     """Draw the region with a speed valley, and its distance in time from the curvature peak."""
     figure, axes = sheet(1, 2, 4.6)
     alongs = np.linspace(0.05, 0.95, 37)
-    threshold = [valley_threshold(along, functools.partial(model_has_valley, along)) for along in alongs]
+    threshold = [valley_threshold(functools.partial(model_has_valley, along)) for along in alongs]
     axes[0, 0].plot(alongs, threshold, **MODEL)
     axes[0, 0].plot(0.5, 9.0 / 32.0, "o", color=THIRD, markersize=3.6)
     axes[0, 0].annotate(

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory
-from viapoint.training.paper.figures.style import ARM, MODEL, SECOND, THIRD, dot, path, plane, sheet
+from viapoint.training.paper.figures.style import ARM, MODEL, SECOND, THIRD, dot, letters, path, plane, sheet
 from viapoint.training.paper.profiles import EDGE, model_profile
 from viapoint.training.paper.reference_movements import curved, straight
 from viapoint.training.paper.rows.curved import ENDS, EXAMPLE
@@ -44,8 +44,7 @@ def model() -> Figure:
     axes[2, 1].legend(loc="upper right", handlelength=1.2)
     for ax in (axes[0, 1], axes[1, 1], axes[2, 0], axes[2, 1]):
         ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
-    for ax, letter in ((axes[0, 0], "A"), (axes[1, 0], "B")):
-        ax.set_title(letter, loc="left", pad=3.0)
+    letters(axes[:2, 0])
     return figure
 
 
@@ -121,7 +120,7 @@ def _joint_column(ax: Float, movement: Trajectory, motion: SimulatedMovements) -
     time = np.linspace(0.0, DURATION, 401)
     position, velocity = movement.sample(401, (0, 1))
     angle = np.asarray(ADULT.inverse_kinematics(position))
-    planned = (angle, joint_velocity(ADULT, angle, velocity), required_torque(ADULT, movement))
+    planned = (angle, joint_velocity(angle, velocity), required_torque(movement))
     reached = (motion.joints[0], np.gradient(motion.joints[0], motion.time, axis=0), motion.torque[0])
     within = motion.time[:-1] <= DURATION
     for row in range(3):

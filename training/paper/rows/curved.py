@@ -31,22 +31,25 @@ ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])
 """d1 / (d1 + d2) of the family."""
 HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])
 """d3 / (d1 + d2) of the family: high enough for two speed peaks everywhere, and within the reach."""
+N_VIAS = 300
+"""Number of random via-points in row 4."""
 
 
-def passage_claims(count: int = 300, seed: int = 0) -> list[Claim]:
+def passage_claims() -> list[Claim]:
     """Return the claims of row 4: the free passage time."""
-    wrong, difference = _count_and_compare(count, seed)
+    wrong, difference = _count_and_compare()
     waypoints = via_waypoints(target(ENDS[0]), target(ENDS[1]), *EXAMPLE)
     movement = minimum_jerk_through(waypoints)
     share = float(passage_share(movement))
     time = np.linspace(0.0, 1.0, 401)
     formula = 1e3 * float(np.abs(closed_form(waypoints, share, time) - movement(time)).max())
+    via, goal = ([Fraction(float(each)) for each in point - waypoints[0]] for point in waypoints[1:])
     motion = simulate(movement)
     arm_share = closest_approach(motion, waypoints[1])
     passed = 1e3 * float(np.linalg.norm(motion.at(0, np.array([share]))[0] - waypoints[1]))
     return [
         Claim(
-            row=4, claim=f"Eq. C16 has one root in (0, 1): vias with another count, of {count} (exact arithmetic)",
+            row=4, claim=f"Eq. C16 has one root in (0, 1): vias with another count, of {N_VIAS} (exact arithmetic)",
             figure="App. C", paper="only one acceptable root", model=float(wrong), expected=near(0.0, 0.0),
         ),
         Claim(
@@ -61,18 +64,18 @@ def passage_claims(count: int = 300, seed: int = 0) -> list[Claim]:
         Claim(
             row=4, claim=f"t1/t_f of the movement of Fig. 1B, d1/(d1+d2) = {EXAMPLE[0]}, d3/(d1+d2) = "
             f"{-EXAMPLE[1]} (arm: when nearest to the via-point)", figure="1B", paper="free, from Eq. C16",
-            model=share, expected=near(_exact_share(waypoints), 1e-12), arm=arm_share,
+            model=share, expected=near(root_of(passage_polynomial(via, goal)), 1e-12), arm=arm_share,
             arm_expected=near(share, 0.01), deviation=motion.worst,
         ),
     ]  # fmt: skip
 
 
-def _count_and_compare(count: int, seed: int) -> tuple[int, float]:
+def _count_and_compare() -> tuple[int, float]:
     """Return the number of via-points without exactly one root, and the greatest difference of passage times."""
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     wrong, difference = 0, 0.0
     goal = (Fraction(1), Fraction(0))
-    for along, height in generator.integers((-1500, 1), (2500, 1500), (count, 2)):
+    for along, height in generator.integers((-1500, 1), (2500, 1500), (N_VIAS, 2)):
         via = (Fraction(int(along), 1000), Fraction(int(height), 1000))
         polynomial = passage_polynomial(via, goal)
         wrong += count_roots(polynomial) != 1
@@ -80,11 +83,6 @@ def _count_and_compare(count: int, seed: int) -> tuple[int, float]:
         share = float(passage_share(minimum_jerk_through(points)))
         difference = max(difference, abs(share - root_of(polynomial)))
     return wrong, difference
-
-
-def _exact_share(waypoints: Float) -> float:
-    via, goal = ([Fraction(float(each)) for each in point - waypoints[0]] for point in waypoints[1:])
-    return root_of(passage_polynomial(via, goal))
 
 
 def closest_approach(motion: SimulatedMovements, via: Float, row: int = 0) -> float:
@@ -140,12 +138,12 @@ def valley_claims() -> list[Claim]:
 
 
 def _threshold_claim(along: float, exact: str, expected: ExpectedRange) -> Claim:
-    model = valley_threshold(along, functools.partial(model_has_valley, along))
+    model = valley_threshold(functools.partial(model_has_valley, along))
 
     def arm_has_valley(height: float) -> bool:
         return bool(np.isfinite(arm_profile(simulate(curved(*ENDS, along, -height))).valley))
 
-    arm = valley_threshold(along, arm_has_valley, halvings=12)
+    arm = valley_threshold(arm_has_valley, halvings=12)
     return Claim(
         row=5, claim=f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds",
         figure="1B", paper=f"two peaks and a valley; {exact}".removesuffix("; -"), model=model, expected=expected,
@@ -159,8 +157,8 @@ def model_has_valley(along: float, height: float) -> bool:
     return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
 
 
-def valley_threshold(along: float, has_valley: Callable[[float], bool], halvings: int = 30) -> float:
-    """Return the least d3 / (d1 + d2) with a speed valley at a given d1 / (d1 + d2), by bisection."""
+def valley_threshold(has_valley: Callable[[float], bool], halvings: int = 30) -> float:
+    """Return the least d3 / (d1 + d2) with a speed valley, by bisection."""
     low, high = 0.2, 0.5
     for _ in range(halvings):
         middle = 0.5 * (low + high)

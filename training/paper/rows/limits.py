@@ -127,7 +127,7 @@ def torque_limited() -> Trajectory:
 
 def _relative_torque(movement: Trajectory) -> float:
     """Return the greatest torque of either joint relative to its limit."""
-    return float((np.abs(required_torque(ADULT, movement)) / np.array(ADULT.torque_limit)).max())
+    return float((np.abs(required_torque(movement)) / np.array(ADULT.torque_limit)).max())
 
 
 def _torque_claims() -> list[Claim]:
