@@ -13,7 +13,7 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import has_shapes, obstacles_from_rows
+from viapoint.envs.geometry.rows import obstacles_from_rows
 from viapoint.envs.rendering.overlay import FirstContact, Movement
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
@@ -100,21 +100,13 @@ def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) 
 
 def _draw_obstacles(axes: Axes, arm: Arm, scene: Scenes, touched: int | None) -> None:
     """Draw footprints with a rim of the hand's radius, which the centre of the hand must not enter."""
-    for row in np.flatnonzero(scene.present[0]):
-        numbers = scene.obstacles[0, row]
-        centre, half_axis = numbers[: arm.dimension], numbers[arm.dimension : 2 * arm.dimension]
+    rows = np.flatnonzero(scene.present[0])
+    for row, shape in zip(rows, obstacles_from_rows(scene.obstacles[0, rows]), strict=True):
         colour: Colour = PALETTE.contact if row == touched else PALETTE.obstacle
-        if has_shapes(numbers):
-            (shape,) = obstacles_from_rows(numbers[None])
-            for outline in shape.footprint():
-                rim = widened_outline(outline, arm.hand_radius)
-                axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
-                axes.add_patch(Polygon(outline, facecolor=colour, linewidth=0, zorder=3))
-            continue
-        ends = centre - half_axis, centre + half_axis
-        rim = capsule(*ends, numbers[-1] + arm.hand_radius)
-        axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
-        axes.add_patch(Polygon(capsule(*ends, numbers[-1]), facecolor=colour, linewidth=0, zorder=3))
+        for outline in shape.footprint():
+            rim = widened_outline(outline, arm.hand_radius)
+            axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
+            axes.add_patch(Polygon(outline, facecolor=colour, linewidth=0, zorder=3))
 
 
 def _draw_ends(axes: Axes, scene: Scenes, scale: float) -> None:

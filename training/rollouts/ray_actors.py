@@ -20,14 +20,7 @@ READS = (("get",), ("call", "observe"), ("call", "render"), ("call", "state"))
 
 
 def join_cluster(on: str, workers: int) -> bool:
-    """Connect to the cluster that rollout workers run on.
-
-    Args:
-        on: `ray` or `ray://HOST:PORT`, see :func:`viapoint.training.io.ray_cluster.connect`.
-        workers: Number of cores that the rollout workers need.
-
-    Returns:
-        True if this call connected, so that the caller disconnects.
+    """Connect to a cluster for so many rollout workers, `ray` or `ray://HOST:PORT`; return True if this call connected.
 
     Raises:
         ImportError: Ray is not installed.

@@ -60,27 +60,14 @@ class DummyServer:
         """Step all environments."""
         return self.env.step(actions)
 
-    def get_attr(self, indices: list[int], name: str) -> list[Any]:
-        """Return an attribute of some environments."""
-        return self.env.get_attr(name, indices)
+    def each(self, indices: list[int], command: str, args: Any, kwargs: Any) -> list[Any]:
+        """Return the results of a method of `DummyVecEnv` for some environments, such as `get_attr`."""
+        results = getattr(self.env, command)(*args, indices=indices, **kwargs)
+        return [None] * len(indices) if results is None else results
 
-    def set_attr(self, indices: list[int], name: str, value: Any) -> list[None]:
-        """Set an attribute of some environments."""
-        self.env.set_attr(name, value, indices)
-        return [None] * len(indices)
-
-    def env_method(self, indices: list[int], name: str, args: Any, kwargs: Any) -> list[Any]:
-        """Call a method of some environments."""
-        return self.env.env_method(name, *args, indices=indices, **kwargs)
-
-    def env_is_wrapped(self, indices: list[int], wrapper_class: Any) -> list[bool]:
-        """Return whether some environments have a wrapper."""
-        return self.env.env_is_wrapped(wrapper_class, indices)
-
-    def images(self, indices: list[int]) -> list[Any]:
-        """Return rendered frames of some environments."""
-        frames = self.env.get_images()
-        return [frames[index] for index in indices]
+    def images(self) -> Sequence[Any]:
+        """Return rendered frames of all environments."""
+        return self.env.get_images()
 
 
 class RayVecEnv(VecEnv):
@@ -231,7 +218,7 @@ class RayVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of each environment asked for."""
-        return self._each("env_method", indices, method_name, method_args, method_kwargs)
+        return self._each("env_method", indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return whether each environment asked for has a wrapper."""
@@ -239,16 +226,18 @@ class RayVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return rendered frames, one for each environment."""
-        return self._each("images", None)
+        for actor in self._actors:
+            actor.ask("images", ())
+        return [frame for k in range(len(self._actors)) for frame in self._take(k, "images", ())]
 
-    def _each(self, command: str, indices: Any, *arguments: Any) -> list[Any]:
+    def _each(self, command: str, indices: Any, /, *args: Any, **kwargs: Any) -> list[Any]:
         rows = list(range(self.num_envs))
         rows = [rows[row] for row in self._get_indices(indices)]
         answers: dict[int, Any] = {}
         for k, part in enumerate(self._parts):
             mine = [row for row in rows if part.start <= row < part.stop]
             if mine:
-                question = command, ([row - part.start for row in mine], *arguments)
+                question = "each", ([row - part.start for row in mine], command, args, kwargs)
                 self._actors[k].ask(*question)
                 answers |= zip(mine, self._take(k, *question), strict=True)
         return [answers[row] for row in rows]

@@ -25,6 +25,7 @@ from viapoint.training.algorithms.model_io import describe
 from viapoint.training.io.files import (
     BadFileError,
     read_arrays,
+    read_bytes,
     read_json,
     write_arrays,
     write_folder,
@@ -67,7 +68,7 @@ def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any
 
     def fill(temporary: Path) -> None:
         write_arrays(temporary / "tensors.safetensors", tensors)
-        state["sha256"] = _file_digest(temporary / "tensors.safetensors")
+        state["sha256"] = hashlib.sha256(read_bytes(temporary / "tensors.safetensors")).hexdigest()
         state["digest"] = _digest(state)
         write_json(temporary / "state.json", state)
 
@@ -107,7 +108,7 @@ def _verified_state(folder: Path) -> dict[str, Any]:
         raise BadFileError(path, f"must have format {known}, got {state.get('format')!r}")
     if state["format"] != 1 and state.get("digest") != _digest(state):
         raise BadFileError(path, "is damaged: it does not have the hash that it states")
-    if _file_digest(tensors) != state.get("sha256"):
+    if hashlib.sha256(read_bytes(tensors)).hexdigest() != state.get("sha256"):
         raise BadFileError(tensors, "is torn: its hash is not the one that state.json states")
     return state
 
@@ -118,19 +119,10 @@ def _digest(state: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def _file_digest(path: Path) -> str:
-    if not path.is_file():
-        raise BadFileError(path, "is no regular file" if path.exists() else "is missing")
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise BadFileError(path, f"cannot be read ({error.strerror})") from None
-
-
 def _restore(model: BaseAlgorithm, state: dict[str, Any], tensors: dict[str, Any]) -> None:
     """Set the attributes that a checkpoint holds; the code determines which ones, never the file."""
-    model.set_parameters(_torch(_insert_arrays(state["parameters"], tensors)), exact_match=True)
+    trained = {name: torch.from_numpy(a) for name, a in tensors.items() if name.startswith("parameters/")}
+    model.set_parameters(_insert_arrays(state["parameters"], trained), exact_match=True)
     variables, arrays = _insert_arrays(state["variables"], tensors), _insert_arrays(state["arrays"], tensors)
     for name in _variables(model):
         recursive_setattr(model, f"{name}.data", torch.from_numpy(variables[name]))
@@ -150,14 +142,9 @@ def _variables(model: BaseAlgorithm) -> dict[str, Any]:
     return {name: recursive_getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
 
 
-def _buffer(model: BaseAlgorithm) -> BaseBuffer | None:
-    """Return the replay buffer; a rollout buffer is empty between two collections."""
-    return getattr(model, "replay_buffer", None)
-
-
 def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the filled part of the replay buffer's arrays."""
-    buffer = _buffer(model)
+    """Return the filled part of the replay buffer's arrays; a rollout buffer is empty between two collections."""
+    buffer: BaseBuffer | None = getattr(model, "replay_buffer", None)
     if buffer is None:
         return {}
     size = buffer.size()
@@ -170,7 +157,7 @@ def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _restore_buffer(model: BaseAlgorithm, state: dict[str, Any]) -> None:
-    buffer = _buffer(model)
+    buffer: BaseBuffer | None = getattr(model, "replay_buffer", None)
     if buffer is None:
         return
     for name, kept in vars(buffer).items():
@@ -245,14 +232,6 @@ def _insert_arrays(value: Any, tensors: Mapping[str, Any]) -> Any:
     if set(value) == {"whole_numbers"}:
         return {int(key): _insert_arrays(each, tensors) for key, each in value["whole_numbers"].items()}
     return {key: _insert_arrays(each, tensors) for key, each in value.items()}
-
-
-def _torch(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _torch(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_torch(each) for each in value]
-    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
 
 
 def _difference(saved: Any, mine: Any, name: str = "the model") -> str:

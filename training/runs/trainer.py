@@ -133,11 +133,7 @@ def training_env(config: TrainConfig) -> ViaVecEnv:
 
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
-    """Build the untrained model of a resolved configuration with its own environments, and close them at the end.
-
-    Raises:
-        ValueError: There is no such environment or model.
-    """
+    """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
     try:
         env = training_env(config)
     except TypeError as error:
@@ -169,13 +165,14 @@ def _check_reports_duration(config: TrainConfig) -> None:
 
 
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
-    """Train from the last checkpoint of the run to its end.
-
-    Raises:
-        TrainingFailedError: A file could not be written.
-    """
+    """Train from the last checkpoint of the run to its end."""
+    folder = str(run.folder / "tensorboard")
     try:
-        with _logging(model, run), RunCallback(run) as monitor:
+        with (
+            closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
+            RunCallback(run) as monitor,
+        ):
+            model.set_logger(logger)
             _learn(model, run, monitor, callback)
     except (OSError, WorkerDiedError) as error:
         raise TrainingFailedError(
@@ -185,11 +182,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
 
 
 def _restore_settings(run: Run, config: TrainConfig) -> None:
-    """Take over a run's own configuration, except for fields that may change.
-
-    Raises:
-        BadFileError: The call asks for something else, or for fewer decisions than there are.
-    """
+    """Take over a run's own configuration, except for fields that may change."""
     check_unchanged(run, config, TrainConfig())
     if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
         if config.n_timesteps < run.decisions:
@@ -235,14 +228,3 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
     best = monitor.best_record["decisions"] if monitor.curve else None
     stopped = "stalled" if monitor.stalled else "budget"
     run.write_end({"stopped": stopped, "decisions": model.num_timesteps, "best_decisions": best})
-
-
-@contextmanager
-def _logging(model: BaseAlgorithm, run: Run) -> Iterator[None]:
-    folder = str(run.folder / "tensorboard")
-    logger = Logger(folder, [TensorBoardOutputFormat(folder)])
-    model.set_logger(logger)
-    try:
-        yield
-    finally:
-        logger.close()
