@@ -14,7 +14,7 @@ from stable_baselines3 import PPO, SAC, TD3
 
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.algorithms.sb3_archive import algorithm_of
-from viapoint.training.cli import import_sb3
+from viapoint.training.cli import archives
 from viapoint.training.cli import main as cli
 from viapoint.training.io.files import BadFileError
 
@@ -86,7 +86,7 @@ def test_nothing_is_opened_unasked(evil, tmp_path, capsys, monkeypatch):
     assert end.value.code == 2
     assert "--trust" in capsys.readouterr().err
     for answer, opened in (("", False), ("y", False), ("no", False), ("yes", True)):
-        monkeypatch.setattr(import_sb3.sys, "stdin", Terminal())
+        monkeypatch.setattr(archives.sys, "stdin", Terminal())
         monkeypatch.setattr("builtins.input", lambda question, answer=answer: answer)
         if opened:
             cli.main(words(evil, tmp_path / "out"))
@@ -125,11 +125,11 @@ def test_what_is_no_such_archive_is_refused_unopened(tmp_path, capsys):
 def test_what_does_not_fit_is_refused(tmp_path):
     archive(PPO, tmp_path / "other.zip", "viapoint/PlanarReach-v0")
     with pytest.raises(BadFileError, match="cannot be opened as PPO for viapoint/PlanarObstacles-v0"):
-        import_sb3.convert(tmp_path / "other.zip", "ppo", ENV, tmp_path / "out")
+        archives.convert(tmp_path / "other.zip", "ppo", ENV, tmp_path / "out")
     with pytest.raises(BadFileError, match="cannot be opened as SAC"):
-        import_sb3.convert(tmp_path / "other.zip", "sac", ENV, tmp_path / "out")
+        archives.convert(tmp_path / "other.zip", "sac", ENV, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
     with pytest.raises(BadFileError, match="is not empty"):
-        import_sb3.run(cli.parse(words(tmp_path / "other.zip", tmp_path / "full", "--trust")))
+        archives.import_sb3(cli.parse(words(tmp_path / "other.zip", tmp_path / "full", "--trust")))

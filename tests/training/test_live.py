@@ -162,7 +162,7 @@ def test_methods_are_compared_in_a_scene(shared):
     some = shared(PLANAR)
     scene, _ = some.scene_kinds()["Hard"]()
     scene = scene.with_shapes(("capsule",))
-    results = {name: result() for name, result in some.own.comparison(scene)}
+    results = {name: result() for name, result in some.own.compare(scene)}
     assert list(results) == ["straight", "geometry search", "planner"]
     assert not results["straight"].success
     assert results["planner"].success

@@ -6,13 +6,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs.registration import STEP_TASKS
 from viapoint.training.algorithms.model_io import build, load_model
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners.baselines import Straight, agent_method
-from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise, whole_task
+from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import validation_scenes
 from viapoint.training.runs.run_dir import Run
@@ -38,8 +38,8 @@ def model():
 
 
 def test_the_task_of_a_step_wise_id_is_its_twin():
-    assert is_step_wise(STEP)
-    assert not is_step_wise(WHOLE)
+    assert STEP in STEP_TASKS
+    assert WHOLE not in STEP_TASKS
     weights = {"progress": 2.0, "success": 3.0}
     given = {"control_step": 0.02, "n_obstacles": 3, "reward_weights": weights}
     assert whole_task(STEP, given) == (WHOLE, {"n_obstacles": 3, "reward_weights": {"success": 3.0}})

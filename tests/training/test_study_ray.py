@@ -11,8 +11,8 @@ import runner_jobs
 
 from viapoint.training import Study, run_study
 from viapoint.training.io.ray_cluster import check_versions, import_ray
-from viapoint.training.study.jobs import baseline_jobs, pairs, training_jobs
-from viapoint.training.study.runner import Job, make_runner
+from viapoint.training.study.jobs import baseline_jobs, training_jobs
+from viapoint.training.study.runners import Job, make_runner
 from viapoint.training.study.search_space import SearchSpace
 from viapoint.training.study.tuning import Tuning
 
@@ -78,7 +78,7 @@ def test_a_study_has_the_same_results_as_on_this_machine(cluster, tmp_path):
     jobs = [
         dataclasses.replace(each, function=runner_jobs.train_then_die) for each in training_jobs(there, steps)
     ]
-    jobs += baseline_jobs(there, pairs(there))
+    jobs += baseline_jobs(there, of_equal_time=False)
     jobs += [
         job(runner_jobs.fill_disk, "disk", folder="disk"),
         job(runner_jobs.fail, "because"),

@@ -9,7 +9,7 @@ import pytest
 import runner_jobs
 
 from viapoint.training import Study, run_study
-from viapoint.training.study.runner import Job, LocalRunner, make_runner
+from viapoint.training.study.runners import Job, LocalRunner, make_runner
 
 
 def job(function, *arguments, label="", **settings):

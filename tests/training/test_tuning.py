@@ -14,12 +14,11 @@ from optuna.trial import TrialState
 
 from viapoint.training import TrainConfig
 from viapoint.training.cli import main as cli
-from viapoint.training.io.files import BadFileError, read_json
-from viapoint.training.io.yaml_file import read_yaml
+from viapoint.training.io.files import BadFileError, read_json, read_yaml
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import resolved
 from viapoint.training.study import tuning as module
-from viapoint.training.study.runner import LocalRunner
+from viapoint.training.study.runners import LocalRunner
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace
 from viapoint.training.study.tuning import MOST_REPEATS, Tuning, TuningStoppedError
 from viapoint.training.study.tuning_report import importance, write_report

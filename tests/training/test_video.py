@@ -11,7 +11,7 @@ from PIL import Image
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.rendering import gl
 from viapoint.envs.rendering.renderer import GLUnavailableError
-from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.plotting.gallery import gallery, play
 from viapoint.training.plotting.top_view import capsule, draw_movement
 from viapoint.training.plotting.video import describe_outcome, record_video
 
@@ -45,13 +45,8 @@ def straight(observation, scene):
 
 
 def entries_of(env, number):
-    entries = []
-    for seed in range(number):
-        scene = scenes_of(env, 1, seed)
-        env.reset(options=scene.as_options())
-        info = env.step(np.zeros(3, dtype=np.float32))[-1]
-        entries.append(Entry.of_last(env, scene, title=f"scene {seed}", success=info["is_success"]))
-    return entries
+    titles = [f"scene {seed}" for seed in range(number)]
+    return play(OBSTACLES, scenes_of(env, number), titles, lambda *_: np.zeros(3, dtype=np.float32))
 
 
 def read(path):

@@ -66,7 +66,6 @@ def run(config: BenchConfig, console: Console | None = None) -> None:
         table.add_row(name, _shown(measured), _shown(floor), unit, f"{ratio:.2f}")
     (console or Console()).print(table)
     if config.json is not None:
-        config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, {each.name: each._asdict() for each in ratios})
 
 

@@ -9,7 +9,6 @@ import gymnasium as gym
 
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.agent import load_agent
-from viapoint.training.cli.progress import progress_bar
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, evenly_spread, task_of
@@ -17,7 +16,7 @@ from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.plotting.failure_report import classify_failures, write_failures
-from viapoint.training.rollouts.step_rollout import whole_task
+from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import SETS, FrozenScenes, scenes_for
@@ -55,7 +54,7 @@ def evaluate(config: EvaluateConfig) -> None:
     check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
     scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
-    with progress_bar() as progress:
+    with report.progress_bar() as progress:
         given: Any = {"checks": config.checks, "baselines": config.baselines, "progress": progress}
         result = measure(agent, env=config.env, scenes=scenes, **given)
     record = result.to_dict()
@@ -65,7 +64,6 @@ def evaluate(config: EvaluateConfig) -> None:
         name = _evaluation_name(config.scenes, whole, len(scenes.share), partial=result.partial)
         print(f"kept as {run.write_evaluation(name, record)}")
     if config.json is not None:
-        config.json.parent.mkdir(parents=True, exist_ok=True)
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
     if result.partial:

@@ -12,14 +12,13 @@ import numpy as np
 
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
 from viapoint.training.algorithms.model_io import untrained
-from viapoint.training.cli.progress import progress_bar
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
 from viapoint.training.io.files import BadFileError, read_json
 from viapoint.training.planners.baselines import Method, StoredSolutions, agent_method, make_method
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.plotting.gallery import Entry, gallery, play
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
@@ -45,49 +44,43 @@ def run(config: DemoConfig) -> None:
     frozen = load("test", config.env)
     frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
     record = _measured(config, agent, frozen)
-    pictures: dict[str, Callable[[Path], Any]] = {
-        "learning_curve.png": lambda path: plots.learning_curve(path, trained.curve),
-        "success_by_band.png": lambda path: plots.success_by_band(path, record),
-        "gallery.png": lambda path: gallery(
-            path,
-            entries(agent, frozen, PICTURES),
-            heading=f"The agent alone in {frozen.name} scenes, easy to hard",
+    heading = f"The agent alone in {frozen.name} scenes, easy to hard"
+    files: dict[str, tuple[str, Callable[[Path], Any] | None]] = {
+        "table.md": ("the table", None),
+        "table.json": ("the table with every outcome", None),
+        "learning_curve.png": (
+            "success during training",
+            lambda path: plots.learning_curve(path, trained.curve),
         ),
-        "movements.mp4": lambda path: _film(path, agent, frozen),
+        "success_by_band.png": ("success by difficulty", lambda path: plots.success_by_band(path, record)),
+        "gallery.png": (
+            "test scenes, planned and executed",
+            lambda path: gallery(path, entries(agent, frozen, PICTURES), heading=heading),
+        ),
+        "movements.mp4": ("movements", lambda path: _film(path, agent, frozen)),
+        model_folder.name: ("the trained agent", None),
     }
     weights = model_folder / "weights.safetensors"
-    for name, draw in pictures.items():
+    for name, (_, draw) in files.items():
         path = folder / name
-        if not path.exists() or path.stat().st_mtime < weights.stat().st_mtime:
+        if draw and (not path.exists() or path.stat().st_mtime < weights.stat().st_mtime):
             draw(path)
     report.show(record)
-    for name, what in (
-        ("table.md", "the table"),
-        ("table.json", "the table with every outcome"),
-        ("learning_curve.png", "success during training"),
-        ("success_by_band.png", "success by difficulty"),
-        ("gallery.png", "test scenes, planned and executed"),
-        ("movements.mp4", "movements"),
-        (model_folder.name, "the trained agent"),
-    ):
+    for name, (what, _) in files.items():
         print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
 
 
 def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
     """Return the agent's movements in scenes of all difficulties for the gallery."""
-    env = gym.make(agent.env_id, **agent.env_kwargs)
     by_difficulty = np.argsort(-frozen.share, kind="stable")
-    result = []
-    for row in by_difficulty[evenly_spread(len(by_difficulty), count)]:
-        scene = frozen.scenes.take([row])
-        observation, _ = env.reset(options=scene.as_options())
-        action, _ = agent.predict(observation, deterministic=True)
-        info = env.step(action)[-1]
-        title = f"share {BANDS[frozen.band[row]]}"
-        result.append(Entry.of_last(env, scene, title=title, success=bool(info["is_success"])))
-    env.close()
-    return result
+    chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), count)])
+    titles = [f"share {BANDS[band]}" for band in chosen.band]
+
+    def act(_: int, observation: Any) -> Any:
+        return agent.predict(observation, deterministic=True)[0]
+
+    return play(agent.env_id, chosen.scenes, titles, act, **agent.env_kwargs)
 
 
 def _trained(config: DemoConfig) -> Run:
@@ -132,7 +125,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         *(make_method(name, config.env) for name in BASELINES),
         StoredSolutions(frozen),
     ]
-    with progress_bar() as progress:
+    with report.progress_bar() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
     record = {**result.to_dict(), **identity}
     report.write(record, config.out)

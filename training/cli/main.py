@@ -58,8 +58,8 @@ COMMANDS: dict[str, Command] = {
     "live": Command(LiveConfig, "viapoint.training.live.page", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
     "tune": Command(TuneConfig, "viapoint.training.study.tuning_report", "run"),
-    "export": Command(ExportConfig, "viapoint.training.cli.export", "run"),
-    "import-sb3": Command(ImportConfig, "viapoint.training.cli.import_sb3", "run"),
+    "export": Command(ExportConfig, "viapoint.training.cli.archives", "export"),
+    "import-sb3": Command(ImportConfig, "viapoint.training.cli.archives", "import_sb3"),
 }
 """Subcommands by name."""
 

@@ -19,11 +19,7 @@ class Config:
     """Least values of the whole numbers, by name; None is allowed where it is the default."""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A value is not allowed; the message lists the allowed values.
-        """
+        """Check the values."""
         for each in dataclasses.fields(self):
             value = getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
@@ -38,9 +34,12 @@ class Config:
     def as_json(self) -> dict[str, Any]:
         """Return the configuration as plain values; :meth:`from_json` is the inverse."""
         values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        plain = {Path: str, tuple: list}
         return {
-            name: next((to(value) for kind, to in plain.items() if isinstance(value, kind)), value)
+            name: f"{value}"
+            if isinstance(value, Path)
+            else list(value)
+            if isinstance(value, tuple)
+            else value
             for name, value in values.items()
         }
 

@@ -292,11 +292,7 @@ VIA_POLICY: dict[str, Allowed] = {
 
 
 def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
-    """Check the values of hyperparameters; building the model checks their names.
-
-    Raises:
-        ValueError: A value is not allowed.
-    """
+    """Check the values of hyperparameters; building the model checks their names."""
     if not isinstance(values, Mapping):
         raise ValueError(f"hyperparameters must be values by name, got {values!r}")
     table = {**HYPERPARAMETERS, **PARTICULAR.get(algo, {})}
@@ -312,11 +308,7 @@ def check_hyperparameters(algo: str, values: Mapping[str, Any]) -> None:
 
 
 def check_via_policy(values: Mapping[str, Any]) -> None:
-    """Check the values of `policy_kwargs` of ViaQ; unknown names are ignored.
-
-    Raises:
-        ValueError: A value is not allowed.
-    """
+    """Check the values of `policy_kwargs` of ViaQ; unknown names are ignored."""
     _check("in policy_kwargs of viaq", VIA_POLICY, values)
     if values.get("form", "poses") == "poses" and values.get("pooling", "minimum") != "minimum":
         raise ValueError(

@@ -58,11 +58,7 @@ class TimeDiscount:
 
 
 def check_discount_unit(algorithm: str, unit: float, env_id: str) -> None:
-    """Check the unit of time for an algorithm in an environment.
-
-    Raises:
-        ValueError: The unit is no positive number, or the algorithm's episodes are one decision there.
-    """
+    """Check the unit of time for an algorithm in an environment."""
     _check_unit("discount_unit", unit)
     if algorithm == "viaq" and env_id not in REPLANNING_TASKS:
         raise ValueError(f"discount_unit must be None for viaq: episodes of {env_id} are one decision")

@@ -25,8 +25,7 @@ from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
-from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
-from viapoint.training.rollouts.step_rollout import whole_task
+from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
@@ -122,8 +121,8 @@ class EvaluationResult:
     """Hash of the scene set."""
     results: tuple[MethodResult, ...]
     """Outcomes of each method, the agent first."""
-    missing: bool = False
-    """Mark of an evaluation that was interrupted before the last method."""
+    partial: bool = False
+    """Mark of an evaluation that was interrupted before the end."""
 
     @property
     def success_rate(self) -> float:
@@ -148,11 +147,6 @@ class EvaluationResult:
     def to_markdown(self) -> str:
         """Return the table of all methods as a Markdown document."""
         return report.markdown(self.to_dict())
-
-    @property
-    def partial(self) -> bool:
-        """Mark of an evaluation that was interrupted before the end."""
-        return self.missing or any(result.partial for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
         """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
@@ -261,11 +255,7 @@ def task_of(
 def check_baselines(
     baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, env_id: str
 ) -> None:
-    """Check that the named baselines exist for an environment.
-
-    Raises:
-        ValueError: One does not.
-    """
+    """Check that the named baselines exist for an environment."""
     for each in baselines:
         if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
             check_method(each, env_id)
@@ -315,17 +305,7 @@ def evaluate_methods(
     time_decisions: bool = True,
     progress: Progress | None = None,
 ) -> EvaluationResult:
-    """Evaluate methods in the same scenes.
-
-    Args:
-        methods: Methods to evaluate, one or more.
-        frozen: Scenes.
-        env_id: Id of the environment.
-        env_kwargs: Keyword arguments of the environment.
-        batch: Number of scenes that are simulated at a time.
-        time_decisions: Measure the wall time of single decisions.
-        progress: Function of the method's name, the number of finished scenes and the number of all scenes.
-    """
+    """Evaluate one or more methods in the same scenes, `batch` at a time; the rest is as for :func:`evaluate`."""
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
@@ -336,9 +316,9 @@ def evaluate_methods(
             results.append(result)
             if result.interrupted:
                 break
-    missing = len(results) < len(methods)
+    partial = len(results) < len(methods) or results[-1].partial
     return EvaluationResult(
-        env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), missing=missing
+        env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), partial=partial
     )
 
 

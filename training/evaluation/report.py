@@ -1,14 +1,17 @@
-"""Tables of evaluations for terminals, documents and programs."""
+"""Progress of evaluations, and their tables for terminals, documents and programs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from tqdm.auto import tqdm
 
 from viapoint.training.io.files import write_bytes, write_json
 from viapoint.training.scene_sets.scene_set import BANDS
@@ -126,10 +129,23 @@ def show(record: Record, console: Console | None = None) -> None:
         console.print(table)
 
 
-def write(record: Record, folder: Path, stem: str = "table") -> tuple[Path, Path]:
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar over the scenes of each method."""
+    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
+
+        def progress(name: str, done: int, total: int) -> None:
+            if bar.desc != f"{name}: ":
+                bar.reset(total)
+                bar.set_description(name)
+            bar.update(done - bar.n)
+
+        yield progress
+
+
+def write(record: Record, folder: Path) -> tuple[Path, Path]:
     """Write the table as Markdown, and with the outcomes of every scene as JSON."""
-    folder.mkdir(parents=True, exist_ok=True)
-    document, data = folder / f"{stem}.md", folder / f"{stem}.json"
+    document, data = folder / "table.md", folder / "table.json"
     write_bytes(document, markdown(record).encode())
     write_json(data, dict(record))
     return document, data

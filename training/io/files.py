@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
@@ -22,6 +23,10 @@ Arrays = dict[str, NDArray[Any]]
 
 LARGEST_JSON = 64 << 20
 """Greatest size of a JSON file, [bytes]."""
+LARGEST_YAML = 1 << 20
+"""Greatest size of a YAML file, [bytes]."""
+_NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
+"""Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 
@@ -35,12 +40,13 @@ class BadFileError(ValueError):
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically, so that readers see the old content or the new, even after a crash.
+    """Write a file atomically, so that readers see the old content or the new, even after a crash; create its folder.
 
     Raises:
         OSError: For example of a full disk; what was there is still there.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with temporary.open("wb") as file:
             file.write(content)
@@ -120,6 +126,37 @@ def read_bytes(path: Path, largest: int | None = None) -> bytes:
         raise BadFileError(path, f"cannot be read ({error.strerror})") from None
     except MemoryError:
         raise BadFileError(path, "does not fit into memory") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """Loader of plain values that refuses repeated names."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping; a repeated name raises an error."""
+        names = [key.value for key, _ in node.value]
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{repeated} is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file that holds values by name.
+
+    Raises:
+        BadFileError: It is missing, too large, no YAML, or holds something else.
+    """
+    content = read_bytes(path, LARGEST_YAML)
+    try:
+        value = yaml.load(content, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadFileError(path, f"cannot be read as YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+        raise BadFileError(path, "must hold values by name, such as env: viapoint/PlanarObstacles-v0")
+    return value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -31,11 +31,7 @@ SPARE_PARAMETERS = 100_000
 
 
 def check_env_arguments(kwargs: Mapping[str, Any]) -> None:
-    """Check that an environment fits into memory.
-
-    Raises:
-        ValueError: An argument is over its limit.
-    """
+    """Check that an environment fits into memory."""
     for name, most in LARGEST_ARGUMENTS.items():
         value = kwargs.get(name, 0)
         for each in value if isinstance(value, list | tuple) else (value,):

@@ -80,12 +80,7 @@ def connect(address: str | None = None, cpus: int | None = None) -> bool:
 
 
 def _check_listens(address: str) -> None:
-    """Check that something listens at an address, as Ray itself tries for minutes.
-
-    Raises:
-        ValueError: The address is not HOST:PORT.
-        OSError: Nothing listens there.
-    """
+    """Check that something listens at an address, as Ray itself tries for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if address in ("auto", "local"):
         return
@@ -95,11 +90,7 @@ def _check_listens(address: str) -> None:
 
 
 def check_nodes(options: Mapping[str, Any] | None = None) -> None:
-    """Check that every node has the packages of this machine.
-
-    Raises:
-        ValueError: One has other versions, or lacks a package; the message names it.
-    """
+    """Check that every node has the packages of this machine."""
     ray = import_ray()
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -120,11 +111,7 @@ def check_nodes(options: Mapping[str, Any] | None = None) -> None:
 
 
 def check_versions(found: dict[str, str], wanted: dict[str, str], node: str) -> None:
-    """Check that the packages of a node are those of the driver.
-
-    Raises:
-        ValueError: They are not; the message names them.
-    """
+    """Check that the packages of a node are those of the driver."""
     others = [
         f"{name} {found.get(name)}, not {wanted[name]}" for name in wanted if found.get(name) != wanted[name]
     ]

@@ -215,9 +215,7 @@ def _distinct(
         if not others.size:
             break
         kept.append(int(others[0]))
-    ranks = np.array(
-        [first + 1, *(each for each in kept[1:])]
-    )  # candidate i has rank i: the chosen one is row 0
+    ranks = np.array([first + 1, *kept[1:]])  # candidate i has rank i: the chosen one is row 0
     return np.asarray(candidates[kept], np.float32), ranks
 
 

@@ -130,7 +130,8 @@ def execute_replanning(
         segment = _segment(env.last_rollout[0], done, None, info)
         current, path = env.last_plan, None
         if not all(np.array_equal(a, b) for a, b in zip(current, known, strict=True)):
-            known, path = current, _path(env)
+            moving = env.unwrapped.last_plans[0][-1][1]
+            known, path = current, np.asarray(moving.trajectory().sample(48, 0)[0][0])
         done += len(segment.time)
         yield segment._replace(time=segment.time + offset, path=path, restarted=restarted)
         wanted, restarted = goal_of(), False
@@ -158,12 +159,6 @@ def _segment(rollout: Rollout, first: int, path: Float | None, info: Mapping[str
         rollout.time[first:], rollout.joints[first:], rollout.hand[first:], rollout.contact[first:],
         rollout.clearance[first:], path, info,
     )  # fmt: skip
-
-
-def _path(env: Any) -> Float:
-    """Return the path of the plan under way, shape (P, D), [m]."""
-    moving = env.unwrapped.last_plans[0][-1][1]
-    return np.asarray(moving.trajectory().sample(48, 0)[0][0])
 
 
 def describe_outcome(info: dict[str, Any]) -> str:

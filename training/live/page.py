@@ -148,11 +148,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _serve(host: str, port: int) -> viser.ViserServer:
-    """Start the server on exactly this port.
-
-    Raises:
-        OSError: The port is occupied, or the address is not one of this machine.
-    """
+    """Start the server on exactly this port."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -15,7 +15,6 @@ from viapoint.training.live.obstacle_editing import BOX_SIZES
 if TYPE_CHECKING:
     import viser
 
-    from viapoint.training.live.comparison import MethodResult
     from viapoint.training.live.decisions import Proposal
     from viapoint.training.live.movements import Profile
 
@@ -71,6 +70,19 @@ class Facts(NamedTuple):
     ranks: bool
     """True if the agent can check its proposals."""
     spatial: bool
+
+
+class MethodResult(NamedTuple):
+    """Simulated outcome of a method in one scene."""
+
+    name: str
+    success: bool
+    reward: float
+    clearance: float
+    """Least clearance of the executed movement, [m]."""
+    jerk_ratio: float
+    seconds: float
+    """Time of the decision, [s]."""
 
 
 class Panels:

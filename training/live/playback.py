@@ -34,13 +34,7 @@ RENDER_TIMEOUT = 20.0
 
 
 class Playback:
-    """Playback in one tab.
-
-    Args:
-        client: Tab.
-        view: View of the tab.
-        scene_of: Function that returns the present scene.
-    """
+    """Playback in the view of one tab; `scene_of` returns the present scene."""
 
     def __init__(
         self, client: viser.ClientHandle, view: SceneView, scene_of: Callable[[], LiveScene]
@@ -51,11 +45,9 @@ class Playback:
         """Segments of the last movement."""
 
     def play(self, segments: Iterator[Segment], speed: float) -> Iterator[float]:
-        """Show a movement in pictures, and yield the time until the next one, [s].
+        """Show a movement at a speed relative to real time, and yield the time until the next picture, [s].
 
-        Args:
-            segments: Movement; each segment is computed when the one before it has been shown.
-            speed: Speed relative to real time.
+        Each segment is computed when the one before it has been shown.
         """
         began = None
         for segment in self._each(segments):
@@ -69,13 +61,7 @@ class Playback:
                 yield min(TICK, max((float(segment.time[shown - 1]) - elapsed) / speed, 0.0))
 
     def film(self, segments: Iterator[Segment], speed: float, tell: Callable[[str], None]) -> bytes:
-        """Return a movement as an MP4 file; the browser renders it in the present view.
-
-        Args:
-            segments: Movement.
-            speed: Speed relative to real time.
-            tell: Function that shows the user how far it is.
-        """
+        """Return a movement as an MP4 file that the browser renders in the present view; `tell` shows how far it is."""
         frames, step, due = list[Any](), speed / FILM_FPS, 0.0
         for segment in self._each(segments):
             for row in np.flatnonzero(segment.time >= due):

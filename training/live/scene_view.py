@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
     from viapoint.training.live.scene_file import LiveScene
 
-Drag = Callable[[str, Float, bool], None]
-"""Function that is called with a handle's name, its new position (D,) [m], and True at the end of a drag."""
+Drag = Callable[[str, Float], None]
+"""Function that is called with a handle's name and its new position, shape (D,), [m]."""
 
 FADE_STEPS = 8
 """Steps in which an old plan fades."""
@@ -80,6 +80,7 @@ class SceneView:
         self._drops: dict[str, Any] = {}
         self._obstacles: list[tuple[Any, Float]] = []
         self._paths: dict[str, Any] = {}
+        self._count = 0
         self._thin: list[Any] = []
         self._fading: list[tuple[Any, int]] = []
         self._grab: dict[str, Float] = {}
@@ -156,7 +157,7 @@ class SceneView:
         for i, via in enumerate(vias):
             self._place_handle(f"via {i}", via)
         if path is not None:
-            self._count = getattr(self, "_count", 0) + 1
+            self._count += 1
             colour = PALETTE.plan if clear else PALETTE.contact
             mesh = tube(in_space(path, LEVEL), PLAN)
             self._paths["plan"] = self._add_mesh(f"/plans/{self._count}", mesh, _rgb(colour), shadow=False)
@@ -310,7 +311,7 @@ class SceneView:
             point = np.array([*place[:2], max(point[2], 0.0)])
         low, high = PLANAR_LIMITS if self._planar else SPATIAL_LIMITS
         point = np.clip(point, low, high)
-        self._on_drag(name, point[: self._task.arm.dimension], event.phase == "end")
+        self._on_drag(name, point[: self._task.arm.dimension])
 
 
 def _single(mesh: Triangles) -> tuple[Any, Any]:

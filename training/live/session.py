@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.training.live.comparison import MethodResult
 from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
 from viapoint.training.live.job_thread import Job, JobThread
 from viapoint.training.live.movements import (
@@ -24,7 +23,7 @@ from viapoint.training.live.movements import (
     plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
-from viapoint.training.live.panels import BAD, GOOD, RESET, Actions, Panels
+from viapoint.training.live.panels import BAD, GOOD, RESET, Actions, MethodResult, Panels
 from viapoint.training.live.playback import Playback, png
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
@@ -42,10 +41,7 @@ FADE_EVERY = 0.08
 
 
 class Session:
-    """Session of one tab.
-
-    All work is done in one thread. Jobs of the same key replace each other while they wait, so that a fast drag skips
-    positions instead of lagging behind.
+    """Session of one tab; all its work is done in one :class:`JobThread`.
 
     Args:
         client: Tab.
@@ -75,7 +71,7 @@ class Session:
         self._origin = ""
         self._jobs = JobThread(
             f"viapoint-tab-{client.client_id}", begin=self._open, animate=self._animate, end=self._end,
-            tell=self._tell_error,
+            tell=lambda sentence: self._panels.tell(sentence, BAD),
         )  # fmt: skip
         self._jobs.start()
 
@@ -123,7 +119,7 @@ class Session:
 
     def load(self, content: bytes) -> None:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
-        self.post("load", lambda: self._load(content))
+        self.post("load", lambda: self._take(self._shared.read(content), ""))
 
     @property
     def _task(self) -> Task:
@@ -165,9 +161,6 @@ class Session:
             if env is not None:
                 env.close()
         self._on_end()
-
-    def _tell_error(self, sentence: str) -> None:
-        self._panels.tell(sentence, BAD)
 
     def _animate(self) -> bool:
         """Fade old plans, show the next picture of a movement when it is due, and return True if there is more."""
@@ -220,7 +213,7 @@ class Session:
             self._panels.show_comparison(())
         self._decide()
 
-    def _drag(self, name: str, point: Float, end: bool) -> None:
+    def _drag(self, name: str, point: Float) -> None:
         """Move what is dragged."""
         kind, _, number = name.partition(" ")
         if kind == "goal" and self._playing is not None and self._task.replanning:
@@ -260,21 +253,17 @@ class Session:
             self._by_hand = vias, self.proposal.duration
             self._set_scene(self._scene, changed=False)
 
-    def _select(self, row: int | None) -> None:
-        """Select an obstacle, or none."""
-        self._selected = row
-        self._view.show_obstacles(self._scene.obstacles, row)
-        if row is None or row >= len(self._scene.obstacles):
-            self._panels.show_selected("", None)
-        else:
+    def _select(self, row: int) -> None:
+        """Select an obstacle, unless it has been removed meanwhile."""
+        if row < len(self._scene.obstacles):
+            self._selected = row
+            self._view.show_obstacles(self._scene.obstacles, row)
             self._panels.show_selected(f"obstacle {row}", sizes_of(self._scene.obstacles[row]))
 
     def _resize(self, name: str, value: float) -> None:
-        row = self._selected
-        if row is None or row >= len(self._scene.obstacles):
-            return
-        numbers = resized(self._scene.obstacles[row], name, value)
-        self._set_scene(self._scene.with_row(row, numbers), changed=True)
+        if self._selected is not None:
+            numbers = resized(self._scene.obstacles[self._selected], name, value)
+            self._set_scene(self._scene.with_row(self._selected, numbers), changed=True)
 
     def _add(self, kind: str) -> None:
         scene = self._scene.with_obstacle(new_obstacle(self._scene, kind))
@@ -285,7 +274,7 @@ class Session:
 
     def _remove(self) -> None:
         row, self._selected = self._selected, None
-        if row is not None and row < len(self._scene.obstacles):
+        if row is not None:
             self._set_scene(self._scene.without(row), changed=True)
         self._panels.show_selected("", None)
 
@@ -341,8 +330,7 @@ class Session:
             return
         others = self._setting.decisions.proposals(observation, decision)
         own = self._proposals[0]
-        by_hand = own.rank == 0
-        self._proposals = (own, *others) if by_hand else others
+        self._proposals = others if own.rank else (own, *others)
         self._show_details()
 
     def _show_details(self, executed: Profile | None = None) -> None:
@@ -361,9 +349,7 @@ class Session:
             self._stop()
             self._view.show_executed(None)
             self._picked = index
-            proposals = self._proposals
             self._show_plan()
-            self._proposals = proposals
             self._show_details()
 
     def _redecide(self, **changes: Any) -> None:
@@ -415,7 +401,7 @@ class Session:
         """Compare methods, one job for each, so that changes of the scene come between."""
         scene, setting, results = self._scene, self._setting, list[MethodResult]()
         setting.observe(self._fitted, self._env)  # an impossible scene is refused
-        rows = setting.comparison(self._fitted, self._checks)
+        rows = setting.compare(self._fitted, self._checks)
 
         def step() -> None:
             if scene is not self._scene:
@@ -431,9 +417,6 @@ class Session:
         step()
 
     # Files
-
-    def _load(self, content: bytes) -> None:
-        self._take(self._shared.read(content), "")
 
     def _save(self) -> None:
         text = to_json(self._scene, self._setting.env_id)
@@ -464,6 +447,7 @@ class Session:
         def later(key: str, function: Callable[..., None]) -> Any:
             return lambda *values: self.post(key, lambda: function(*values))
 
+        own = self._shared.own.task.action.n_via
         return Actions(
             scene=later("scene", self._draw_scene),
             duration=later("duration", self._set_duration),
@@ -473,7 +457,7 @@ class Session:
             add=later("add", self._add),
             remove=later("remove", self._remove),
             resize=later("resize", self._resize),
-            decide=later("decide", self._decide_anew),
+            decide=later("decide", lambda: self._redecide(_by_hand=None, _duration=None, _n_via=own)),
             execute=later("execute", self._execute),
             compare=later("compare", self._compare),
             save=later("save", self._save),
@@ -489,6 +473,3 @@ class Session:
             self._redecide(_by_hand=(self._by_hand[0], duration))
         else:
             self._redecide(_duration=duration)
-
-    def _decide_anew(self) -> None:
-        self._redecide(_by_hand=None, _duration=None, _n_via=self._task.action.n_via)

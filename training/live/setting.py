@@ -1,9 +1,10 @@
-"""Environments, agent and comparison that all tabs of the live page share."""
+"""Environments, agent and comparison of methods that all tabs of the live page share."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,31 +13,28 @@ import numpy as np
 
 from viapoint.envs.common.types import Observation
 from viapoint.envs.mdp.task import Task
+from viapoint.envs.registration import STEP_TASKS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.envs.scenes.scene import Scenes, check_scenes
 from viapoint.training.algorithms.agent import Agent
-from viapoint.training.live.comparison import Comparison
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.obstacle_editing import KINDS
-from viapoint.training.live.panels import Facts
+from viapoint.training.live.panels import Facts, MethodResult
 from viapoint.training.live.scene_draws import Draw, scene_kinds
 from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
-from viapoint.training.rollouts.step_rollout import is_step_wise, whole_task
+from viapoint.training.planners.baselines import Method, agent_method, make_method
+from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation, whole_task
 
+BASELINES = {"straight": "straight", "geometry search": "search512", "planner": "planner"}
+"""Compared methods by their names in the table."""
 MOST_VIAS = 4
 """Greatest number of via-points of the slider."""
 
 
 class Setting:
-    """Environment, what decides in it, and a comparison of methods.
-
-    Args:
-        env_id: Id of a registered environment.
-        agent: Agent of that environment; None for the geometry search.
-        env_kwargs: Arguments of the environment.
-    """
+    """Environment, what decides in it (without an agent the geometry search), and a comparison of methods."""
 
     def __init__(self, env_id: str, agent: Agent | None, env_kwargs: Mapping[str, Any]) -> None:
         self.env_id, self.agent, self.env_kwargs = env_id, agent, dict(env_kwargs)
@@ -45,9 +43,10 @@ class Setting:
         self.task: Task = env.task
         self.model = env.model
         env.close()
-        self._steps = agent is not None and is_step_wise(env_id)
+        self._steps = agent is not None and env_id in STEP_TASKS
         self.decisions = DecisionMaker(self.task, None if self._steps else agent)
-        self.comparison = Comparison(self.whole_id, agent, **self.whole_kwargs)
+        self._simulation: SceneSimulation | None = None
+        self._methods: dict[str, Method] = {}
         self.comparing = threading.Lock()
         """Lock of the comparison, whose environments all tabs share."""
 
@@ -77,18 +76,58 @@ class Setting:
         Raises:
             ValueError: The scene is impossible, with the reason.
         """
-        task, rows = self.task, scene.batch()
-        check_scenes(rows, task.collision_model)  # type: ignore[arg-type]
+        check_scenes(scene.batch(), self.task.collision_model)  # type: ignore[arg-type]
         observation: Observation
-        if task.replanning:
+        if self.task.replanning:
             observation = env.reset(options=scene.options(changing=True))[0]
             return observation
-        joints = np.asarray(task.arm.inverse_kinematics(rows.start))
-        missing = task.observation.n_rows - rows.obstacles.shape[1]
-        obstacles = np.pad(rows.obstacles, ((0, 0), (0, missing), (0, 0)))
-        scenes = Scenes(rows.start, rows.goal, obstacles)
-        observation = task.observation.observe(joints, rows.start, scenes)
+        rows = self._filled(scene)
+        joints = np.asarray(self.task.arm.inverse_kinematics(rows.start))
+        observation = self.task.observation.observe(joints, rows.start, rows)
         return observation
+
+    def compare(self, scene: LiveScene, checks: int = 0) -> Iterator[tuple[str, Callable[[], MethodResult]]]:
+        """Yield the name of each method and a function that lets it decide in a scene and simulates its decision."""
+        if self.agent is not None:
+            ranks = hasattr(self.agent.policy, "checks")
+            method = agent_method("agent", self.agent, checks if ranks else None)
+            yield "agent", lambda: self._result("agent", method, scene)
+        for name, known in BASELINES.items():
+            yield name, lambda name=name, known=known: self._result(name, self._baseline(known), scene)  # type: ignore[misc]
+
+    def close(self) -> None:
+        """Close the environments of the comparison."""
+        if self._simulation is not None:
+            self._simulation.close()
+
+    def _baseline(self, name: str) -> Method:
+        if name not in self._methods:
+            self._methods[name] = make_method(name, self.whole_id, **self.whole_kwargs)
+        return self._methods[name]
+
+    def _result(self, name: str, method: Method, scene: LiveScene) -> MethodResult:
+        if self._simulation is None:
+            self._simulation = new_simulation(self.whole_id, 1, **self.whole_kwargs)
+        simulation, scenes = self._simulation, self._filled(scene)
+        observation = simulation.observe(scenes)
+        begin = time.perf_counter()
+        decisions = method.decide(observation, scenes)
+        seconds = time.perf_counter() - begin
+        results = simulation.play(method, scenes, decisions)
+        info = results.info
+        return MethodResult(
+            name=name, success=bool(results.success[0]), reward=float(results.reward[0]),
+            clearance=float(info["min_clearance"][0]), jerk_ratio=float(info["jerk_ratio"][0]), seconds=seconds,
+        )  # fmt: skip
+
+    def _filled(self, scene: LiveScene) -> Any:
+        """Return a scene as a batch of one, with as many rows of obstacles as the observation has."""
+        changing = scene.batch()
+        scenes: Any = changing if self.task.replanning else Scenes(*changing[:3])
+        missing = self.task.observation.n_rows - len(scene.obstacles)
+        names = [name for name in ("obstacles", "courses") if name in scenes._fields]
+        padded = {name: np.pad(getattr(scenes, name), ((0, 0), (0, missing), (0, 0))) for name in names}
+        return scenes._replace(**padded)
 
     def limit(self, scene: LiveScene) -> str:
         """Return the limit of the environment that a scene exceeds, as part of a sentence; "" if it has room for it."""
@@ -103,15 +142,7 @@ class Setting:
 
 
 class Shared:
-    """Settings, and everything else that is expensive to make, for all tabs of a page.
-
-    Args:
-        env_id: Id of a registered environment.
-        agent: Agent of that environment; None for the geometry search.
-        model_file: MJCF file that the arm was loaded from, whose meshes are drawn.
-        seed: Seed of the random scenes.
-        env_kwargs: Arguments of the environment.
-    """
+    """Settings, and everything else that is expensive to make, for all tabs; arguments as of :class:`LivePage`."""
 
     def __init__(
         self,
@@ -130,11 +161,7 @@ class Shared:
         self.drawing()
 
     def setting_of(self, scene: LiveScene) -> Setting:
-        """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used.
-
-        Raises:
-            ValueError: The scene has more obstacles than any setting.
-        """
+        """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used."""
         if not self.own.limit(scene):
             return self.own
         if len(scene.obstacles) > MOST_OBSTACLES:
@@ -186,4 +213,4 @@ class Shared:
         """Close the environments of the comparisons."""
         for setting in (self.own, self._wide):
             if setting is not None:
-                setting.comparison.close()
+                setting.close()

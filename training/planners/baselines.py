@@ -10,15 +10,16 @@ import numpy as np
 from tqdm import tqdm
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import REPLANNING_TASKS
+from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planners.cma_planner import Planner
 from viapoint.training.planners.ompl_planner import MotionPlanner
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
-from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation
-from viapoint.training.rollouts.step_rollout import StepAgentMethod, is_step_wise
+from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, new_simulation
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.search.geometry_search import GeometrySearch
+from viapoint.training.search.candidates import candidate_actions
+from viapoint.training.search.geometry_search import GeometrySearch, registered_task, score_plans
+from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 
 class Method(Protocol):
@@ -87,6 +88,25 @@ class RandomVias:
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
+class RandomOrder:
+    """Best of some plans that are drawn at random for each scene and checked with computed geometry."""
+
+    def __init__(self, env_id: str, checks: int, **kwargs: Any) -> None:
+        self.name, self._checks = f"random order, {checks} checks", checks
+        self._task = registered_task(env_id, **kwargs)
+        self._generator = np.random.default_rng(0)
+
+    def decide(self, observation: Observation, scenes: Any) -> Float:
+        """Return the best of random plans that have the duration of the greatest reward."""
+        layout = candidate_actions(self._task, 2, replanning=False)[1]
+        number, size = len(observation["hand"]), self._task.action.size
+        duration = self._task.action.n_via * self._task.action.dimension
+        actions = self._generator.uniform(-1.0, 1.0, (number, self._checks, size)).astype(np.float32)
+        actions[..., duration] = layout[duration]
+        worth = score_plans(observation, actions, self._task, (CLEARANCE_MARGIN, REACH_MARGIN))
+        return np.asarray(actions[np.arange(number), worth.argmax(axis=1)], dtype=np.float64)
+
+
 class StoredSolutions:
     """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew."""
 
@@ -141,7 +161,7 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
     env_id, env_kwargs = env_arguments(model.get_env())
-    if is_step_wise(env_id):
+    if env_id in STEP_TASKS:
         return StepAgentMethod(name, model, env_id, env_kwargs)
     return AgentMethod(name, model, checks)
 
@@ -180,11 +200,7 @@ REPLANNING_METHODS: dict[str, Callable[[Any], Method]] = {
 
 
 def check_method(name: str, env_id: str) -> None:
-    """Check that a baseline of this name exists for an environment.
-
-    Raises:
-        ValueError: No baseline has that name.
-    """
+    """Check that a baseline of this name exists for an environment."""
     known = _known(env_id)
     if name not in known:
         raise ValueError(
@@ -193,11 +209,7 @@ def check_method(name: str, env_id: str) -> None:
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
-    """Return a baseline for an environment made with `kwargs`.
-
-    Raises:
-        ValueError: No baseline has that name.
-    """
+    """Return a baseline for an environment made with `kwargs`."""
     check_method(name, env_id)
     return _known(env_id)[name](new_simulation(env_id, **kwargs))
 

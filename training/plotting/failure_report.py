@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.evaluation.evaluator import MethodResult, evenly_spread
 from viapoint.training.io.files import write_bytes, write_json
-from viapoint.training.plotting.gallery import Entry, gallery
+from viapoint.training.plotting.gallery import Entry, gallery, play
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
 
@@ -142,7 +141,6 @@ def write_failures(failures: Failures, folder: Path, env_id: str, **env_kwargs: 
 
     The pictures of a kind range from its deepest collision to its shallowest.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     table = markdown(failures.counts(), len(failures.frozen.share))
     heading = f"# Failures of {failures.method} on {env_id}, scenes {failures.frozen.name}"
     write_bytes(folder / "failures.md", f"{heading}\n\n{table}\n".encode())
@@ -157,6 +155,15 @@ def write_failures(failures: Failures, folder: Path, env_id: str, **env_kwargs: 
             heading = f"{kind.description}: {len(mine)} of {len(failures.rows)} failures"
             written.append(gallery(folder / f"{kind.name}.png", entries, heading=heading))
     return written
+
+
+def _entries(
+    failures: Failures, chosen: NDArray[np.int64], env_id: str, env_kwargs: Mapping[str, Any]
+) -> list[Entry]:
+    """Simulate some of the failures again and return them as entries of a gallery."""
+    scenes, actions = failures.frozen.scenes.take(failures.rows[chosen]), failures.actions[chosen]
+    titles = [_title(failures, index) for index in chosen]
+    return play(env_id, scenes, titles, lambda row, _: actions[row].astype(np.float32), **env_kwargs)
 
 
 def markdown(counts: Mapping[str, Any], scenes: int) -> str:
@@ -174,21 +181,6 @@ def markdown(counts: Mapping[str, Any], scenes: int) -> str:
         succeeds = "-" if None in another else str(sum(another))
         lines.append([description, str(number), part, *by_band, succeeds])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _entries(
-    failures: Failures, chosen: NDArray[np.int64], env_id: str, env_kwargs: Mapping[str, Any]
-) -> list[Entry]:
-    """Simulate some of the failures again and return them as entries of a gallery."""
-    env = gym.make(env_id, **env_kwargs)
-    entries = []
-    for index in chosen:
-        scene = failures.frozen.scenes.take([failures.rows[index]])
-        env.reset(options=scene.as_options())
-        env.step(failures.actions[index].astype(np.float32))
-        entries.append(Entry.of_last(env, scene, title=_title(failures, index), success=False))
-    env.close()
-    return entries
 
 
 def _title(failures: Failures, index: int) -> str:

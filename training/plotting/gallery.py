@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Observation
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Rollout
 from viapoint.training.plotting.top_view import draw_movement
@@ -47,21 +48,32 @@ class Entry:
     whole_arm: bool = False
     """True where the links can touch obstacles, too."""
 
-    @classmethod
-    def of_last(cls, env: gym.Env[Any, Any], scene: Scenes, *, title: str, success: bool) -> Entry:
-        """Return the last movement of an environment, in the scene that it was reset to."""
-        inner: Any = env.unwrapped
-        return cls(
-            arm=inner.task.arm, scene=scene, plan=inner.last_plan, rollout=inner.last_rollout, title=title,
-            success=success, whole_arm=inner.task.whole_arm,
-        )  # fmt: skip
-
     @property
     def outcome(self) -> str:
         """Outcome in one word."""
         if self.success:
             return "success"
         return "collision" if self.rollout.contact.any() else "missed"
+
+
+def play(
+    env_id: str, scenes: Scenes, titles: Sequence[str], act: Callable[[int, Observation], Any], **kwargs: Any
+) -> list[Entry]:
+    """Simulate one movement in each scene; `act` returns the action from its row and its first observation."""
+    env: Any = gym.make(env_id, **kwargs)
+    inner, entries = env.unwrapped, []
+    for row, title in enumerate(titles):
+        scene = scenes.take([row])
+        observation, _ = env.reset(options=scene.as_options())
+        success = bool(env.step(act(row, observation))[-1]["is_success"])
+        entries.append(
+            Entry(
+                arm=inner.task.arm, scene=scene, plan=inner.last_plan, rollout=inner.last_rollout, title=title,
+                success=success, whole_arm=inner.task.whole_arm,
+            )
+        )  # fmt: skip
+    env.close()
+    return entries
 
 
 def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:

@@ -17,7 +17,7 @@ from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
 from viapoint.training.planners.baselines import agent_method
-from viapoint.training.rollouts.step_rollout import whole_task
+from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, drawn, frozen_fit, load

@@ -205,7 +205,6 @@ class Run:
     def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
         """Write the result of an evaluation under a name."""
         path = self.folder / "evaluations" / f"{name}.json"
-        path.parent.mkdir(exist_ok=True)
         write_json(path, record)
         return path
 
@@ -265,11 +264,7 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
-    """Check that a run is resumed with its own settings; `usual` has defaults for all that the call does not name.
-
-    Raises:
-        BadFileError: Something was asked for that the run did not begin with.
-    """
+    """Check that a run is resumed with its own settings; `usual` has defaults for all that the call does not name."""
     begun, asked, default = (each.as_json() for each in (run.config, config, usual))
     others = []
     for name in asked.keys() - MAY_CHANGE:

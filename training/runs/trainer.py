@@ -115,12 +115,7 @@ def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
 
 
 def training_env(config: TrainConfig) -> ViaVecEnv:
-    """Return the environments of a training, in this process or shared by rollout workers.
-
-    Raises:
-        ImportError: Ray is asked for and not installed.
-        ValueError: There is no such environment or cluster.
-    """
+    """Return the environments of a training, in this process or shared by rollout workers."""
     shared = {"workers": config.rollout_workers, "observe_candidates": config.observe_candidates}
     if config.on == "local":
         return ViaVecEnv(config.env, config.copies, **shared, **config.env_kwargs)

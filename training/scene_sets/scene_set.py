@@ -137,11 +137,7 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """Return the kind of scenes of a file, and its arrays, whose shapes are consistent.
-
-    Raises:
-        ValueError: It is no such file.
-    """
+    """Return the kind of scenes of a file, and its arrays, whose shapes are consistent."""
     try:
         with path.open("rb") as file:
             if not zipfile.is_zipfile(file):

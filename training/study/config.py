@@ -17,7 +17,7 @@ from viapoint.training.algorithms.model_io import ALGORITHMS, argument_names
 from viapoint.training.config.checks import check_env_kwargs, check_whole
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import Algorithm, preset_of
-from viapoint.training.io.yaml_file import read_yaml
+from viapoint.training.io.files import read_yaml
 from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS
 from viapoint.training.scene_sets.scene_set import SETS, shipped_path
 from viapoint.training.study.fields import (
@@ -137,11 +137,7 @@ class Agent(Entry):
         return found + [Mode(checks, untrained=True) for checks in self.checks if self.untrained]
 
     def config(self, env: Environment, seed: int, out: Path) -> TrainConfig:
-        """Return the configuration of a training; `policy_kwargs` are merged with those of the preset.
-
-        Raises:
-            ValueError: A setting is not allowed.
-        """
+        """Return the configuration of a training; `policy_kwargs` are merged with those of the preset."""
         env_id = TWINS[env.id] if self.step_wise else env.id
         given = dict(self.training)
         hyperparameters = dict(given.pop("hyperparameters", {}))

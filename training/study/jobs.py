@@ -24,17 +24,26 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.worker_env import n_cores
-from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.algorithms.model_io import load_model, untrained
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods, one_thread
 from viapoint.training.io.files import read_json, write_json
-from viapoint.training.planners.baselines import Method
+from viapoint.training.planners.baselines import (
+    Method,
+    RandomOrder,
+    StoredSolutions,
+    agent_method,
+    make_method,
+    refined_search,
+)
+from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
+from viapoint.training.rollouts.rollout import EpisodeSimulation, new_simulation
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import resolved, train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
+from viapoint.training.search.geometry_search import GeometrySearch
 from viapoint.training.study.config import Agent, Baseline, Environment, Mode, Study
-from viapoint.training.study.methods import method_of, method_of_mode
-from viapoint.training.study.runner import Job
+from viapoint.training.study.runners import Job
 
 STORED_OUTCOMES = ("is_success", "collision", "jerk_ratio", "duration")
 """Outcomes that are stored for every scene."""
@@ -191,7 +200,6 @@ def agent_evaluations(root: Path, cell: Cell, name: str, frozen: FrozenScenes) -
             model = load_model(run.best) if model is None else model
             method = method_of_mode(mode, model, cell.env, kwargs, cell.seed)
             record = wanted | measure(method, frozen, cell.env, kwargs)
-            path.parent.mkdir(exist_ok=True)
             write_json(path, record)
         found[mode.name] = record
     return found
@@ -208,7 +216,6 @@ def measure_baseline(root: Path, baseline: Baseline, env: Environment, sets: Set
                 method = method_of(baseline, env, frozen)
             kwargs = {**env.env_kwargs, **baseline.env_kwargs}
             record = wanted | measure(method, frozen, env, kwargs)
-            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, record)
         rates.append(f"{name} {percent(record)}")
     return "; ".join(rates)
@@ -222,11 +229,7 @@ def baseline_record(
 
 
 def measure(method: Method, frozen: FrozenScenes, env: Environment, kwargs: Mapping[str, Any]) -> Record:
-    """Return the metrics of a method and its outcomes in every scene; nothing if it was interrupted.
-
-    Raises:
-        KeyboardInterrupt: The evaluation was interrupted.
-    """
+    """Return the metrics of a method and its outcomes in every scene; nothing if it was interrupted."""
     with one_thread():
         evaluation = evaluate_methods([method], frozen, env.id, env_kwargs=kwargs, time_decisions=False)
     (result,) = evaluation.results
@@ -320,3 +323,26 @@ def times_of(study: Study, env: Environment) -> Record:
     """Return the stored times by row."""
     path = study.out / path_of_times(env)
     return read_json(path) if path.is_file() else {}
+
+
+def method_of_mode(mode: Mode, model: Any, env: Environment, kwargs: Any, seed: int = 0) -> Method:
+    """Return an agent that decides in a mode; the network before training has the weights of the seed."""
+    chosen = untrained(model, seed) if mode.untrained else model
+    method = agent_method(mode.name, chosen, mode.checks)
+    if mode.unrevised:
+        return OpenLoopBaseline(method, EpisodeSimulation(env.id, **kwargs))
+    return method
+
+
+def method_of(baseline: Baseline, env: Environment, frozen: FrozenScenes, **more: Any) -> Method:
+    """Return a baseline in an environment."""
+    kwargs = {**env.env_kwargs, **baseline.env_kwargs, **more}
+    if baseline.method == "stored":
+        return StoredSolutions(frozen)
+    if baseline.checks is None:
+        return make_method(baseline.method, env.id, **kwargs)
+    if baseline.method == "search":
+        return refined_search(baseline.checks)(new_simulation(env.id, 2, **kwargs))
+    if baseline.method == "sobol":
+        return GeometrySearch(env.id, baseline.checks, **kwargs)
+    return RandomOrder(env.id, baseline.checks, **kwargs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import functools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -16,7 +16,7 @@ from viapoint.training.study.figures import draw_figures
 from viapoint.training.study.jobs import baseline_jobs, measured_files, training_jobs
 from viapoint.training.study.page import write_pages
 from viapoint.training.study.results import Row, gather, rows_in
-from viapoint.training.study.runner import Job, Runner, make_runner
+from viapoint.training.study.runners import Job, make_runner
 from viapoint.training.study.timing import remove_times, time_decisions
 
 Step = Literal["train", "evaluate", "baselines", "time", "page"]
@@ -32,12 +32,7 @@ class StudyFailedError(Exception):
 
 
 def run(config: StudyConfig) -> None:
-    """Run a study from the command line.
-
-    Raises:
-        ValueError: The file describes no study, or names something unknown.
-        StudyFailedError: A job failed.
-    """
+    """Run a study from the command line."""
     report = functools.partial(print, flush=True)
     run_study(
         config.file, on=config.on, workers=config.workers, only=config.only, redo=config.redo, report=report
@@ -100,7 +95,6 @@ def run_study(
         failed = _measure(study, jobs, steps, on, workers, report)
     record = gather(study, before)
     if "page" in steps:
-        study.page.record.parent.mkdir(parents=True, exist_ok=True)
         write_json(study.page.record, record)
         for path in [
             *draw_figures(record, study.page.figures, study.page.shown),
@@ -113,11 +107,7 @@ def run_study(
 
 
 def _remove_measurements(study: Study, patterns: Sequence[str], steps: set[str], report: Report) -> None:
-    """Remove the measurements and decision times of rows, so that the steps make them again.
-
-    Raises:
-        ValueError: A pattern matches no row.
-    """
+    """Remove the measurements and decision times of rows, so that the steps make them again."""
     rows = [(env, row) for env in study.environments for row in rows_in(study, env)]
     for pattern in patterns:
         if not any(_matches(row, env, pattern) for env, row in rows):
@@ -144,29 +134,26 @@ def _measure(
 ) -> list[str]:
     """Run jobs, then timings alone, then the searches that they decide; return what failed."""
     study.out.mkdir(parents=True, exist_ok=True)
-    failed = []
-    if jobs:
+    failed: list[str] = []
+
+    def run_all(jobs: Sequence[Job]) -> None:
         with make_runner(on, study.out, workers) as runner:
-            failed += _run(runner, jobs, report)
+            began = time.monotonic()
+            report(f"{len(jobs)} jobs; Ctrl-C saves, and the same command goes on")
+            for number, (job, answer) in enumerate(runner.run(jobs), 1):
+                minutes = (time.monotonic() - began) / 60.0
+                where = f" on {answer.place}" if answer.place else ""
+                text = f"FAILED: {answer.error}" if answer.error else answer.value
+                report(f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}{where}: {text}")
+                if answer.error:
+                    failed.append(f"{job.label}: {answer.error}")
+
+    if jobs:
+        run_all(jobs)
     if "time" in steps:
         for line in time_decisions(study):
             report(line)
     later = list(baseline_jobs(study, of_equal_time=True)) if "baselines" in steps else []
     if later:
-        with make_runner(on, study.out, workers) as runner:
-            failed += _run(runner, later, report)
-    return failed
-
-
-def _run(runner: Runner, jobs: Iterable[Job], report: Report) -> list[str]:
-    """Run jobs, report each, and return what failed."""
-    jobs, failed, began = list(jobs), [], time.monotonic()
-    report(f"{len(jobs)} jobs; Ctrl-C saves, and the same command goes on")
-    for number, (job, answer) in enumerate(runner.run(jobs), 1):
-        minutes = (time.monotonic() - began) / 60.0
-        where = f" on {answer.place}" if answer.place else ""
-        text = f"FAILED: {answer.error}" if answer.error else answer.value
-        report(f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}{where}: {text}")
-        if answer.error:
-            failed.append(f"{job.label}: {answer.error}")
+        run_all(later)
     return failed

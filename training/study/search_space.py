@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
@@ -20,8 +20,9 @@ from viapoint.training.config.base import Config
 from viapoint.training.config.checks import check_whole
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import Algorithm
-from viapoint.training.io.files import BadFileError
-from viapoint.training.io.yaml_file import read_yaml
+from viapoint.training.io.files import BadFileError, read_yaml
+
+Made = TypeVar("Made")
 
 SAMPLERS: dict[str, type[BaseSampler]] = {
     "tpe": optuna.samplers.TPESampler,
@@ -38,6 +39,8 @@ PRUNERS: dict[str, type[BasePruner]] = {
 ERROR, ATTEMPTS = "error", "attempts"
 """Attributes of a trial: the reason why it cannot be trained; numbers of the earlier attempts at it."""
 OBJECTIVES = ("final", "mean")
+SHARED = ("env", "algo", "n_timesteps", "eval_every", "eval_scenes", "env_kwargs", "discount_unit")
+"""Fields of a search that its trainings take over as they are."""
 RANGES = {
     "float": {"low", "high", "log", "step"},
     "int": {"low", "high", "log", "step"},
@@ -164,19 +167,9 @@ class SearchSpace(Config):
         for name, value in values.items():
             top, *inner = name.split(".")
             changed[top] = _replaced(name, changed.get(top, usual.get(top)), inner, value)
+        shared = {name: getattr(self, name) for name in SHARED}
         return TrainConfig(
-            env=self.env,
-            algo=self.algo,
-            seed=seed,
-            n_timesteps=self.n_timesteps,
-            n_envs=n_envs,
-            out=out,
-            eval_every=self.eval_every,
-            eval_scenes=self.eval_scenes,
-            env_kwargs=dict(self.env_kwargs),
-            hyperparameters=changed,
-            discount_unit=self.discount_unit,
-            progress=progress,
+            seed=seed, n_envs=n_envs, out=out, hyperparameters=changed, progress=progress, **shared
         )
 
     def make_sampler(self, number: int) -> BaseSampler:
@@ -188,16 +181,13 @@ class SearchSpace(Config):
         name, arguments = _named("sampler", self.sampler, SAMPLERS)
         seed = arguments.pop("seed", 0)
         check_whole("seed", seed, 0)
-        sampler: BaseSampler = _made(
-            "sampler", SAMPLERS[name], {**arguments, "seed": (seed * 1_000_003 + number) % 2**32}
-        )
-        return sampler
+        arguments["seed"] = (seed * 1_000_003 + number) % 2**32
+        return _made("sampler", SAMPLERS[name], arguments)
 
     def make_pruner(self) -> BasePruner:
         """Return the pruner."""
         name, arguments = _named("pruner", self.pruner, PRUNERS)
-        pruner: BasePruner = _made("pruner", PRUNERS[name], arguments)
-        return pruner
+        return _made("pruner", PRUNERS[name], arguments)
 
     def score(self, curve: list[dict[str, Any]]) -> float:
         """Return the score of a training from its learning curve."""
@@ -286,7 +276,7 @@ def _named(what: str, given: Any, known: Mapping[str, Any]) -> tuple[str, dict[s
     return name, {each: value for each, value in record.items() if each != "name"}
 
 
-def _made(what: str, kind: Any, arguments: Mapping[str, Any]) -> Any:
+def _made(what: str, kind: type[Made], arguments: Mapping[str, Any]) -> Made:
     allowed = [name for name in inspect.signature(kind).parameters if name not in ("args", "kwargs")]
     unknown = sorted(set(arguments) - set(allowed))
     if unknown:

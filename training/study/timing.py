@@ -22,12 +22,13 @@ from viapoint.training.study.jobs import (
     Record,
     identity,
     identity_of,
+    method_of,
+    method_of_mode,
     path_of_times,
     sets_of,
     times_of,
     trained,
 )
-from viapoint.training.study.methods import method_of, method_of_mode
 
 N_TIMED = 100
 """Greatest number of scenes in which decisions are timed."""
@@ -60,7 +61,7 @@ def time_decisions(study: Study) -> Iterator[str]:
             if times.get(row, {}).get("source") == source:
                 continue
             times[row] = {"source": source, **measure()}
-            _write(study, env, times)
+            write_json(study.out / path_of_times(env), times)
             checks = f"{times[row]['checks']} checks in " if "checks" in times[row] else ""
             yield f"{env.folder} {row}: {checks}{1e3 * times[row]['median']:.2f} ms"
 
@@ -70,7 +71,7 @@ def remove_times(study: Study, env: Environment, row: str) -> bool:
     times = times_of(study, env)
     if times.pop(row, None) is None:
         return False
-    _write(study, env, times)
+    write_json(study.out / path_of_times(env), times)
     return True
 
 
@@ -156,9 +157,3 @@ def _agent_to_time(study: Study, env: Environment, agent: Agent) -> Iterator[Tim
     for mode in agent.modes(env.id):
         source = identity_of(_timed_scenes(env), folder, mode)
         yield Timed(mode.row(agent.name), source, functools.partial(measure, mode))
-
-
-def _write(study: Study, env: Environment, times: Record) -> None:
-    path = study.out / path_of_times(env)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, times)

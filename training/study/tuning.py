@@ -35,7 +35,7 @@ from viapoint.training.io.installed import versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import new_model, resolved, train
-from viapoint.training.study.runner import Job, make_runner
+from viapoint.training.study.runners import Job, make_runner
 from viapoint.training.study.search_space import ATTEMPTS, ERROR, SearchSpace, stored
 
 SAVING_TIME = 60.0
@@ -173,12 +173,11 @@ class Tuning:
 
         Args:
             trials: Number of trials in total; that of the description if not given.
-            on: Runner, see :func:`~viapoint.training.study.runner.make_runner`.
+            on: Place of the trainings, see :func:`~viapoint.training.run_study`.
             workers: Number of trainings at the same time; 0 for one in this process.
             told: Function that shows one line for each finished trial.
 
         Raises:
-            ValueError: There is no such runner.
             TuningStoppedError: A trial ended without a result, for example because the disk is full; the next call
                 repeats it.
         """
@@ -306,10 +305,6 @@ def train_trial(
 
     Returns:
         The result. Checkpoints are removed when it is known; models and learning curves stay.
-
-    Raises:
-        TrainingStoppedError: Ctrl-C was pressed; checkpoints are kept.
-        TrainingFailedError: A file could not be written.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     space = SearchSpace.from_json(search)
@@ -390,11 +385,7 @@ class PruningCallback(BaseCallback):
 
 
 def check_models(search: SearchSpace) -> None:
-    """Check that models can be built with the lowest and highest values of all parameters and with every choice.
-
-    Raises:
-        ValueError: One cannot be built, for example because a hyperparameter does not exist.
-    """
+    """Check that models can be built with the lowest and highest values of all parameters and with every choice."""
     for values in search.extremes():
         config = resolved(search.training(values, search.seeds[0]))
         try:

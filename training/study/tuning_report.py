@@ -28,12 +28,7 @@ FEWEST = 4
 
 
 def run(config: TuneConfig) -> None:
-    """Search for hyperparameters, and write the report: the command `tune`.
-
-    Raises:
-        ValueError: The file or the folder holds something else, or a model cannot be built.
-        TuningStoppedError: A trial ended without a result.
-    """
+    """Search for hyperparameters, and write the report: the command `tune`."""
     search = SearchSpace.read(config.file)
     trials = config.trials or search.trials
     tuning = Tuning.create(config.folder, search)

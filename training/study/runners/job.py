@@ -1,4 +1,4 @@
-"""Jobs, and the protocol of what runs them; :mod:`viapoint.training.study.runner` describes both."""
+"""Jobs, and the protocol of what runs them; :mod:`viapoint.training.study.runners` describes both."""
 
 from __future__ import annotations
 

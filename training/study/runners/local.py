@@ -36,17 +36,16 @@ class LocalRunner:
         if not self._workers:
             yield from ((job, answer(job, self._root)) for job in jobs)
             return
-        queue, again, waiting = iter(jobs), list[tuple[Job, int]](), list[tuple[Job, int]]()
+        queue, again = ((job, 0) for job in jobs), list[tuple[Job, int]]()
         free, running = _shares(self._workers), dict[Any, _Task]()
         try:
             while True:
-                while free and (waiting or again or _take(queue, waiting)):
-                    if not waiting:
-                        waiting.append(again.pop(0))
-                    wanted = min(waiting[0][0].cpus, self._workers)
+                while free and (following := again.pop(0) if again else next(queue, None)):
+                    job, retries = following
+                    wanted = min(job.cpus, self._workers)
                     if wanted > len(free):
+                        again.insert(0, following)
                         break
-                    job, retries = waiting.pop()
                     mine, free = free[:wanted], free[wanted:]
                     worker = self._idle.pop() if self._idle else _Worker(self._root)
                     worker.begin(job, sorted({core for share in mine for core in share}))
@@ -121,14 +120,6 @@ def _shares(workers: int) -> list[list[int]]:
     """Return the cores of each worker."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     return [cores[i::workers] or cores for i in range(workers)]
-
-
-def _take(queue: Iterator[Job], waiting: list[tuple[Job, int]]) -> bool:
-    """Move the next job of the queue to `waiting`, and return whether there is one."""
-    job = next(queue, None)
-    if job is not None:
-        waiting.append((job, 0))
-    return job is not None
 
 
 def _serve(pipe: Any, root: Path) -> None:

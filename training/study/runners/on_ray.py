@@ -58,7 +58,7 @@ class _Task(NamedTuple):
 
 
 class RayRunner:
-    """Runner on a Ray cluster, see :func:`viapoint.training.study.runner.make_runner`.
+    """Runner on a Ray cluster, see :func:`viapoint.training.study.runners.make_runner`.
 
     Args:
         root: Folder of the driver that the folders of jobs are in.
@@ -94,10 +94,10 @@ class RayRunner:
 
     def run(self, jobs: Iterable[Job]) -> Iterator[tuple[Job, Answer]]:
         """Run jobs, see :class:`viapoint.training.study.runners.job.Runner`."""
-        queue, again, running = iter(jobs), list[_Task](), dict[Any, _Task]()
+        queue, again, running = (_Task(job, 0) for job in jobs), list[_Task](), dict[Any, _Task]()
         try:
             while True:
-                while len(running) < self._room() and (task := _next_task(again, queue)):
+                while len(running) < self._room() and (task := again.pop(0) if again else next(queue, None)):
                     running[self._submit(task)] = task
                 if not running:
                     return
@@ -161,11 +161,7 @@ class RayRunner:
         return found, True
 
     def _collect(self, running: dict[Any, _Task]) -> None:
-        """Write the files that have come from nodes.
-
-        Raises:
-            ConnectionError: The cluster is lost.
-        """
+        """Write the files that have come from nodes."""
         tasks = {task.job.label: task for task in running.values()}
         try:
             collected = self._ray.get(self._collector.take.remote())
@@ -198,14 +194,6 @@ def _wanted(job: Job) -> dict[str, float]:
 
 def _warn(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
-
-
-def _next_task(again: list[_Task], queue: Iterator[Job]) -> _Task | None:
-    """Return the next job, or None if there is none."""
-    if again:
-        return again.pop(0)
-    job = next(queue, None)
-    return None if job is None else _Task(job, 0)
 
 
 def _run_on_node(

@@ -1,44 +1,40 @@
-"""Command `export`: write an agent as an archive of Stable-Baselines3 with a model card for Hugging Face."""
+"""Commands `export` and `import-sb3`: agents as archives of Stable-Baselines3, with model cards, and back."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from viapoint.training.algorithms.agent import Agent, find_model, load_agent
-from viapoint.training.algorithms.sb3_archive import write_archive
-from viapoint.training.cli.progress import progress_bar
-from viapoint.training.config.checks import SHIPPED
-from viapoint.training.config.configs import ExportConfig, TrainConfig
+from viapoint.training.algorithms.model_io import ALGORITHMS, save_model
+from viapoint.training.algorithms.sb3_archive import algorithm_of, environment_of, open_archive, write_archive
+from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED, check_env
+from viapoint.training.config.configs import ExportConfig, ImportConfig, TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate
-from viapoint.training.io.files import BadFileError, read_json, write_bytes
+from viapoint.training.evaluation.report import progress_bar
+from viapoint.training.io.files import BadFileError, read_json, write_bytes, write_folder
 from viapoint.training.io.installed import versions
+from viapoint.training.io.model_limits import check_env_arguments
 from viapoint.training.io.template import load_template, packaged
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 
 CARD = "README.md"
 SHIPPED_SEED = 0
 """Seed of the trainings of the shipped agents."""
-CLASSES = {
-    "viaq": ("viapoint.training", "ViaQ", ", trust=True"),
-    "sac": ("stable_baselines3", "SAC", ""),
-    "td3": ("stable_baselines3", "TD3", ""),
-    "ppo": ("stable_baselines3", "PPO", ""),
-    "tqc": ("sb3_contrib", "TQC", ""),
-}
-"""Module and name of the class that loads the archives of each algorithm, and its further arguments."""
+WARNING = (
+    "{file} is an archive of Stable-Baselines3. Opening one runs whatever code its author put into it, with your "
+    "rights. Open only archives that you made or whose author you trust."
+)
 
 
-def run(config: ExportConfig) -> None:
-    """Export an agent and print where it is.
-
-    Raises:
-        ValueError: There is no such agent, or no such scenes for it.
-        BadFileError: The archive or the card exists already.
-    """
+def export(config: ExportConfig) -> None:
+    """Export an agent and print where it is."""
     folder = find_model(config.agent)
     record = read_json(folder / "model.json")
     archive, card = paths(config, record)
@@ -55,11 +51,7 @@ def run(config: ExportConfig) -> None:
 
 
 def paths(config: ExportConfig, record: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Return the paths of the archive and of the card.
-
-    Raises:
-        BadFileError: One of them exists already.
-    """
+    """Return the paths of the archive and of the card."""
     name = f"{record['algorithm']}-{record['env']['id'].replace('/', '-')}.zip"
     archive = config.out if config.out.suffix == ".zip" else config.out / name
     card = archive.parent / CARD
@@ -86,7 +78,9 @@ def model_card(
         command: Command that trained the model; None if it is not known.
         license_: Identifier of the model's licence; None to leave it open.
     """
-    module, name, more = CLASSES[record["algorithm"]]
+    name, package = ALGORITHMS[record["algorithm"]].__name__, ALGORITHMS[record["algorithm"]].__module__
+    own = package.startswith("viapoint")
+    module, more = ("viapoint.training", ", trust=True") if own else (package.partition(".")[0], "")
     env_id = record["env"]["id"]
     header = yaml.safe_dump(_header(name, env_id, evaluations, license_), sort_keys=False, allow_unicode=True)
     written_by = ", ".join(f"{package} {version}" for package, version in versions().items())
@@ -158,3 +152,44 @@ def _command(folder: Path, record: Mapping[str, Any]) -> str | None:
     if (folder.parent / "config.json").is_file():
         return Run(folder.parent).config.command
     return None
+
+
+class NotTrustedError(Exception):
+    """Error of an archive that the user did not allow to open."""
+
+
+def import_sb3(config: ImportConfig) -> None:
+    """Convert an archive and print where the model is."""
+    if config.out.exists() and (not config.out.is_dir() or any(config.out.iterdir())):
+        raise BadFileError(config.out, "is not empty; name another folder")
+    algo = config.algo or algorithm_of(config.file)
+    named = environment_of(config.file)
+    if named is None or config.env not in (None, named["id"]):
+        named = {"id": config.env or DEFAULT_ENV, "kwargs": {}}
+    env_id, env_kwargs = named["id"], named["kwargs"]
+    check_env(env_id)
+    check_env_arguments(env_kwargs)
+    print(WARNING.format(file=config.file), file=sys.stderr)
+    asks = not config.trust and sys.stdin.isatty()
+    if not (config.trust or (asks and input("open it? [yes/no] ").strip().lower() == "yes")):
+        raise NotTrustedError(f"{config.file} was not opened; --trust says that it may be")
+    model = convert(config.file, algo, env_id, config.out, **env_kwargs)
+    print(f"{algo} of {model.num_timesteps} decisions on {env_id}: {config.out}")
+    print(f"measure it with: viapoint evaluate {config.out}")
+
+
+def convert(path: Path, algo: str, env_id: str, out: Path, **env_kwargs: Any) -> Agent:
+    """Open an archive, which runs its code, write its model, and return the agent loaded from it.
+
+    Raises:
+        BadFileError: The archive cannot be opened, is for another environment, or holds objects of other packages.
+    """
+    with closing(ViaVecEnv(env_id, 1, **env_kwargs)) as env:
+        try:
+            model = open_archive(path, ALGORITHMS[algo], env)
+            write_folder(out, lambda temporary: save_model(model, temporary))
+        except BadFileError:
+            raise
+        except (ValueError, KeyError) as error:
+            raise BadFileError(path, f"holds no plain {algo} model for {env_id}: {error}") from None
+    return load_agent(out)
