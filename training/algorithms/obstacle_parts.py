@@ -145,7 +145,7 @@ class PairGeometry(Protocol):
     """Gap beyond that of the nearest pair of a plan up to which pairs determine its value in decisions, [m]; None for
     all pairs, which training always uses."""
     near_coarse: float
-    """The same for values that only select plans to check."""
+    """Gap up to which pairs count where values only select plans to check, [m]."""
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return invariants of the pose of a part relative to a body."""
