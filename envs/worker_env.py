@@ -27,9 +27,6 @@ from viapoint.envs.common.validation import (
 )
 from viapoint.envs.worker_process import WorkerDiedError, WorkerProcess
 
-SHARED = ("begin", "execute")
-"""Commands whose results are records of arrays, which are joined at once."""
-
 
 class BatchServer:
     """Native batch of environments that a worker runs; the arms are those that the keyword arguments may name."""
@@ -268,7 +265,7 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             raise gym.error.ClosedEnvironmentError("the environments are closed: make new ones")
         try:
             for worker, mine in zip(self._workers, arguments or [()] * self.n_workers, strict=True):
-                worker.submit(command, mine, shared=command in SHARED)
+                worker.submit(command, mine)
         except WorkerDiedError as error:
             raise self._closing(error) from None
         return self._collect(first)

@@ -1,4 +1,4 @@
-"""Processes that run an object: commands through a socket, arrays of results through shared memory.
+"""Processes that run an object: commands and their results go through a socket.
 
 Python's `multiprocessing` starts its processes by a fork, which is unsafe beside the threads of MuJoCo and torch, or by
 importing the main module again, which needs a guard in every script. Here a process imports only what its object needs.
@@ -6,13 +6,11 @@ importing the main module again, which needs a guard in every script. Here a pro
 
 from __future__ import annotations
 
-import mmap
 import os
 import pickle
 import signal
 import subprocess
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable
 from multiprocessing import Pipe
@@ -21,9 +19,6 @@ from typing import Any
 
 from gymnasium.vector.utils import CloudpickleWrapper
 
-ALIGNMENT = 64
-LARGEST = 1 << 26
-"""Largest message in shared memory, which is kept for the next ones, [bytes]; larger ones go through the socket."""
 COMMAND = "from viapoint.envs.worker_process import serve; serve()"
 PATIENCE = 5.0
 """Time that a process has to end by itself, [s]."""
@@ -31,69 +26,6 @@ PATIENCE = 5.0
 
 class WorkerDiedError(RuntimeError):
     """A worker process ended before its work was done."""
-
-
-class SharedMemory:
-    """Memory that two processes share by an open file without a name, which the system frees when both have ended."""
-
-    def __init__(self, file: int | None = None) -> None:
-        self.file = _open_unnamed() if file is None else file
-        self._map: mmap.mmap | None = None
-
-    def view(self, size: int) -> memoryview:
-        """Return the first bytes of the memory, which grows where it is smaller.
-
-        Raises:
-            OSError: There is no memory left.
-        """
-        if self._map is None or len(self._map) < size:
-            if os.fstat(self.file).st_size < size:
-                _extend(self.file, 2 * size)
-            self._map = mmap.mmap(self.file, 0)  # arrays of earlier messages keep the old one alive
-        return memoryview(self._map)[:size]
-
-
-def _open_unnamed() -> int:
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("viapoint")
-    file, path = tempfile.mkstemp()
-    os.unlink(path)
-    return file
-
-
-def _extend(file: int, size: int) -> None:
-    if hasattr(os, "posix_fallocate"):  # fails now, where a page without memory would kill the process later
-        os.posix_fallocate(file, 0, size)
-    else:
-        os.ftruncate(file, size)
-
-
-def send(connection: Connection, memory: SharedMemory, message: Any, shared: bool) -> None:
-    """Send a message; if `shared`, its arrays go through shared memory, where they stay until the next message."""
-    if not shared:
-        connection.send((pickle.dumps(message, protocol=5), []))
-        return
-    buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
-    arrays = [buffer.raw() for buffer in buffers]
-    spans, end = [], 0
-    for array in arrays:
-        spans.append((end, array.nbytes))
-        end += -(-array.nbytes // ALIGNMENT) * ALIGNMENT
-    if end > LARGEST:
-        send(connection, memory, message, shared=False)
-        return
-    view = memory.view(max(end, 1))
-    for array, (first, size) in zip(arrays, spans, strict=True):
-        view[first : first + size] = array
-    connection.send((body, spans))
-
-
-def receive(connection: Connection, memory: SharedMemory) -> Any:
-    """Receive what :func:`send` sent."""
-    body, spans = connection.recv()
-    view = memory.view(max((first + size for first, size in spans), default=1))
-    return pickle.loads(body, buffers=[view[first : first + size] for first, size in spans])
 
 
 def answer(server: Any, command: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
@@ -118,7 +50,7 @@ def _portable(error: Exception) -> Exception:
 def serve() -> None:
     """Run an object in this process until its parent closes the socket."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    connection, memory = Connection(int(sys.argv[1])), SharedMemory(int(sys.argv[2]))
+    connection = Connection(int(sys.argv[1]))
     try:
         server: Any = None
         ready: tuple[bool, Any] = (True, None)
@@ -126,10 +58,10 @@ def serve() -> None:
             server = connection.recv().fn()
         except Exception as error:
             ready = (False, _portable(error))
-        send(connection, memory, ready, shared=False)
+        connection.send(ready)
         while True:
-            command, arguments, shared = connection.recv()
-            send(connection, memory, answer(server, command, arguments), shared)
+            command, arguments = connection.recv()
+            connection.send(answer(server, command, arguments))
     except (EOFError, ConnectionError):
         pass
 
@@ -142,16 +74,14 @@ class WorkerProcess:
 
     def __init__(self, make: Callable[[], Any], title: str, threads: int) -> None:
         self.title = title
-        self._memory = SharedMemory()
         self._connection, theirs = Pipe()
-        files = theirs.fileno(), self._memory.file
         path = os.pathsep.join(os.path.abspath(each) for each in sys.path)
         limits = {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "OPENBLAS", "MKL")}
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", COMMAND, *map(str, files)],
+            [sys.executable, "-P", "-c", COMMAND, str(theirs.fileno())],
             env={**limits, **os.environ, "PYTHONPATH": path},
             stdin=subprocess.DEVNULL,
-            pass_fds=files,
+            pass_fds=(theirs.fileno(),),
         )
         theirs.close()
         self._pending = 0
@@ -162,14 +92,11 @@ class WorkerProcess:
         """Number of the process."""
         return self._process.pid
 
-    def submit(self, command: str, arguments: tuple[Any, ...], *, shared: bool) -> None:
-        """Begin to call a method of the object; results that nobody took are dropped.
-
-        The arrays of a shared result stay in shared memory until the next call of this method.
-        """
+    def submit(self, command: str, arguments: tuple[Any, ...]) -> None:
+        """Begin to call a method of the object; results that nobody took are dropped."""
         while self._pending:
             self._receive()
-        self._send((command, arguments, shared))
+        self._send((command, arguments))
 
     def result(self) -> Any:
         """Return the result of the method.
@@ -190,9 +117,6 @@ class WorkerProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if self._memory.file >= 0:
-            os.close(self._memory.file)
-            self._memory.file = -1
 
     def _send(self, message: Any) -> None:
         self._pending += 1
@@ -203,7 +127,7 @@ class WorkerProcess:
 
     def _receive(self) -> Any:
         try:
-            received = receive(self._connection, self._memory)
+            received = self._connection.recv()
         except (EOFError, OSError):
             raise self._death() from None
         self._pending -= 1

@@ -30,7 +30,7 @@ class Here:
     def __init__(self, make):
         self.server, self.answer = pickle.loads(pickle.dumps(make))(), (True, None)
 
-    def submit(self, command, arguments, *, shared):
+    def submit(self, command, arguments):
         self.answer = answer(self.server, command, pickle.loads(pickle.dumps(arguments)))
 
     def result(self):
@@ -161,7 +161,7 @@ def test_given_scenes_and_their_errors_are_those_of_one_process(env_id):
 
 
 def test_processes_change_nothing_and_one_that_dies_is_named():
-    """Real processes: shared memory, attributes, a killed worker."""
+    """Real processes: messages, attributes, a killed worker."""
     alone, several = both(MOVING)
     assert isinstance(several.unwrapped, WorkerVectorEnv)
     assert_same(several.reset(seed=0), alone.reset(seed=0))

@@ -172,7 +172,7 @@ def test_training_does_not_depend_on_rollout_workers(tmp_path, monkeypatch):
 def test_an_actor_that_always_dies_at_the_same_point_is_named():
     actor = ray_actors.RecoveringActor(partial(importlib.import_module, "os"), "worker 1 of 1", 1)
     actor.result()
-    actor.submit("_exit", (3,), shared=False)
+    actor.submit("_exit", (3,))
     with pytest.raises(WorkerDiedError, match=r"worker 1 of 1 died .*, 3 times at the same point"):
         actor.result()
 

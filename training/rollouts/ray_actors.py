@@ -141,7 +141,7 @@ class RecoveringActor:
         self._log: list[tuple[str, tuple[Any, ...]]] = []
         self._last: tuple[str, tuple[Any, ...]] | None = None
 
-    def submit(self, command: str, arguments: tuple[Any, ...], *, shared: bool) -> None:
+    def submit(self, command: str, arguments: tuple[Any, ...]) -> None:
         """Begin to call a method of the object; see :meth:`WorkerProcess.submit`."""
         self._last = command, arguments
         self.handle.ask(command, arguments)
