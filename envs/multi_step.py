@@ -11,7 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Observation
 from viapoint.envs.sim.episode_state import Episodes
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.single_env import ReachEnv
 from viapoint.envs.vector_env import ReachVectorEnv, Transition
 
@@ -35,7 +35,7 @@ class MultiStepVectorEnv(ReachVectorEnv):
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
         """Running episodes so far at every physics step; empty before the first reset."""
-        return () if self.scenes is None else tuple(self._rollout(row) for row in range(self.num_envs))
+        return () if self.scenes is None else tuple(map(self._rollout, range(self.num_envs)))
 
     def transition(self, actions: Any) -> Transition:
         """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
@@ -70,11 +70,9 @@ class MultiStepVectorEnv(ReachVectorEnv):
         """Return the part of :meth:`episodes_state` that belongs to some environments."""
         return {name: np.asarray(part)[rows] for name, part in state.items()}
 
-    def _rollout(self, row: int) -> Rollout:
-        """Return the running episode of one environment so far."""
+    def _recorded(self, sim: int) -> tuple[Any, Float, Float, Bool]:
         assert self.scenes is not None
-        scene = self.scenes.take([row])
-        return self._episodes.rollout(row, lambda *movement: self._clearance(scene, *movement))
+        return self.scenes.take([sim]), *self._episodes.recorded(sim)
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None or self.scenes is None or not self._episodes.now.steps[sim]:
@@ -84,10 +82,6 @@ class MultiStepVectorEnv(ReachVectorEnv):
     @abstractmethod
     def _film(self, sim: int, scene: Any) -> Any:
         """Render the running episode of one environment."""
-
-    @abstractmethod
-    def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
-        """Return the clearance in one scene at each time, shape (T,), [m]."""
 
 
 class MultiStepEnv(ReachEnv):

@@ -276,9 +276,9 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         duration = np.where(start.begun, np.minimum(episodes.time, ends), 0.0)
         length = np.maximum(scenes.straight_length(episodes.time), MIN_GOAL_DISTANCE)
         cost = straight_jerk_cost(length, np.maximum(duration, self._simulator.timestep))
-        return episodes.outcome(arrived & now.sound, goal_error, duration, cost)
+        return now.outcome(arrived & now.sound, goal_error, duration, cost, self._simulator.timestep)
 
-    def _clearance(self, scene: ChangingScenes, hand: Float, joints: Float, time: Float) -> Float:
+    def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
         profile = self.task.collision_model.clearance_profile(
             hand[None], scene.places(time[None]), scene.present, joints[None]
         )

@@ -11,7 +11,7 @@ from gymnasium.utils import EzPickle
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Observation
 from viapoint.envs.common.validation import as_given, real_numbers
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.vector_env import METADATA, ReachVectorEnv
 
 __all__ = ["ReachEnv", "ReachVectorEnv"]

@@ -30,7 +30,8 @@ from viapoint.envs.mdp.rewards import reward_terms
 from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
 from viapoint.envs.scenes.options import draw_given, given_scenes
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Execution, Executor, Movements, Rollout, join_groups
+from viapoint.envs.sim.executor import Execution, Executor, join_groups
+from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.sim.scheduler import Scheduler
 from viapoint.envs.sim.simulator import Simulator
 
@@ -195,9 +196,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
         """Last movements at every physics step, one for each environment; empty before the first."""
-        if self._last is None:
-            return ()
-        return tuple(self._executor.rollout(self._last, sim) for sim in range(self.num_envs))
+        return () if self._last is None else tuple(map(self._rollout, range(self.num_envs)))
 
     @property
     def last_plan(self) -> Plan | None:
@@ -330,8 +329,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A plan starts elsewhere.
         """
-        scenes = self._check_running()
-        return self._execute(Movements(scenes, checked_plan(plan, scenes.start)))[0]
+        return self._execute(checked_plan(plan, self._check_running().start))[0]
 
     def render(self) -> Any:
         """Render the last movement of each environment in the render mode; after a reset, the scenes."""
@@ -346,25 +344,25 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._scheduler.close()
         self._renderer.close()
 
-    def _decode(self, actions: Any) -> Movements:
+    def _decode(self, actions: Any) -> Plan:
         """Stage 1: return the movements that actions stand for."""
         scenes = self._check_running()
         actions = checked_actions(actions, self.num_envs, self.action_names)
-        return Movements(scenes, self.action_layout.decode(actions, scenes.start, scenes.goal))
+        return self.action_layout.decode(actions, scenes.start, scenes.goal)
 
     def _execute(
-        self, movements: Movements, meanwhile: Callable[[], Scenes] | None = None
+        self, plan: Plan, meanwhile: Callable[[], Scenes] | None = None
     ) -> tuple[Decision, Future[Scenes] | None]:
         """Stages 2 to 7: scale time, build references, simulate, measure, score and observe.
 
         The job `meanwhile` runs during the physics; its future is returned.
         """
-        stages = self._executor
-        scaled = stages.scale_time(movements)
+        stages, scenes = self._executor, self._check_running()
+        scaled = stages.scale_time(scenes, plan)
         groups, following = self._scheduler.run(
             scaled.groups(), stages.build_references, stages.simulate, stages.measure, meanwhile
         )
-        self._last = execution = join_groups(movements, groups)
+        self._last = execution = join_groups(scenes, plan, groups)
         self.scenes = None
         terms = reward_terms(execution.outcome, self.action_layout.centre_duration, self.task.weights)
         reward, info = terms.total(), {**execution.outcome._asdict(), **terms.as_info()}
@@ -383,7 +381,25 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             assert self.scenes is not None
             return self._renderer.still(self.scenes.take([sim]))
         scenes, plan = self._last.scenes.take([sim]), self._last.plan.take([sim])
-        return self._renderer.movement(scenes, plan, self._executor.rollout(self._last, sim))
+        return self._renderer.movement(scenes, plan, self._rollout(sim))
+
+    def _rollout(self, sim: int) -> Rollout:
+        """Return the movement of one environment at every physics step."""
+        scene, planned, joints, contact = self._recorded(sim)
+        hand = np.asarray(self.arm.hand_position(joints))
+        time = np.asarray(np.arange(1, len(joints) + 1) * self._simulator.timestep)
+        clearance = self._clearance(scene, hand, joints, time)
+        return Rollout(time, planned, joints, hand, contact, clearance)
+
+    def _recorded(self, sim: int) -> tuple[Any, Float, Float, Bool]:
+        """Return the scene of one environment, and planned positions, joint angles and contacts of its movement."""
+        assert self._last is not None
+        return self._last.scenes.take([sim]), *self._executor.recorded(self._last, sim)
+
+    def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
+        """Return the clearance in one scene at each time, shape (T,), [m]."""
+        obstacles, present = (np.repeat(part, len(time), axis=0) for part in (scene.obstacles, scene.present))
+        return self.task.collision_model.least_clearance(hand[:, None], obstacles, present, joints[:, None])
 
     def _check_running(self) -> Scenes:
         if self.scenes is None:

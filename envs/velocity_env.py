@@ -219,7 +219,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         success = (rest * timestep >= SETTLING - 1e-9) & now.sound
         duration = timestep * np.where(success, np.maximum(now.steps - rest, 1), np.maximum(now.steps, 1))
         cost = straight_jerk_cost(norm(scenes.goal - scenes.start), duration)
-        return self._episodes.outcome(success, norm(now.hand - scenes.goal), duration, cost)
+        return now.outcome(success, norm(now.hand - scenes.goal), duration, cost, timestep)
 
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         joints = super()._start(rows, scenes)
@@ -237,11 +237,6 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         now = self._episodes.now
         seen = self.observation_layout.observe(now.joints, now.hand, self.scenes)
         return self.observation_layout.moving(seen, self.scenes, self._motion, self._episodes.time)
-
-    def _clearance(self, scene: Scenes, hand: Float, joints: Float, time: Float) -> Float:
-        obstacles = np.repeat(scene.obstacles, len(time), axis=0)
-        present = np.repeat(scene.present, len(time), axis=0)
-        return self.task.collision_model.least_clearance(hand[:, None], obstacles, present, joints[:, None])
 
     def _film(self, sim: int, scene: Scenes) -> Any:
         plan = self.last_plan

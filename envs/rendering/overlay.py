@@ -13,7 +13,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance, point_distance_squared
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 
 CONTACT_TOLERANCE = 0.01
 """Greatest clearance of an obstacle that counts as the one in contact, [m]."""

@@ -20,7 +20,7 @@ from viapoint.envs.rendering.scene_view import SPACING, SceneView
 from viapoint.envs.rendering.shapes import ShapeWriter, resampled
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.sim.simulator import Simulator
 
 __all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame_steps"]

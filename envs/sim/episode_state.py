@@ -1,18 +1,42 @@
-"""State of episodes of several steps: metrics so far, and everything needed to continue a stored episode."""
+"""State of episodes: metrics so far, and everything needed to continue a stored episode."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.arms.base import Arm
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import norm, squared_length
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
-from viapoint.envs.sim.executor import Rollout
 from viapoint.envs.sim.outcome import Outcome, sum_in_order, within_joint_range
+
+
+class Segment(NamedTuple):
+    """Measured movements of n episodes during one step, in T recorded physics steps."""
+
+    rows: Int
+    """Episodes that moved, shape (n,)."""
+    steps: Int
+    """Physics steps that belong to each, 1 to T, shape (n,)."""
+    planned: Float
+    """Commanded hand position after each step, shape (n, T, D), [m]."""
+    joints: Float
+    """Joint angles after each step, shape (n, T, J), [rad]."""
+    hand: Float
+    """Hand position after each step, shape (n, T, D), [m]."""
+    contact: Bool
+    """True where the arm touched an obstacle at the state before the step, shape (n, T)."""
+    unstable: Bool
+    """True where the physics broke down, shape (n,)."""
+    min_clearance: Float
+    """Least clearance of the arm, shape (n,), [m]."""
+    planned_clearance: Float
+    """Least clearance of the commanded path, shape (n,), [m]."""
+    jerk_cost: Float
+    """Jerk cost of the commanded path, shape (n,), [m^2/s^5]."""
 
 
 class EpisodeState(NamedTuple):
@@ -49,6 +73,17 @@ class EpisodeState(NamedTuple):
     unstable: Bool
     """True if the physics broke down."""
 
+    @classmethod
+    def at_rest(cls, joints: Float, hand: Float, clearance: Float) -> EpisodeState:
+        """Return n episodes that begin with joint angles (n, J), hand positions (n, D) and clearances (n,)."""
+        n = len(hand)
+        return cls(
+            joints=joints.copy(), hand=hand.copy(), steps=np.zeros(n, np.int64), first_contact=np.full(n, -1),
+            min_clearance=clearance.copy(), planned_clearance=clearance.copy(), path_length=np.zeros(n),
+            peak_speed=np.zeros(n), last_speed=np.zeros(n), deviation=np.zeros(n), jerk_cost=np.zeros(n),
+            stretch=np.ones(n), within=np.ones(n, bool), reachable=np.ones(n, bool), unstable=np.zeros(n, bool),
+        )  # fmt: skip
+
     @property
     def collision(self) -> Bool:
         """True where the arm has touched an obstacle, shape (N,)."""
@@ -59,30 +94,74 @@ class EpisodeState(NamedTuple):
         """True where nothing rules out success so far, shape (N,)."""
         return np.asarray(~self.collision & self.within & self.reachable & ~self.unstable)
 
+    def take(self, rows: Any) -> EpisodeState:
+        """Return the episodes at `rows`, an index, slice or mask."""
+        return EpisodeState(*(part[rows] for part in self))
 
-class Segment(NamedTuple):
-    """Measured movements of n episodes during one step, in T recorded physics steps."""
+    def put(self, rows: Any, others: EpisodeState) -> None:
+        """Overwrite the episodes at `rows`."""
+        for mine, theirs in zip(self, others, strict=True):
+            mine[rows] = theirs
 
-    rows: Int
-    """Episodes that moved, shape (n,)."""
-    steps: Int
-    """Physics steps that belong to each, 1 to T, shape (n,)."""
-    planned: Float
-    """Commanded hand position after each step, shape (n, T, D), [m]."""
-    joints: Float
-    """Joint angles after each step, shape (n, T, J), [rad]."""
-    hand: Float
-    """Hand position after each step, shape (n, T, D), [m]."""
-    contact: Bool
-    """True where the arm touched an obstacle at the state before the step, shape (n, T)."""
-    unstable: Bool
-    """True where the physics broke down, shape (n,)."""
-    min_clearance: Float
-    """Least clearance of the arm, shape (n,), [m]."""
-    planned_clearance: Float
-    """Least clearance of the commanded path, shape (n,), [m]."""
-    jerk_cost: Float
-    """Jerk cost of the commanded path, shape (n,), [m^2/s^5]."""
+    def advanced(self, segment: Segment, arm: Arm, timestep: float) -> tuple[EpisodeState, Float]:
+        """Return n episodes after a segment of theirs, and how far the hand moved per physics step, (n, T), [m]."""
+        steps, contact = segment.steps, segment.contact
+        last = np.arange(len(steps)), steps - 1
+        moved = norm(np.diff(segment.hand, axis=1, prepend=self.hand[:, None]))
+        deviation = squared_length(segment.hand - segment.planned)
+        kept = within_joint_range(segment.joints, arm).all(axis=-1)
+        done = np.arange(segment.hand.shape[1]) < steps[:, None]
+        if not done.all():  # steps beyond the end of a shorter movement do not count
+            contact, moved, deviation, kept = contact & done, moved * done, deviation * done, kept | ~done
+        first_contact = np.where(contact.any(axis=-1), self.steps + contact.argmax(axis=-1), -1)
+        after = EpisodeState(
+            joints=segment.joints[last],
+            hand=segment.hand[last],
+            steps=self.steps + steps,
+            first_contact=np.where(self.collision, self.first_contact, first_contact),
+            min_clearance=np.minimum(self.min_clearance, segment.min_clearance),
+            planned_clearance=np.minimum(self.planned_clearance, segment.planned_clearance),
+            path_length=self.path_length + sum_in_order(moved),
+            peak_speed=np.maximum(self.peak_speed, moved.max(axis=-1) / timestep),
+            last_speed=moved[last] / timestep,
+            deviation=self.deviation + sum_in_order(deviation),
+            jerk_cost=self.jerk_cost + segment.jerk_cost,
+            stretch=self.stretch,
+            within=self.within & kept.all(axis=-1),
+            reachable=self.reachable,
+            unstable=self.unstable | segment.unstable,
+        )
+        return after, moved
+
+    def outcome(
+        self, success: Bool, goal_error: Float, duration: Float, straight_cost: Float, timestep: float
+    ) -> Outcome:
+        """Return the metrics so far.
+
+        Args:
+            success: True where the hand has arrived and the episode is sound, shape (N,).
+            goal_error: Distance from the goal, shape (N,), [m].
+            duration: Duration of the movements, shape (N,), [s].
+            straight_cost: Jerk cost of the straight movement of that duration, shape (N,), [m^2/s^5].
+            timestep: Length of a physics step, [s].
+        """
+        return Outcome(
+            is_success=success,
+            collision=self.collision,
+            first_contact_time=np.where(self.collision, self.first_contact * timestep, -1.0),
+            min_clearance=np.minimum(self.min_clearance, MAX_CLEARANCE),
+            planned_clearance=np.minimum(self.planned_clearance, MAX_CLEARANCE),
+            goal_error=goal_error,
+            duration=duration,
+            path_length=self.path_length.copy(),
+            jerk_cost=self.jerk_cost.copy(),
+            jerk_ratio=np.maximum(self.jerk_cost / straight_cost, 1.0),
+            peak_speed=self.peak_speed.copy(),
+            tracking_error=np.sqrt(self.deviation / np.maximum(self.steps, 1)),
+            reachable=self.reachable.copy(),
+            unstable=self.unstable.copy(),
+            stretch=self.stretch.copy(),
+        )
 
 
 class Episodes:
@@ -101,10 +180,7 @@ class Episodes:
     ) -> None:
         self.arm, self.timestep = arm, timestep
         n, j, d = num_envs, len(arm.joint_range), arm.dimension
-        numbers: dict[str, Any] = {name: np.zeros(n) for name in EpisodeState._fields}
-        numbers |= {name: np.zeros(n, dtype=np.int64) for name in ("steps", "first_contact")}
-        numbers |= {name: np.zeros(n, dtype=bool) for name in ("within", "reachable", "unstable")}
-        self.now = EpisodeState(**{**numbers, "joints": np.zeros((n, j)), "hand": np.zeros((n, d))})
+        self.now = EpisodeState.at_rest(np.zeros((n, j)), np.zeros((n, d)), np.zeros(n))
         """Metrics so far."""
         self._past: dict[str, Any] = {
             "joints": np.zeros((n, max_steps, j)),
@@ -124,85 +200,22 @@ class Episodes:
 
     def begin(self, rows: Int, joints: Float, hand: Float, clearance: Float) -> None:
         """Start episodes (n,) at rest with joint angles (n, J), hand positions (n, D) and clearances (n,)."""
-        now = self.now
-        for part in now:
-            part[rows] = 0
-        now.joints[rows], now.hand[rows] = joints, hand
-        now.within[rows] = now.reachable[rows] = True
-        now.stretch[rows], now.first_contact[rows] = 1.0, -1
-        now.min_clearance[rows] = now.planned_clearance[rows] = clearance
+        self.now.put(rows, EpisodeState.at_rest(joints, hand, clearance))
 
     def add(self, segment: Segment) -> Float:
         """Add one step of some episodes; return the distances that the hand moved per physics step, (n, T), [m]."""
-        now, rows, steps = self.now, segment.rows, segment.steps
-        last = np.arange(len(rows)), steps - 1
         self._store(segment)
-        contact, moved = segment.contact, norm(np.diff(segment.hand, axis=1, prepend=now.hand[rows, None]))
-        deviation = ((segment.hand - segment.planned) ** 2).sum(axis=-1)
-        kept = within_joint_range(segment.joints, self.arm).all(axis=-1)
-        done = np.arange(segment.hand.shape[1]) < steps[:, None]
-        if not done.all():  # steps beyond the end of a shorter movement do not count
-            contact, moved, deviation, kept = contact & done, moved * done, deviation * done, kept | ~done
-        touched = contact.any(axis=-1) & (now.first_contact[rows] < 0)
-        now.first_contact[rows[touched]] = (now.steps[rows] + contact.argmax(axis=-1))[touched]
-        now.min_clearance[rows] = np.minimum(now.min_clearance[rows], segment.min_clearance)
-        now.planned_clearance[rows] = np.minimum(now.planned_clearance[rows], segment.planned_clearance)
-        now.path_length[rows] += sum_in_order(moved)
-        now.peak_speed[rows] = np.maximum(now.peak_speed[rows], moved.max(axis=-1) / self.timestep)
-        now.last_speed[rows] = moved[last] / self.timestep
-        now.deviation[rows] += sum_in_order(deviation)
-        now.jerk_cost[rows] += segment.jerk_cost
-        now.within[rows] &= kept.all(axis=-1)
-        now.unstable[rows] |= segment.unstable
-        now.joints[rows], now.hand[rows] = segment.joints[last], segment.hand[last]
-        now.steps[rows] += steps
+        after, moved = self.now.take(segment.rows).advanced(segment, self.arm, self.timestep)
+        self.now.put(segment.rows, after)
         return moved
 
-    def outcome(self, success: Bool, goal_error: Float, duration: Float, straight_cost: Float) -> Outcome:
-        """Return the metrics so far.
-
-        Args:
-            success: True where the hand has arrived and the episode is sound, shape (N,).
-            goal_error: Distance from the goal, shape (N,), [m].
-            duration: Duration of the movements, shape (N,), [s].
-            straight_cost: Jerk cost of the straight movement of that duration, shape (N,), [m^2/s^5].
-        """
-        now = self.now
-        contact = now.collision
-        return Outcome(
-            is_success=success,
-            collision=contact,
-            first_contact_time=np.where(contact, now.first_contact * self.timestep, -1.0),
-            min_clearance=np.minimum(now.min_clearance, MAX_CLEARANCE),
-            planned_clearance=np.minimum(now.planned_clearance, MAX_CLEARANCE),
-            goal_error=goal_error,
-            duration=duration,
-            path_length=now.path_length.copy(),
-            jerk_cost=now.jerk_cost.copy(),
-            jerk_ratio=np.maximum(now.jerk_cost / straight_cost, 1.0),
-            peak_speed=now.peak_speed.copy(),
-            tracking_error=np.sqrt(now.deviation / np.maximum(now.steps, 1)),
-            reachable=now.reachable.copy(),
-            unstable=now.unstable.copy(),
-            stretch=now.stretch.copy(),
-        )
-
-    def rollout(self, row: int, clearance: Callable[[Float, Float, Float], Float]) -> Rollout:
-        """Return the movement of one episode so far, physics step by physics step.
-
-        Args:
-            row: Episode.
-            clearance: Function of hand positions (T, D), joint angles (T, J) and times (T,), which returns the
-                clearance at each time, shape (T,), [m].
-        """
+    def recorded(self, row: int) -> tuple[Float, Float, Bool]:
+        """Return commanded positions, joint angles and contacts of one episode so far, one for each physics step."""
         steps = int(self.now.steps[row])
-        number = max(steps, 1)
-        joints, planned, contact = (part[row, :number].copy() for part in self._past.values())
+        joints, planned, contact = (part[row, : max(steps, 1)].copy() for part in self._past.values())
         if not steps:  # at rest at the start
             joints[:], planned[:], contact[:] = self.now.joints[row], self.now.hand[row], False
-        hand = np.asarray(self.arm.hand_position(joints))
-        time = np.asarray(self.timestep * np.arange(1, number + 1))
-        return Rollout(time, planned, joints, hand, contact, clearance(hand, joints, time))
+        return planned, joints, contact
 
     def state(self) -> dict[str, Any]:
         """Return the state of all episodes as fresh arrays."""
@@ -219,7 +232,7 @@ class Episodes:
                 mine[:] = state[f"{prefix}{name}"]
 
     def _store(self, segment: Segment) -> None:
-        """Keep the physics steps of each episode for :meth:`rollout`."""
+        """Keep the physics steps of each episode for :meth:`recorded`."""
         rows, steps, begin = segment.rows, segment.steps, self.now.steps[segment.rows]
         parts, length = (segment.joints, segment.planned, segment.contact), segment.hand.shape[1]
         for past, part in zip(self._past.values(), parts, strict=True):

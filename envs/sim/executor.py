@@ -7,51 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.common.arrays import norm, squared_length
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.geometry.narrow_phase import nearest_approach
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import (
-    GOAL_TOLERANCE,
-    REST_SPEED,
-    SETTLING,
-    Outcome,
-    straight_jerk_cost,
-    sum_in_order,
-    within_joint_range,
-)
+from viapoint.envs.sim.episode_state import EpisodeState, Segment
+from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
 from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
 
 GROUP = 64
 """Movements of one group: few enough for the processor's cache, many enough for the engine's threads."""
-
-
-class Rollout(NamedTuple):
-    """One movement at its T physics steps."""
-
-    time: Float
-    """Shape (T,), [s]."""
-    planned: Float
-    """Planned hand positions, shape (T, D), [m]."""
-    joints: Float
-    """Joint angles, shape (T, J), [rad]."""
-    hand: Float
-    """Executed hand positions, shape (T, D), [m]."""
-    contact: Bool
-    """True where the arm touched an obstacle at the state before the step, shape (T,)."""
-    clearance: Float
-    """Clearance from the nearest obstacle, shape (T,), [m]."""
-
-
-class Movements(NamedTuple):
-    """Decided movements of N simulations."""
-
-    scenes: Scenes
-    """Scenes that they take place in."""
-    plan: Plan
-    """Via-points and durations as decided."""
 
 
 class ScaledMovements(NamedTuple):
@@ -102,20 +69,13 @@ class TrackingReferences(NamedTuple):
     """Least clearance of the plan, shape (n,), [m]."""
 
 
-class SimulatedMovements(NamedTuple):
-    """Movements of one group after the physics."""
+class MeasuredMovements(NamedTuple):
+    """Movements of one group with their metrics."""
 
     references: TrackingReferences
     """References that the arm tracked."""
     log: SimulationLog | None
     """Recorded physics of the reachable movements; None if there are none."""
-
-
-class MeasuredMovements(NamedTuple):
-    """Movements of one group with their metrics."""
-
-    simulated: SimulatedMovements
-    """Movements after the physics."""
     joints: Float
     """Joint angles at the end, shape (n, J), [rad]."""
     outcome: Outcome
@@ -129,7 +89,7 @@ class Execution(NamedTuple):
     """Scenes that they took place in."""
     plan: Plan
     """Via-points and durations as decided."""
-    groups: tuple[MeasuredMovements, ...]
+    groups: list[MeasuredMovements]
     """Groups that were simulated together."""
     joints: Float
     """Joint angles at the end, shape (N, J), [rad]."""
@@ -137,17 +97,16 @@ class Execution(NamedTuple):
     """Metrics."""
 
 
-def join_groups(movements: Movements, groups: list[MeasuredMovements]) -> Execution:
+def join_groups(scenes: Scenes, plan: Plan, groups: list[MeasuredMovements]) -> Execution:
     """Return the executed movements of all groups, in the order of the simulations."""
-    scenes, plan = movements
     if len(groups) == 1:
-        return Execution(scenes, plan, tuple(groups), groups[0].joints, groups[0].outcome)
-    back = np.argsort(np.concatenate([group.simulated.references.movements.sims for group in groups]))
+        return Execution(scenes, plan, groups, groups[0].joints, groups[0].outcome)
+    back = np.argsort(np.concatenate([group.references.movements.sims for group in groups]))
     outcome = Outcome(
         *(np.concatenate(parts)[back] for parts in zip(*(g.outcome for g in groups), strict=True))
     )
     joints = np.concatenate([group.joints for group in groups])[back]
-    return Execution(scenes, plan, tuple(groups), joints, outcome)
+    return Execution(scenes, plan, groups, joints, outcome)
 
 
 class Executor:
@@ -158,15 +117,14 @@ class Executor:
         self._check_steps = round(CHECK_INTERVAL / simulator.timestep)
         self._settling_steps = round(SETTLING / simulator.timestep)
 
-    def scale_time(self, movements: Movements) -> ScaledMovements:
+    def scale_time(self, scenes: Scenes, plan: Plan) -> ScaledMovements:
         """Slow movements down where the arm's limits require it."""
-        plan = movements.plan
         stretch, within = required_time_scale(self.arm, plan)
         scaled = Plan(plan.waypoints, plan.durations * stretch[:, None])
         duration = np.asarray(scaled.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         sims = np.arange(len(steps))
-        return ScaledMovements(sims, movements.scenes, scaled, stretch, within, duration, steps)
+        return ScaledMovements(sims, scenes, scaled, stretch, within, duration, steps)
 
     def build_references(self, movements: ScaledMovements) -> TrackingReferences:
         """Sample one group of movements at the physics rate and compute the controls that track them."""
@@ -185,111 +143,69 @@ class Executor:
             clearance=self.simulator.collision_model.least_clearance(seen, scenes.obstacles, scenes.present),
         )
 
-    def simulate(self, references: TrackingReferences) -> SimulatedMovements:
+    def simulate(self, references: TrackingReferences) -> SimulationLog | None:
         """Run the physics of one group; arms whose plans leave their reach do not start."""
         run, sims, controls = references.reachable, references.movements.sims, references.controls
         if not run.all():
             sims, controls = sims[run], controls[run]
-        return SimulatedMovements(references, self.simulator.rollout(sims, controls) if len(sims) else None)
+        return self.simulator.rollout(sims, controls) if len(sims) else None
 
-    def measure(self, simulated: SimulatedMovements) -> MeasuredMovements:
+    def measure(self, references: TrackingReferences, log: SimulationLog | None) -> MeasuredMovements:
         """Compute the metrics of one group."""
-        references, log = simulated
         movements, run = references.movements, references.reachable
         scenes = movements.scenes
         if log is not None and run.all():
-            done = self._measure_log(log, movements.steps, references.planned, scenes)
+            state = self._measure_log(log, movements.steps, references.planned, scenes)
         else:
-            done = self._at_rest(scenes)
+            joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
+            state = EpisodeState.at_rest(joints, scenes.start, np.full(len(run), MAX_CLEARANCE))
             if log is not None:
-                some = self._measure_log(log, movements.steps[run], references.planned[run], scenes.take(run))
-                for mine, theirs in zip(done, some, strict=True):
-                    mine[run] = theirs
-        minimum_jerk_cost = straight_jerk_cost(norm(scenes.goal - scenes.start), movements.duration)
-        outcome = Outcome(
-            is_success=done.is_success,
-            collision=done.collision,
-            first_contact_time=done.first_contact_time,
-            min_clearance=self._with_terminal_clearance(done, run, scenes),
+                steps, planned = movements.steps[run], references.planned[run]
+                state.put(run, self._measure_log(log, steps, planned, scenes.take(run)))
+        state = state._replace(
+            min_clearance=self._with_terminal_clearance(state, run, scenes),
             planned_clearance=references.clearance,
-            goal_error=done.goal_error,
-            duration=movements.duration,
-            path_length=done.path_length,
             jerk_cost=references.jerk_cost,
-            jerk_ratio=np.maximum(references.jerk_cost / minimum_jerk_cost, 1.0),
-            peak_speed=done.peak_speed,
-            tracking_error=done.tracking_error,
-            reachable=run,
-            unstable=done.unstable,
             stretch=movements.stretch,
+            reachable=run,
         )
-        return MeasuredMovements(simulated, done.joints, outcome)
+        goal_error = norm(state.hand - scenes.goal)
+        success = (state.last_speed < REST_SPEED) & (goal_error < GOAL_TOLERANCE) & state.sound
+        cost = straight_jerk_cost(norm(scenes.goal - scenes.start), movements.duration)
+        timestep = self.simulator.timestep
+        outcome = state.outcome(success, goal_error, movements.duration, cost, timestep)
+        return MeasuredMovements(references, log, state.joints, outcome)
 
-    def rollout(self, execution: Execution, sim: int) -> Rollout:
-        """Return the movement of one simulation, physics step by physics step."""
-        references, log = next(
-            group.simulated for group in execution.groups if sim in group.simulated.references.movements.sims
+    def recorded(self, execution: Execution, sim: int) -> tuple[Float, Float, Bool]:
+        """Return planned positions, joint angles and contacts of one simulation, one for each physics step."""
+        references, log, *_ = next(
+            group for group in execution.groups if sim in group.references.movements.sims
         )
         movements, run = references.movements, references.reachable
         row = int(np.flatnonzero(movements.sims == sim)[0])
-        steps, scene = int(movements.steps[row]), execution.scenes.take([sim])
-        joints = np.repeat(np.asarray(self.arm.inverse_kinematics(scene.start)), steps, axis=0)
+        steps, start = int(movements.steps[row]), execution.scenes.start[[sim]]
+        joints = np.repeat(np.asarray(self.arm.inverse_kinematics(start)), steps, axis=0)
         contact = np.zeros(steps, dtype=bool)
         if log is not None and run[row]:
             ran = int(run[:row].sum())
             joints, contact = log.joints[ran, :steps].copy(), log.contact[ran, :steps].copy()
-        hand = np.asarray(self.arm.hand_position(joints))
-        obstacles = np.repeat(scene.obstacles, steps, axis=0)
-        present = np.repeat(scene.present, steps, axis=0)
-        clearance = self.simulator.collision_model.least_clearance(
-            hand[:, None], obstacles, present, joints[:, None]
-        )
-        time = np.asarray(np.arange(1, steps + 1) * self.simulator.timestep)
-        return Rollout(time, references.planned[row, :steps].copy(), joints, hand, contact, clearance)
+        return references.planned[row, :steps].copy(), joints, contact
 
-    def _measure_log(self, log: SimulationLog, steps: Int, planned: Float, scenes: Scenes) -> _Executed:
+    def _measure_log(self, log: SimulationLog, steps: Int, planned: Float, scenes: Scenes) -> EpisodeState:
         """Measure n movements that ran, `steps` of whose T recorded steps belong to each."""
         after = np.arange(log.joints.shape[1]) >= steps[:, None]
         last = np.arange(len(steps)), steps - 1
-        joints, contact = log.joints, log.contact
+        joints, none = log.joints, np.zeros(len(steps))
         if after.any():  # past its end, a movement stays where it ended
-            joints, contact = np.where(after[..., None], joints[last][:, None], joints), contact & ~after
+            joints = np.where(after[..., None], joints[last][:, None], joints)
         hand = self._hand(log, joints, after, last)
-        moved = norm(np.diff(hand, axis=1, prepend=scenes.start[:, None]))
-        deviation = np.where(after, 0.0, squared_length(hand - planned))
-        goal_error = norm(hand[last] - scenes.goal)
-        collision = np.asarray(contact.any(axis=-1))
-        at_rest = moved[last] < REST_SPEED * self.simulator.timestep
-        kept = within_joint_range(joints, self.arm).all(axis=(1, 2))
-        return _Executed(
-            joints=joints[last],
-            is_success=at_rest & (goal_error < GOAL_TOLERANCE) & ~collision & ~log.unstable & kept,
-            collision=collision,
-            first_contact_time=np.where(collision, contact.argmax(axis=-1) * self.simulator.timestep, -1.0),
-            goal_error=goal_error,
-            path_length=sum_in_order(moved),
-            peak_speed=moved.max(axis=-1) / self.simulator.timestep,
-            tracking_error=np.sqrt(sum_in_order(deviation) / steps),
-            min_clearance=self._recorded_clearance(log, hand, joints, last[1], scenes),
-            unstable=log.unstable,
-        )
-
-    def _at_rest(self, scenes: Scenes) -> _Executed:
-        """Return the metrics of n arms that have stayed at rest at the start."""
-        number = len(scenes.start)
-        no, zero = np.zeros((3, number), dtype=bool), np.zeros((3, number))
-        return _Executed(
-            joints=np.asarray(self.arm.inverse_kinematics(scenes.start)),
-            is_success=no[0],
-            collision=no[1],
-            first_contact_time=np.full(number, -1.0),
-            min_clearance=np.full(number, MAX_CLEARANCE),
-            goal_error=norm(scenes.goal - scenes.start),
-            path_length=zero[0],
-            peak_speed=zero[1],
-            tracking_error=zero[2],
-            unstable=no[2],
-        )
+        clearance = self._recorded_clearance(log, hand, joints, last[1], scenes)
+        start = EpisodeState.at_rest(joints[:, 0], scenes.start, np.full(len(steps), MAX_CLEARANCE))
+        segment = Segment(
+            rows=last[0], steps=steps, planned=planned, joints=joints, hand=hand, contact=log.contact,
+            unstable=log.unstable, min_clearance=clearance, planned_clearance=none, jerk_cost=none,
+        )  # fmt: skip
+        return start.advanced(segment, self.arm, self.simulator.timestep)[0]
 
     def _hand(self, log: SimulationLog, joints: Float, after: Bool, last: tuple[Int, Int]) -> Float:
         """Return the hand positions after each step, computed or as recorded.
@@ -312,7 +228,7 @@ class Executor:
             return model.least_clearance(hand, scenes.obstacles, scenes.present, joints)
         return nearest_approach(log.traced, self.arm.link_radii, scenes.obstacles, scenes.present, last)
 
-    def _with_terminal_clearance(self, done: _Executed, run: Bool, scenes: Scenes) -> Float:
+    def _with_terminal_clearance(self, state: EpisodeState, run: Bool, scenes: Scenes) -> Float:
         """Return the least clearance including the state at the end, which records before each step lack.
 
         Arms whose plans leave their reach have their clearance at the start.
@@ -320,25 +236,10 @@ class Executor:
         model = self.simulator.collision_model
         rows = np.flatnonzero(~run | (model.whole_arm and len(self.arm.traced) > 0))
         if not rows.size:
-            return done.min_clearance
-        least, scene = done.min_clearance.copy(), scenes.take(rows)
+            return state.min_clearance
+        least, scene = state.min_clearance.copy(), scenes.take(rows)
         end = model.least_clearance(
-            scene.start[:, None], scene.obstacles, scene.present, done.joints[rows, None]
+            scene.start[:, None], scene.obstacles, scene.present, state.joints[rows, None]
         )
         least[rows] = np.minimum(least[rows], end)
         return least
-
-
-class _Executed(NamedTuple):
-    """Metrics of n movements that only the physics decides, shape (n,) each, and their last joint angles (n, J)."""
-
-    joints: Float
-    is_success: Bool
-    collision: Bool
-    first_contact_time: Float
-    min_clearance: Float
-    goal_error: Float
-    path_length: Float
-    peak_speed: Float
-    tracking_error: Float
-    unstable: Bool

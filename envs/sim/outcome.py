@@ -1,4 +1,4 @@
-"""Metrics of executed movements; :class:`~viapoint.envs.sim.executor.Executor` computes them.
+"""Executed movements and their metrics; :class:`~viapoint.envs.sim.episode_state.EpisodeState` computes them.
 
 Clearances come from :class:`~viapoint.envs.arms.base.CollisionModel`.
 """
@@ -22,6 +22,23 @@ SETTLING = 0.1
 """Time after the movement in which the hand must come to rest, [s]."""
 LIMIT_TOLERANCE = 1e-3
 """Tolerance of MuJoCo's soft joint limits, [rad]."""
+
+
+class Rollout(NamedTuple):
+    """One movement at its T physics steps."""
+
+    time: Float
+    """Shape (T,), [s]."""
+    planned: Float
+    """Planned hand positions, shape (T, D), [m]."""
+    joints: Float
+    """Joint angles, shape (T, J), [rad]."""
+    hand: Float
+    """Executed hand positions, shape (T, D), [m]."""
+    contact: Bool
+    """True where the arm touched an obstacle at the state before the step, shape (T,)."""
+    clearance: Float
+    """Clearance from the nearest obstacle, shape (T,), [m]."""
 
 
 class Outcome(NamedTuple):

@@ -90,15 +90,6 @@ class DecisionReferences(NamedTuple):
     """Jerk cost of the commanded path, shape (n,), [m^2/s^5]."""
 
 
-class SimulatedDecisions(NamedTuple):
-    """Decisions of one group after the physics."""
-
-    references: DecisionReferences
-    """References that the arm tracked."""
-    log: SimulationLog
-    """Recorded physics."""
-
-
 class ReplanningExecutor:
     """Stages of decisions, each a batch function from one record to the next."""
 
@@ -151,17 +142,15 @@ class ReplanningExecutor:
             ),
         )
 
-    def simulate(self, references: DecisionReferences) -> SimulatedDecisions:
+    def simulate(self, references: DecisionReferences) -> SimulationLog:
         """Run the physics of one group among moving obstacles."""
         decisions = references.decisions
-        log = self.simulator.rollout_among_moving(
+        return self.simulator.rollout_among_moving(
             decisions.rows, references.controls, references.places, decisions.steps
         )
-        return SimulatedDecisions(references, log)
 
-    def measure(self, simulated: SimulatedDecisions) -> Segment:
+    def measure(self, references: DecisionReferences, log: SimulationLog) -> Segment:
         """Measure one group; a decision ends with the first contact."""
-        references, log = simulated
         rows, _, _, now, steps, scenes = references.decisions
         touched = log.contact & (np.arange(log.contact.shape[1]) < steps[:, None])
         steps = np.where(touched.any(axis=-1), touched.argmax(axis=-1) + 1, steps)

@@ -37,7 +37,7 @@ class Scheduler:
         groups: Sequence[Group],
         build_references: Callable[[Group], References],
         simulate: Callable[[References], Simulated],
-        measure: Callable[[Simulated], Measured],
+        measure: Callable[[References, Simulated], Measured],
         meanwhile: Callable[[], Result] | None = None,
     ) -> tuple[list[Measured], Future[Result] | None]:
         """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
@@ -48,7 +48,7 @@ class Scheduler:
             groups: Inputs of the first stage.
             build_references: First stage.
             simulate: Second stage.
-            measure: Third stage.
+            measure: Third stage, a function of the results of both.
             meanwhile: Independent job that may run during the physics.
 
         Returns:
@@ -58,7 +58,7 @@ class Scheduler:
         references = [submit(build_references, group) for group in groups]
         # The physics waits for the first references only, so the independent job comes after all of them.
         following = None if meanwhile is None else self.submit(meanwhile)
-        measured = [submit(measure, simulate(each.result())) for each in references]
+        measured = [submit(measure, each.result(), simulate(each.result())) for each in references]
         return [each.result() for each in measured], following
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
-    from viapoint.envs.sim.executor import Rollout
+    from viapoint.envs.sim.outcome import Rollout
     from viapoint.training.live.decisions import DecisionMaker
     from viapoint.training.live.scene_file import LiveScene
 

@@ -17,7 +17,7 @@ from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Observation
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 from viapoint.training.plotting.top_view import draw_movement
 
 TILE = 2.6

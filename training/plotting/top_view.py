@@ -16,7 +16,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.rows import obstacles_from_rows
 from viapoint.envs.rendering.overlay import FirstContact, Movement
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Rollout
+from viapoint.envs.sim.outcome import Rollout
 
 VIEW = ((-0.56, 0.48), (-0.14, 0.90))
 """Limits of x and y, [m]."""
