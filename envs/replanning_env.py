@@ -18,7 +18,7 @@ from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import ReplanningObservationLayout
 from viapoint.envs.mdp.rewards import replanning_rewards
 from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
-from viapoint.envs.rendering.renderer import EpisodeRenderer, History
+from viapoint.envs.rendering.renderer import History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
 from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
@@ -27,7 +27,7 @@ from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
-from viapoint.envs.vector_env import METADATA, Decision, ReachVectorEnv
+from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 HISTORY_NAMES = ("time", *MovingPlan._fields)
 """Columns of a stored history of plans."""
@@ -74,7 +74,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
     __signature__ = ReplanningConfig.signature()
     scenes: ChangingScenes | None  # type: ignore[assignment]
     observation_layout: ReplanningObservationLayout
-    _renderer: EpisodeRenderer
 
     def _build(self) -> None:
         """Create the layouts, the sampler of changes, the stages and the episodes."""
@@ -112,10 +111,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             task.arm, n, timestep=timestep, max_steps=self._ends.limit + 1,
             records={"plan": self._plan, "start": self._plan_start},
         )  # fmt: skip
-
-    def _make_renderer(self) -> EpisodeRenderer:
-        config, fps = self.config, METADATA["render_fps"]
-        return EpisodeRenderer(self._simulator, self.render_mode, config.width, config.height, fps)
 
     @property
     def last_plan(self) -> Plan | None:

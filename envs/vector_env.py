@@ -169,7 +169,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._last: Execution | None = None
         self.action_names = self.action_layout.names
         self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
-        self._renderer = self._make_renderer()
+        self._renderer = MovementRenderer(
+            self._simulator, self.render_mode, config.width, config.height, METADATA["render_fps"]
+        )
         self._build()
         self.single_action_space = spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
         self.single_observation_space = self.observation_layout.space()
@@ -178,10 +180,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _build(self) -> None:
         """Create what only a subclass has, before the spaces."""
-
-    def _make_renderer(self) -> MovementRenderer:
-        config, fps = self.config, METADATA["render_fps"]
-        return MovementRenderer(self._simulator, self.render_mode, config.width, config.height, fps)
 
     @property
     def model(self) -> Any:

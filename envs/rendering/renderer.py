@@ -1,23 +1,20 @@
-"""Renderers of movements and of episodes."""
+"""Renderer of movements and of episodes of several plans."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.common.arrays import in_space
-from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
-from viapoint.envs.rendering.overlay import Movement
-from viapoint.envs.rendering.scene_view import SPACING, SceneView
-from viapoint.envs.rendering.shapes import ShapeWriter, resampled
+from viapoint.envs.rendering.overlay import FirstContact, Movement
+from viapoint.envs.rendering.scene_view import SceneView
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Rollout
@@ -51,6 +48,14 @@ def frame_steps(time: Float, fps: int) -> Int:
     return np.round(np.linspace(0, len(time), count + 1)).astype(np.int64)
 
 
+History = list[tuple[float, MovingPlan]]
+"""Plans of an episode and the times at which they began, [s]."""
+POINTS = 60
+"""Points along a planned path of an episode."""
+Moment = tuple[Scenes, Movement, Sequence[Float]]
+"""Scene, movement, and paths of replaced plans at one time of a movement."""
+
+
 class MovementRenderer:
     """Renderer of the movement of one simulation.
 
@@ -58,8 +63,6 @@ class MovementRenderer:
     end of the movement or, after a collision, the moment of first contact. `rgb_array_list` returns a film of the
     movement as a list of such pictures, and `human` plays it in a window.
     """
-
-    view_class: ClassVar[type[SceneView]] = SceneView
 
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
         self._simulator = simulator
@@ -72,19 +75,38 @@ class MovementRenderer:
 
     def still(self, scene: Scenes) -> Any:
         """Render the scene before the movement."""
-        picture = self._draw(scene, self._simulator.arm.inverse_kinematics(scene.start)[0])
+        picture = self._draw(scene, None, (), 0)
         return {"human": None, "rgb_array_list": [picture]}.get(str(self.mode), picture)
 
     def movement(self, scene: Scenes, plan: Plan, rollout: Rollout) -> Any:
         """Render a movement."""
         movement = Movement.of(self._simulator.collision_model, scene, plan, rollout)
+        return self._film(movement.contact, lambda step: (scene, movement, ()), rollout.time)
+
+    def episode(self, changing: ChangingScenes, history: History, rollout: Rollout) -> Any:
+        """Render an episode so far, with the obstacles and plans of the time of each frame."""
+        timestep = self._simulator.timestep
+        touched = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
+        scene, plan = changing.at(np.array([touched * timestep])), history[-1][1].plan
+        movement = Movement.of(self._simulator.collision_model, scene, plan, rollout)
+
+        def at(step: int) -> Moment:
+            begun = [plan for began, plan in history if began <= step * timestep + 1e-9] or [history[0][1]]
+            *replaced, path = (np.asarray(plan.trajectory().sample(POINTS, 0)[0][0]) for plan in begun)
+            shown = movement._replace(planned=path, vias=begun[-1].waypoints[0, 1:-1])
+            return changing.at(np.array([step * timestep])), shown, replaced
+
+        return self._film(movement.contact, at, rollout.time)
+
+    def _film(self, contact: FirstContact | None, at: Callable[[int], Moment], times: Float) -> Any:
+        """Render the moments of a movement that the render mode shows."""
         if self.mode == "rgb_array":
-            step = len(rollout.time) if movement.contact is None else movement.contact.step
-            return self._draw(scene, movement.joints[step], movement, step)
-        steps = frame_steps(rollout.time, self._fps)
+            step = len(times) if contact is None else contact.step
+            return self._draw(*at(step), step)
+        steps = frame_steps(times, self._fps)
         if self.mode == "human":
-            return self._play(scene, movement, steps)
-        return [self._draw(scene, movement.joints[step], movement, step) for step in steps]
+            return self._play(at, steps)
+        return [self._draw(*at(step), step) for step in steps]
 
     def close(self) -> None:
         """Close window and OpenGL context; the next picture opens them again."""
@@ -96,7 +118,7 @@ class MovementRenderer:
     def _ready(self) -> SceneView:
         """Return the scene view, after opening a canvas or a window for it."""
         if self._view is None:
-            view = self.view_class(self._simulator, *self._size)
+            view = SceneView(self._simulator, *self._size)
             if self.mode == "human":
                 self._window = Window(view.model, *self._size, title="Viapoint")
             else:
@@ -105,15 +127,16 @@ class MovementRenderer:
             self._view = view
         return self._view
 
-    def _draw(self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0) -> Any:
+    def _draw(self, scene: Scenes, movement: Movement | None, replaced: Sequence[Float], step: int) -> Any:
         """Return a picture, or show it in the window and return False after the window has been closed."""
         view = self._ready()
-        view.set(scene, joints, movement, step)
+        still = self._simulator.arm.inverse_kinematics(scene.start) if movement is None else movement.joints
+        view.set(scene, still[step], movement, step, replaced)
         screen = self._window or self._canvas
         assert screen is not None
         return screen.show(view.scene) if isinstance(screen, Window) else screen.draw(view.scene)
 
-    def _play(self, scene: Scenes, movement: Movement, steps: Int) -> None:
+    def _play(self, at: Callable[[int], Moment], steps: Int) -> None:
         """Play the film in the window in real time; late frames are left out."""
         begin = time.monotonic()
         for number, step in enumerate(steps):
@@ -122,59 +145,5 @@ class MovementRenderer:
                 continue
             if late < 0.0:
                 time.sleep(-late)
-            if not self._draw(scene, movement.joints[step], movement, step):
+            if not self._draw(*at(step), step):
                 return
-
-
-History = list[tuple[float, MovingPlan]]
-"""Plans of an episode and the times at which they began, [s]."""
-
-FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
-"""Colour of a replaced plan."""
-FADED_RADIUS = 0.0045
-"""Radius of the path of a replaced plan, [m]."""
-POINTS = 60
-"""Points along a planned path."""
-
-
-class ReplanningSceneView(SceneView):
-    """Scene view that shows moving obstacles and replaced plans at the time of a frame."""
-
-    changing: ChangingScenes | None = None
-    """Scene with its changes over time."""
-    history: History
-    """Plans and the times at which they began, [s]."""
-
-    def set(self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0) -> Any:
-        """Set up the scene as :meth:`SceneView.set` does, with obstacles and plans of the step's time."""
-        if movement is None or self.changing is None:
-            return super().set(scene, joints, movement, step)
-        time = step * float(self.model.opt.timestep)
-        begun = [plan for began, plan in self.history if began <= time + 1e-9] or [self.history[0][1]]
-        current = begun[-1]
-        movement = movement._replace(planned=_path(current), vias=current.waypoints[0, 1:-1])
-        super().set(self.changing.at(np.array([time])), joints, movement, step)
-        shapes = ShapeWriter(self.scene)
-        for plan in begun[:-1]:
-            shapes.line(in_space(resampled(_path(plan), SPACING), self._floor + 0.001), FADED_RADIUS, FADED)
-        return self.scene
-
-
-class EpisodeRenderer(MovementRenderer):
-    """Renderer of an episode of several decisions."""
-
-    view_class = ReplanningSceneView
-
-    def episode(self, changing: ChangingScenes, history: History, rollout: Rollout) -> Any:
-        """Render the episode so far."""
-        view = self._ready()
-        assert isinstance(view, ReplanningSceneView)
-        view.changing, view.history = changing, history
-        touched = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
-        scene = changing.at(np.array([touched * float(view.model.opt.timestep)]))
-        return self.movement(scene, history[-1][1].plan, rollout)
-
-
-def _path(plan: MovingPlan) -> Float:
-    """Return the path of a plan, shape (POINTS, D), [m]."""
-    return np.asarray(plan.trajectory().sample(POINTS, 0)[0][0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -29,6 +30,10 @@ PLAN, DONE = 0.0065, 0.0030
 """Radii of the planned and of the executed path, [m]; the planned one shows as a rim of the other."""
 SPACING = 0.011
 """Distance of the points of a drawn path, [m]."""
+FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
+"""Colour of a replaced plan."""
+FADED_RADIUS = 0.0045
+"""Radius of the path of a replaced plan, [m]."""
 MAX_GEOMS = 2000
 """Greatest number of shapes in a scene."""
 
@@ -54,9 +59,12 @@ class SceneView:
         """Scene to render, after :meth:`set`."""
 
     def set(
-        self, scene: Scenes, joints: Float, movement: Movement | None = None, step: int = 0
-    ) -> mujoco.MjvScene:
-        """Set up one picture of a scene; of a movement the whole plan is drawn, and its execution up to a step."""
+        self, scene: Scenes, joints: Float, movement: Movement | None, step: int, replaced: Sequence[Float]
+    ) -> None:
+        """Set up one picture of a scene.
+
+        Of a movement the whole plan is drawn, its execution up to a step, and the paths of plans that it replaced.
+        """
         contact = None if movement is None else movement.contact
         contact = None if contact is None or step < contact.step else contact
         self._pose(joints)
@@ -68,6 +76,8 @@ class SceneView:
         self._draw_obstacles(shapes, scene, None if contact is None else contact.obstacle)
         if movement is not None:
             self._draw_movement(shapes, movement, step)
+        for path in replaced:
+            shapes.line(in_space(resampled(path, SPACING), self._floor + 0.001), FADED_RADIUS, FADED)
 
     def _pose(self, joints: Float) -> None:
         """Start the scene with the arm in a configuration."""
