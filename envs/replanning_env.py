@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, ReplanningDecoder
 from viapoint.envs.actions.via_points import Plan, checked_plan
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
 from viapoint.envs.config import ReplanningConfig
@@ -252,15 +252,14 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         rows, now = np.flatnonzero(revised), self._episodes.now
         if not rows.size:
             return
-        scaled = self._stages.scale_time(plan.take(rows))
+        scaled = self._stages.scale_time(take(plan, rows))
         now.reachable[rows] &= scaled.reachable
         now.stretch[rows] = np.maximum(now.stretch[rows], scaled.stretch)
-        self._plan.put(rows, scaled.plan)
+        put(self._plan, rows, scaled.plan)
         self._plan_start.step[rows], self._plan_start.begun[rows] = now.steps[rows], True
         times = self._episodes.time
         for row in rows:
-            one = MovingPlan(*(part[row : row + 1].copy() for part in self._plan))
-            self._history[row].append((float(times[row]), one))
+            self._history[row].append((float(times[row]), take(self._plan, [row])))
 
     def _outcome(self, scenes: ChangingScenes, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for hands that have arrived at their last goal."""
@@ -310,7 +309,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         self._episodes.begin(rows, joints, scenes.start, clearance.min(axis=(1, 2), initial=MAX_CLEARANCE))
         number, zero = self._plan.waypoints.shape[1], np.zeros_like(scenes.start)
         rest = np.repeat(scenes.start[:, None], number, axis=1)
-        self._plan.put(rows, MovingPlan(rest, np.ones((len(rows), number - 1)), zero, zero))
+        put(self._plan, rows, MovingPlan(rest, np.ones((len(rows), number - 1)), zero, zero))
         self._plan_start.step[rows], self._plan_start.begun[rows] = 0, False
         for row in rows:
             self._history[row] = []

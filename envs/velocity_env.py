@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from viapoint.envs.actions.velocity import Steering
 from viapoint.envs.actions.via_points import Motion, Plan
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Float, Int, Observation
 from viapoint.envs.common.validation import checked_actions
 from viapoint.envs.config import VelocityConfig
@@ -185,7 +185,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         reachable = (np.asarray(self.arm.reach_margin(motion.position)) >= 0.0).all(axis=-1)
         self._episodes.now.reachable[:] = reachable
         rows = np.flatnonzero(reachable)
-        some = Motion(*(part[rows] for part in motion))
+        some = take(motion, rows)
         controls = self.arm.controls(*(part[:, :-1] for part in some)) if rows.size else np.zeros((0, 0, 0))
         return StepReferences(rows, some, controls, cost[rows])
 
@@ -211,7 +211,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         at_goal = resting & (norm(hand - scenes.goal[:, None]) < GOAL_TOLERANCE)
         trailing = np.where(at_goal.all(axis=-1), number, np.argmin(at_goal[:, ::-1], axis=-1))
         self._rest.steps[rows] = trailing + np.where(trailing == number, self._rest.steps[rows], 0)
-        self._motion.put(rows, Motion(*(part[:, -1] for part in motion)))
+        put(self._motion, rows, Motion(*(part[:, -1] for part in motion)))
 
     def _outcome(self, scenes: Scenes) -> Outcome:
         """Return the metrics so far; the duration of a success is the time until the hand came to rest."""
@@ -223,7 +223,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
 
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         joints = super()._start(rows, scenes)
-        self._motion.put(rows, Motion.at_rest(scenes.start))
+        put(self._motion, rows, Motion.at_rest(scenes.start))
         self._rest.steps[rows] = 0
         clearance = self.task.collision_model.least_clearance(
             scenes.start[:, None], scenes.obstacles, scenes.present

@@ -12,7 +12,9 @@ from __future__ import annotations
 from fractions import Fraction
 from functools import cache
 from math import comb, factorial, perm, sqrt
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
+import numpy as np
 
 Table: TypeAlias = tuple[tuple[float, ...], ...]
 Exact: TypeAlias = list[list[Fraction]]
@@ -35,12 +37,10 @@ def stiffness_table(order: int) -> Table:
     """
     m = order
     columns = [m, *range(1, m), *range(m + 1, 2 * m)]
-    upper = [[row[column] for column in columns] for row in _coefficients(m)[m:]]
-    gram = [
-        [Fraction(perm(k, m) * perm(j, m), k + j - 2 * m + 1) for j in range(m, 2 * m)]
-        for k in range(m, 2 * m)
-    ]
-    return _floats(_product(_product(_transposed(upper), gram), upper))
+    upper = np.array(_coefficients(m)[m:])[:, columns]
+    size = range(m, 2 * m)
+    gram = np.array([[Fraction(perm(k, m) * perm(j, m), k + j - 2 * m + 1) for j in size] for k in size])
+    return _floats(upper.T @ gram @ upper)
 
 
 @cache
@@ -101,14 +101,6 @@ def _coefficients(order: int) -> Exact:
     return table
 
 
-def _transposed(table: Exact) -> Exact:
-    return [list(column) for column in zip(*table, strict=True)]
-
-
-def _product(left: Exact, right: Exact) -> Exact:
-    columns = _transposed(right)
-    return [[sum((a * b for a, b in zip(row, c, strict=True)), Fraction()) for c in columns] for row in left]
-
-
-def _floats(table: Exact) -> Table:
+def _floats(table: Any) -> Table:
+    """Return a table of fractions, a list of rows or a NumPy array of objects, as floats."""
     return tuple(tuple(float(value) for value in row) for row in table)

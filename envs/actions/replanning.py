@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from viapoint import primitives
 from viapoint.envs.actions.via_points import ActionLayout, Motion, Plan, frame
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 
@@ -46,15 +46,6 @@ class MovingPlan(NamedTuple):
     def duration(self) -> Float:
         """Total duration, shape (N,), [s]."""
         return np.asarray(self.durations.sum(axis=-1))
-
-    def take(self, rows: Any) -> MovingPlan:
-        """Return the movements at `rows`, an index, slice or mask."""
-        return MovingPlan(*(field[rows] for field in self))
-
-    def put(self, rows: Any, other: MovingPlan) -> None:
-        """Overwrite the movements at `rows`."""
-        for mine, theirs in zip(self, other, strict=True):
-            mine[rows] = theirs
 
     def trajectory(self) -> primitives.Trajectory:
         """Return the minimum-jerk movement through the waypoints."""
@@ -147,9 +138,9 @@ class ReplanningDecoder:
         first, later = np.flatnonzero(~default.begun), np.flatnonzero(default.begun & ~keep)
         if first.size:
             place, goal = default.state.position[first], default.goal[first]
-            revised.put(first, MovingPlan.of(self.layout.decode(actions[first], place, goal)))
+            put(revised, first, MovingPlan.of(self.layout.decode(actions[first], place, goal)))
         if later.size:
-            revised.put(later, self._revised(NominalPlan(*_taken(default, later)), actions[later]))
+            put(revised, later, self._revised(take(default, later), actions[later]))
         return revised, keep
 
     def _revised(self, default: NominalPlan, actions: Float) -> MovingPlan:
@@ -212,10 +203,3 @@ def timed(waypoints: Float, duration: Float, state: Motion) -> MovingPlan:
         waypoints, duration, start_velocity=state.velocity, start_acceleration=state.acceleration
     )
     return MovingPlan(waypoints, durations, state.velocity, state.acceleration)
-
-
-def _taken(default: NominalPlan, rows: NDArray[np.int64]) -> list[Any]:
-    return [
-        Motion(*(part[rows] for part in field)) if isinstance(field, Motion) else field[rows]
-        for field in default
-    ]

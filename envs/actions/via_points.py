@@ -65,11 +65,6 @@ class Motion(NamedTuple):
         """Return references that rest at `position`, shape (N, D), [m]."""
         return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
 
-    def put(self, rows: Any, other: Motion) -> None:
-        """Overwrite the references at `rows`."""
-        for mine, theirs in zip(self, other, strict=True):
-            mine[rows] = theirs
-
 
 @dataclass(frozen=True, kw_only=True)
 class ActionLayout:

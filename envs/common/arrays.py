@@ -1,11 +1,11 @@
-"""Array operations for NumPy and torch that are slow, or missing, in the Array API standard."""
+"""Array operations for NumPy and torch that are slow, or missing, in the Array API standard; rows of records."""
 
 from __future__ import annotations
 
 import functools
 import operator
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,9 +13,22 @@ from viapoint.envs.common.types import Numbers
 from viapoint.primitives.array_api import Array, namespace_of
 
 N = TypeVar("N", bound=Numbers)
+Record = TypeVar("Record", bound=tuple[Any, ...])
 
 TINY = 1e-12
 """Least squared length of an axis, [m^2], and least squared sine between axes that are not parallel."""
+
+
+def take(record: Record, rows: Any) -> Record:
+    """Return the rows of a named tuple of arrays, or of such tuples; `rows` is an index, slice or mask."""
+    parts = (take(part, rows) if isinstance(part, tuple) else part[rows] for part in record)
+    return type(record)(*parts)
+
+
+def put(record: Record, rows: Any, others: Record) -> None:
+    """Overwrite rows of a named tuple of arrays."""
+    for mine, theirs in zip(record, others, strict=True):
+        mine[rows] = theirs
 
 
 def clamp(values: Array, low: float, high: float) -> Array:

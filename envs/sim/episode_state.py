@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.base import Arm
-from viapoint.envs.common.arrays import norm, squared_length
+from viapoint.envs.common.arrays import norm, put, squared_length, take
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.sim.outcome import Outcome, sum_in_order, within_joint_range
@@ -93,15 +93,6 @@ class EpisodeState(NamedTuple):
     def sound(self) -> Bool:
         """True where nothing rules out success so far, shape (N,)."""
         return np.asarray(~self.collision & self.within & self.reachable & ~self.unstable)
-
-    def take(self, rows: Any) -> EpisodeState:
-        """Return the episodes at `rows`, an index, slice or mask."""
-        return EpisodeState(*(part[rows] for part in self))
-
-    def put(self, rows: Any, others: EpisodeState) -> None:
-        """Overwrite the episodes at `rows`."""
-        for mine, theirs in zip(self, others, strict=True):
-            mine[rows] = theirs
 
     def advanced(self, segment: Segment, arm: Arm, timestep: float) -> tuple[EpisodeState, Float]:
         """Return n episodes after a segment of theirs, and how far the hand moved per physics step, (n, T), [m]."""
@@ -200,13 +191,13 @@ class Episodes:
 
     def begin(self, rows: Int, joints: Float, hand: Float, clearance: Float) -> None:
         """Start episodes (n,) at rest with joint angles (n, J), hand positions (n, D) and clearances (n,)."""
-        self.now.put(rows, EpisodeState.at_rest(joints, hand, clearance))
+        put(self.now, rows, EpisodeState.at_rest(joints, hand, clearance))
 
     def add(self, segment: Segment) -> Float:
         """Add one step of some episodes; return the distances that the hand moved per physics step, (n, T), [m]."""
         self._store(segment)
-        after, moved = self.now.take(segment.rows).advanced(segment, self.arm, self.timestep)
-        self.now.put(segment.rows, after)
+        after, moved = take(self.now, segment.rows).advanced(segment, self.arm, self.timestep)
+        put(self.now, segment.rows, after)
         return moved
 
     def recorded(self, row: int) -> tuple[Float, Float, Bool]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.geometry.narrow_phase import nearest_approach
@@ -44,12 +44,7 @@ class ScaledMovements(NamedTuple):
         if len(self.sims) <= GROUP:
             return [self]
         order = np.argsort(self.steps, kind="stable")
-        return [self.take(np.sort(order[first : first + GROUP])) for first in range(0, len(order), GROUP)]
-
-    def take(self, rows: Int) -> ScaledMovements:
-        """Return the movements at some rows."""
-        found = self.stretch[rows], self.within[rows], self.duration[rows], self.steps[rows]
-        return ScaledMovements(self.sims[rows], self.scenes.take(rows), self.plan.take(rows), *found)
+        return [take(self, np.sort(order[first : first + GROUP])) for first in range(0, len(order), GROUP)]
 
 
 class TrackingReferences(NamedTuple):
@@ -161,7 +156,7 @@ class Executor:
             state = EpisodeState.at_rest(joints, scenes.start, np.full(len(run), MAX_CLEARANCE))
             if log is not None:
                 steps, planned = movements.steps[run], references.planned[run]
-                state.put(run, self._measure_log(log, steps, planned, scenes.take(run)))
+                put(state, run, self._measure_log(log, steps, planned, scenes.take(run)))
         state = state._replace(
             min_clearance=self._with_terminal_clearance(state, run, scenes),
             planned_clearance=references.clearance,

@@ -9,6 +9,7 @@ import numpy as np
 from viapoint.envs.actions.replanning import MovingPlan, timed
 from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.arms.serial_arm import CONTROL_STRIDE
+from viapoint.envs.common.arrays import put, take
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
@@ -62,15 +63,10 @@ class Decisions(NamedTuple):
     scenes: ChangingScenes
     """Scenes of the episodes."""
 
-    def take(self, rows: Int) -> Decisions:
-        """Return the decisions at some rows."""
-        plan, scenes = self.plan.take(rows), self.scenes.take(rows)
-        return Decisions(self.rows[rows], plan, self.since[rows], self.now[rows], self.steps[rows], scenes)
-
     def groups(self) -> list[Decisions]:
         """Return groups of decisions of similar length; decisions without steps are left out."""
         some = np.flatnonzero(self.steps > 0)
-        return [self.take(some[group]) for group in groups_of(self.steps[some])]
+        return [take(self, some[group]) for group in groups_of(self.steps[some])]
 
 
 class DecisionReferences(NamedTuple):
@@ -110,8 +106,8 @@ class ReplanningExecutor:
             if not rows.size:
                 break
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
-            slower.put(rows, timed(plan.waypoints[rows], slower.duration[rows], state))
-            again = required_time_scale(self.arm, slower.take(rows)).stretch
+            put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
+            again = required_time_scale(self.arm, take(slower, rows)).stretch
             rows, again = rows[again > ENOUGH], again[again > ENOUGH]
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.arrays import take
 from viapoint.envs.common.types import Bool, Float
 
 CHECK_INTERVAL = 0.008
@@ -33,7 +34,7 @@ class TimeScale(NamedTuple):
 def required_time_scale(arm: Arm, plan: Any) -> TimeScale:
     """Return the time scaling that joint limits require; for an arm without limits, check the reach of short plans.
 
-    The plan has N movements: `durations` of their segments [s], `trajectory()` and `take(rows)`.
+    The plan is a record of N movements with `durations` of their segments [s] and `trajectory()`.
     """
     number, segments = plan.durations.shape
     stretch, within = np.ones(number), np.ones(number, dtype=bool)
@@ -42,7 +43,7 @@ def required_time_scale(arm: Arm, plan: Any) -> TimeScale:
     rows = np.arange(number) if arm.velocity_limit else np.flatnonzero(short)
     for first in range(0, len(rows), BLOCK_SIZE):
         some = rows[first : first + BLOCK_SIZE]
-        stretch[some], within[some] = _check_block(arm, plan.take(some))
+        stretch[some], within[some] = _check_block(arm, take(plan, some))
     return TimeScale(stretch, within)
 
 
@@ -70,7 +71,7 @@ def _check_block(arm: Arm, plan: Any) -> TimeScale:
     if len(near):
         about = np.take_along_axis(times[near], demand[near].argmax(axis=-1)[..., None], axis=-1)
         again = np.clip(about + apart[near, :, None] * SECOND_CHECKS, 0.0, ends[near, -1, None, None])
-        closer = _demand(arm, *plan.take(near).trajectory().sample(again.reshape(len(near), -1)))
+        closer = _demand(arm, *take(plan, near).trajectory().sample(again.reshape(len(near), -1)))
         stretch[near] = np.maximum(stretch[near], closer.max(axis=-1))
     return TimeScale(np.where(within, np.maximum(stretch, 1.0), 1.0), within)
 
