@@ -109,7 +109,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         self._history: list[History] = [[] for _ in range(n)]
         self._episodes = Episodes(
             task.arm, n, timestep=timestep, max_steps=self._ends.limit + 1,
-            records={"plan": self._plan, "start": self._plan_start},
+            records={"plan": self._plan._asdict(), "start": self._plan_start._asdict()},
         )  # fmt: skip
 
     @property
@@ -187,13 +187,12 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
     def restore_episodes(self, state: Mapping[str, Any]) -> None:
         """See :meth:`MultiStepVectorEnv.restore_episodes`."""
         super().restore_episodes(state)
-        first = 0
-        for row, number in enumerate(np.asarray(state["history_number"])):
-            part = slice(first, first + int(number))
-            time, *parts = (np.asarray(state[f"history_{name}"])[part] for name in HISTORY_NAMES)
-            plans = (MovingPlan(*(each[k : k + 1].copy() for each in parts)) for k in range(number))
-            self._history[row] = [(float(began), plan) for began, plan in zip(time, plans, strict=True)]
-            first += int(number)
+        began, *parts = (np.asarray(state[f"history_{name}"]) for name in HISTORY_NAMES)
+        plans = [(float(time), take(MovingPlan(*parts), [k])) for k, time in enumerate(began)]
+        ends = np.cumsum(state["history_number"])
+        self._history = [
+            plans[end - number : end] for end, number in zip(ends, state["history_number"], strict=True)
+        ]
 
     @staticmethod
     def take_episodes(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:

@@ -58,13 +58,6 @@ class StepObservationLayout(ObservationLayout):
         return {**observation, **{name: part.astype(np.float32) for name, part in parts.items()}}
 
 
-class RestingSteps(NamedTuple):
-    """Rest of N hands at their goals."""
-
-    steps: Int
-    """Last physics steps in which the hand was at rest at the goal, shape (N,)."""
-
-
 class StepReferences(NamedTuple):
     """References of one control step for the n episodes that stay within reach."""
 
@@ -124,11 +117,12 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         )  # fmt: skip
         self.action_names = self.steering.names
         self._motion = Motion.at_rest(np.zeros((self.num_envs, arm.dimension)))
-        self._rest = RestingSteps(np.zeros(self.num_envs, dtype=np.int64))
+        self._rest = np.zeros(self.num_envs, dtype=np.int64)
+        """Last physics steps in which the hand was at rest at the goal, shape (N,)."""
         self._episodes = Episodes(
             arm, self.num_envs, timestep=timestep,
             max_steps=self.control_steps * self.steering.physics_steps,
-            records={"motion": self._motion, "rest": self._rest},
+            records={"motion": self._motion._asdict(), "rest": {"steps": self._rest}},
         )  # fmt: skip
 
     @property
@@ -210,12 +204,12 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         resting = moved < REST_SPEED * self._simulator.timestep
         at_goal = resting & (norm(hand - scenes.goal[:, None]) < GOAL_TOLERANCE)
         trailing = np.where(at_goal.all(axis=-1), number, np.argmin(at_goal[:, ::-1], axis=-1))
-        self._rest.steps[rows] = trailing + np.where(trailing == number, self._rest.steps[rows], 0)
+        self._rest[rows] = trailing + np.where(trailing == number, self._rest[rows], 0)
         put(self._motion, rows, Motion(*(part[:, -1] for part in motion)))
 
     def _outcome(self, scenes: Scenes) -> Outcome:
         """Return the metrics so far; the duration of a success is the time until the hand came to rest."""
-        now, timestep, rest = self._episodes.now, self._simulator.timestep, self._rest.steps
+        now, timestep, rest = self._episodes.now, self._simulator.timestep, self._rest
         success = (rest * timestep >= SETTLING - 1e-9) & now.sound
         duration = timestep * np.where(success, np.maximum(now.steps - rest, 1), np.maximum(now.steps, 1))
         cost = straight_jerk_cost(norm(scenes.goal - scenes.start), duration)
@@ -224,7 +218,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         joints = super()._start(rows, scenes)
         put(self._motion, rows, Motion.at_rest(scenes.start))
-        self._rest.steps[rows] = 0
+        self._rest[rows] = 0
         clearance = self.task.collision_model.least_clearance(
             scenes.start[:, None], scenes.obstacles, scenes.present
         )

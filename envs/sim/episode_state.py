@@ -163,11 +163,17 @@ class Episodes:
         num_envs: Number of environments N.
         timestep: Length of a physics step, [s].
         max_steps: Physics steps of an episode at most.
-        records: Further named tuples of arrays, shape (N, ...) each, that belong to the state of the episodes.
+        records: Further arrays by name, shape (N, ...) each, that belong to the state of the episodes.
     """
 
     def __init__(
-        self, arm: Arm, num_envs: int, *, timestep: float, max_steps: int, records: Mapping[str, Any]
+        self,
+        arm: Arm,
+        num_envs: int,
+        *,
+        timestep: float,
+        max_steps: int,
+        records: Mapping[str, Mapping[str, Any]],
     ) -> None:
         self.arm, self.timestep = arm, timestep
         n, j, d = num_envs, len(arm.joint_range), arm.dimension
@@ -181,7 +187,7 @@ class Episodes:
         self._stored: dict[str, dict[str, Any]] = {
             "": self.now._asdict(),
             "past_": self._past,
-            **{f"{name}_": record._asdict() for name, record in records.items()},
+            **{f"{name}_": dict(record) for name, record in records.items()},
         }
 
     @property
