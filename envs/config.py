@@ -1,4 +1,7 @@
-"""Keyword arguments of the environments, with their defaults and checks."""
+"""Keyword arguments of the environments, with their defaults and checks.
+
+The classes of the environments document each argument.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from viapoint.envs.sim.replan_triggers import TRIGGERS, Trigger
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig:
-    """Keyword arguments that all environments share."""
+    """Keyword arguments that all environments share; see :class:`~viapoint.envs.vector_env.ReachVectorEnv`."""
 
     weights_kind: ClassVar[type[RewardWeights]] = RewardWeights
     """Class of the reward's weights."""
@@ -31,27 +34,16 @@ class EnvConfig:
     """True if an action holds for one control step."""
 
     arm: Arm | str = ADULT
-    """Arm that moves, a record or its name."""
     whole_arm: bool = False
-    """True if the links must clear the obstacles, too; False for the hand alone."""
     n_obstacles: int | tuple[int, int] = (1, 5)
-    """Number of obstacles, or the fewest and the most."""
     shapes: str | Sequence[str] = CAPSULES
-    """Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length."""
     uniform_share: float = 0.0
-    """Share of episodes whose ends and obstacles are uniform in the workspace."""
     duration_range: tuple[float, float] = (0.6, 1.2)
-    """Shortest and longest movement, [s]."""
     reward_weights: RewardWeights | Mapping[str, float] | None = None
-    """Some or all of the weights of the reward's terms."""
     render_mode: str | None = None
-    """One of `human`, `rgb_array` and `rgb_array_list`."""
     width: int = 480
-    """Width of a rendered frame, [pixels]."""
     height: int = 480
-    """Height of a rendered frame, [pixels]."""
     threads: int = 0
-    """Threads of the simulation; 0 for one per core. Results do not depend on it."""
 
     @classmethod
     def of(cls, kwargs: Mapping[str, Any]) -> Self:
@@ -108,9 +100,7 @@ class ViaPointConfig(EnvConfig):
     """Keyword arguments of environments whose actions are via-points and a duration."""
 
     n_via: int = 1
-    """Number of via-points of an action."""
     timing: Timing = "optimal"
-    """`optimal` passage times, or `learned` ones as part of the action."""
 
     def _action_layout(self, dimension: int) -> ActionLayout:
         return ActionLayout(
@@ -120,13 +110,12 @@ class ViaPointConfig(EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityConfig(EnvConfig):
-    """Keyword arguments of environments whose actions are velocities."""
+    """Keyword arguments of :class:`~viapoint.envs.velocity_env.VelocityVectorEnv`."""
 
     weights_kind = StepRewardWeights
     stepwise = True
 
     control_step: float = 0.04
-    """Time for which an action holds, [s]."""
 
     def task(self) -> Task:
         """Return the task that these arguments describe; see :meth:`EnvConfig.task`."""
@@ -138,22 +127,17 @@ class VelocityConfig(EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplanningConfig(ViaPointConfig):
-    """Keyword arguments of environments whose plans are revised during the movement."""
+    """Keyword arguments of :class:`~viapoint.envs.replanning_env.ReplanningVectorEnv`."""
 
     weights_kind = ReplanningRewardWeights
     replanning = True
 
     n_obstacles: int | tuple[int, int] = 0
     moving_obstacles: bool = False
-    """True if the obstacles move."""
     n_jumps: int | tuple[int, int] = 0
-    """Number of jumps of the target, or the fewest and the most."""
     decide_at: Sequence[Trigger] = TRIGGERS
-    """Events that end a decision: some of `horizon`, `target`, `course`, `clearance`."""
     horizon: float = 0.3
-    """Time after which a decision ends, [s]."""
     margin: float = 0.02
-    """Predicted clearance below which a decision ends, [m]."""
 
     def task(self) -> Task:
         """Return the task that these arguments describe; see :meth:`EnvConfig.task`."""

@@ -109,6 +109,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
         n_via: Number of via-points of an action.
         n_obstacles: Number of obstacles, or the fewest and the most.
+        shapes: Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length.
         uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement, [s].
@@ -269,11 +270,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return self.transition(actions).as_step()
 
     def transition(self, actions: Any) -> Transition:
-        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result.
-
-        Args:
-            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
-        """
+        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
         rows, everyone = np.arange(self.num_envs), np.ones(self.num_envs, dtype=bool)
         # The next scenes depend on no outcome, so they are drawn during the physics.
         (observation, reward, info), following = self._execute(

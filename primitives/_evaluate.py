@@ -30,17 +30,9 @@ _FEW = 8
 
 
 def _power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:
-    """Return the transposed basis of Eq. 1.
+    """Return the transposed basis of Eq. 1, (..., (degree + 1) S, T); see `evaluate` for the arguments.
 
-    Args:
-        time: (..., T) [s], within the movement.
-        starts: (..., S) start time of each segment [s].
-        rates: (..., S) reciprocal durations [1/s].
-        degree: highest power, at least 1.
-        xp: namespace.
-
-    Returns:
-        (..., (degree + 1) S, T); row k S + s is u_s^k where segment s is current, else 0.
+    Row k S + s is u_s^k where segment s is current, else 0.
     """
     local = (time[..., None, :] - starts[..., None]) * rates[..., None]
     current = xp.ones_like(local)

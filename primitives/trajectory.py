@@ -81,14 +81,7 @@ class Trajectory:
     def from_segments(
         cls, coefficients: Array, durations: Array, xp: Namespace, *, some_empty: bool = False
     ) -> Trajectory:
-        """Return a trajectory of joined segments.
-
-        Args:
-            coefficients: (..., 2 order, S, D) [m].
-            durations: (..., S) [s].
-            xp: namespace.
-            some_empty: durations may be 0, where a via-point equals its neighbour.
-        """
+        """Return a trajectory of joined segments; with `some_empty`, durations may be 0 between equal points."""
         order = coefficients.shape[-3] // 2
         if durations.shape[-1] == 1:
             return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
@@ -357,12 +350,7 @@ def require_trajectory(value: object) -> None:
 def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
     """Return the least-cost trajectory through all waypoints at fixed times.
 
-    Args:
-        xp: namespace.
-        order: m.
-        waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S), positive, or 0 between equal waypoints; may be shared by the batch [s].
-        states: per knot, its derivatives (see States).
+    The arguments are those of `least_cost_coefficients`; durations may be 0 between equal waypoints.
     """
     durations = 1.0 * durations  # a copy of its own
     some_empty = bool((durations <= 0).any())

@@ -116,11 +116,7 @@ def _rim(number: int) -> Float:
 
 
 def cover_points(points: Float, tolerance: float) -> list[Capsule]:
-    """Return capsules and spheres that together contain the convex hull of points.
-
-    Args:
-        points: Shape (n, 3), [m].
-        tolerance: Greatest distance of a point of the capsules from the hull, [m].
+    """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
     Raises:
         ValueError: More than MOST_CAPSULES capsules are needed.

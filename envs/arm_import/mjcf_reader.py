@@ -275,10 +275,7 @@ def _symmetric_limit(limits: Float) -> float:
 def _isolate(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
     """Return the model without actuators, constraints and sensors, all other joints fixed as in the first keyframe.
 
-    Args:
-        spec: Model of the file, which is changed.
-        joints: Joints of the arm.
-        whole: Compiled model of the whole file.
+    The model of the file, `spec`, is changed; `whole` is the compiled model of the whole file.
     """
     for part in (
         *spec.actuators, *spec.equalities, *spec.sensors, *spec.tendons, *spec.keys, *spec.excludes, *spec.pairs,

@@ -178,13 +178,8 @@ class Feasibility:
 def fit_feasible_table(check: Feasibility, box: Box, required: Float) -> IKTable:
     """Return an inverse-kinematics table that is feasible in its whole box, in a smaller box where necessary.
 
-    Args:
-        check: Feasibility of the arm.
-        box: Reach, [m].
-        required: Two corners of the part of the box that must remain, shape (2, 3), [m].
-
     Raises:
-        ValueError: No such table exists.
+        ValueError: No box around the corners `required`, shape (2, 3), [m], has such a table.
     """
     while True:
         table = fit_ik_table(check.chain, check.hand_offset, check.home, box)
@@ -216,13 +211,7 @@ def infeasible_positions(table: IKTable, check: Feasibility) -> Float:
 
 
 def check_strength(parsed: ParsedMjcf, chain: Chain, joints: Float, places: Sequence[str]) -> None:
-    """Check that the joints can hold the arm against gravity.
-
-    Args:
-        parsed: Arm with its torque limits.
-        chain: Chain with its masses.
-        joints: Configurations, shape (N, J), [rad].
-        places: Descriptions of these configurations for the error, N of them.
+    """Check that the joints can hold the arm against gravity in configurations (N, J), [rad], described by `places`.
 
     Raises:
         ValueError: A joint is too weak; the message names it with its limit and the torque that it needs.

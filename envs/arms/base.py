@@ -218,13 +218,7 @@ class CollisionModel:
     ) -> Float:
         """Return the clearance from each obstacle, which may move, at each time, shape (N, T, n).
 
-        Without joint angles, as for a plan, :meth:`with_self_clearance` applies to arms that may touch themselves.
-
-        Args:
-            hand: Hand positions, shape (N, T, D), [m].
-            obstacles: Obstacles at these times, shape (N, T, n, 2 D + 1), [m].
-            present: True for rows that are obstacles, shape (N, n).
-            joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
+        The arguments are those of :meth:`least_clearance`, but obstacles have a time axis: shape (N, T, n, 2 D + 1).
         """
         number, times, most = obstacles.shape[:3]
         if not obstacles.size or not present.any():

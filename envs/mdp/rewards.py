@@ -15,7 +15,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Outcome
+from viapoint.envs.sim.outcome import Outcome, straight_jerk_cost
 
 CLEARANCE_RANGE = (-0.05, 0.01)
 """Range in which clearance changes the reward, [m]."""
@@ -165,7 +165,7 @@ def replanning_rewards(
     """
     low, high = CLEARANCE_RANGE
     kept, lost = (np.clip(each.planned_clearance, low, high) / CLEARANCE_UNIT for each in (after, before))
-    straight = 360.0 * norm(scenes.goal - scenes.start) ** 2 / centre_duration**5  # half of 720 A^2/T^5
+    straight = straight_jerk_cost(norm(scenes.goal - scenes.start), centre_duration)
     rough = np.log1p(after.jerk_cost / straight) - np.log1p(before.jerk_cost / straight)
     far = np.minimum(after.goal_error / GOAL_ERROR_UNIT, 1.0)
     return RewardTerms(
@@ -199,16 +199,8 @@ def step_rewards(
 
     Over an episode the terms of a success sum to those of a whole movement with the same outcome, and the progress to
     its weight. Clearance and goal error are given when they change, the others at the end; smoothness and duration
-    count where the hand arrived only, as a movement that ends early would seem the smoothest and quickest.
-
-    Args:
-        before: Metrics before the step.
-        after: Metrics after the step.
-        ended: True if the episode ended, shape (N,).
-        begun: True for the first step of an episode, shape (N,).
-        scenes: Scenes of the N episodes.
-        centre_duration: Duration of the zero action of a whole movement, [s].
-        weights: Weights of the terms.
+    count where the hand arrived only, as a movement that ends early would seem the smoothest and quickest. The
+    arguments are those of :func:`replanning_rewards`, with a control step for a decision.
     """
     whole = reward_terms(after, centre_duration, weights)
     low, high = CLEARANCE_RANGE

@@ -37,12 +37,7 @@ def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
 def frame_steps(time: Float, fps: int) -> Int:
     """Return the states of a movement that the frames of its film show, evenly in time from start to end.
 
-    Args:
-        time: Times of the physics steps, shape (T,), [s], evenly spaced, the first one step after the start.
-        fps: Frames per second.
-
-    Returns:
-        Indices in [0, T], where 0 is the start, shape (F,), F = round(time[-1] fps) + 1.
+    For the times of T physics steps, [s], these are round(time[-1] fps) + 1 indices in [0, T], where 0 is the start.
     """
     count = round(float(time[-1]) * fps)
     return np.round(np.linspace(0, len(time), count + 1)).astype(np.int64)

@@ -167,13 +167,7 @@ class Episodes:
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        num_envs: int,
-        *,
-        timestep: float,
-        max_steps: int,
-        records: Mapping[str, Mapping[str, Any]],
+        self, arm: Arm, num_envs: int, *, timestep: float, max_steps: int, records: Mapping[str, Any]
     ) -> None:
         self.arm, self.timestep = arm, timestep
         n, j, d = num_envs, len(arm.joint_range), arm.dimension

@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
     """Factor by which the movement was slowed down for the arm's limits, 1 or more."""
 
 
-def straight_jerk_cost(length: Float, duration: Float) -> Float:
+def straight_jerk_cost(length: Float, duration: Float | float) -> Float:
     """Return the jerk cost of straight minimum-jerk movements from rest to rest, [m^2/s^5].
 
     Half the integral of the squared jerk is 360 A^2 / T^5 for length A and duration T.

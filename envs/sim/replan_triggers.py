@@ -67,15 +67,7 @@ class Ends(NamedTuple):
 
 
 class ReplanTriggers:
-    """Predictor of the ends of decisions.
-
-    Args:
-        collision_model: Arm that moves.
-        timestep: Length of a physics step, [s].
-        triggers: Events that end a decision before the goal.
-        horizon: Longest decision, [s].
-        margin: Predicted clearance below which a decision ends, [m].
-        time_limit: Time limit of an episode, [s].
+    """Predictor of the ends of decisions; see :class:`~viapoint.envs.replanning_env.ReplanningVectorEnv`.
 
     Raises:
         ValueError: There is no such trigger, or horizon or margin are too small.

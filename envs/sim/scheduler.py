@@ -42,17 +42,8 @@ class Scheduler:
     ) -> tuple[list[Measured], Future[Result] | None]:
         """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
 
-        With one group there is nothing to overlap, and all stages run on the calling thread.
-
-        Args:
-            groups: Inputs of the first stage.
-            build_references: First stage.
-            simulate: Second stage.
-            measure: Third stage, a function of the results of both.
-            meanwhile: Independent job that may run during the physics.
-
-        Returns:
-            The results of the last stage, and the future of the independent job.
+        With one group there is nothing to overlap, and all stages run on the calling thread. The independent job
+        `meanwhile` may run during the physics; its future is returned with the results of the last stage.
         """
         submit = self.submit if len(groups) > 1 else _run_now
         references = [submit(build_references, group) for group in groups]

@@ -227,14 +227,8 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
 def attach_gradient(fractions: Array, waypoints: Array, ends: list[Any], xp: Namespace) -> Array:
     """Return the fractions (..., S), differentiable with respect to waypoints and boundary values.
 
-    Movements with a dropped via-point get the gradient zero.
-
-    Args:
-        fractions: (..., S) fractions of the duration.
-        waypoints: (..., S + 1, D).
-        ends: start velocity and acceleration, goal velocity and acceleration in unit time: (..., D), None or
-            FREE.
-        xp: namespace.
+    Movements with a dropped via-point get the gradient zero. `ends` are the four boundary values in unit time,
+    (..., D) each, None or FREE.
     """
     segments = fractions.shape[-1]
     if segments == 1:
