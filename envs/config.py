@@ -15,7 +15,7 @@ import numpy as np
 
 from viapoint.envs.actions.via_points import ActionLayout, Timing
 from viapoint.envs.arms import ADULT, Arm, arm_of
-from viapoint.envs.common.validation import fewest_and_most, refuse_unknown
+from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.mdp.rewards import ReplanningRewardWeights, RewardWeights, StepRewardWeights
 from viapoint.envs.mdp.task import Task, distribution_of
@@ -53,17 +53,18 @@ class EnvConfig:
             TypeError: There is no such argument.
         """
         known = [field.name for field in dataclasses.fields(cls)]
-        refuse_unknown({name: kwargs[name] for name in kwargs if name not in known}, known)
+        if unknown := sorted(kwargs.keys() - set(known)):
+            raise TypeError(
+                f"unknown keyword argument {', '.join(map(repr, unknown))}; allowed are {', '.join(known)}"
+            )
         return cls(**kwargs)
 
     @classmethod
     def signature(cls) -> inspect.Signature:
         """Return the signature of a vector environment with these keyword arguments."""
-        kind = inspect.Parameter.KEYWORD_ONLY
+        named = inspect.signature(cls).parameters.values()
         number = inspect.Parameter("num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1)
-        fields = dataclasses.fields(cls)
-        named = [inspect.Parameter(f.name, kind, default=f.default, annotation=f.type) for f in fields]
-        workers = inspect.Parameter("workers", kind, default=0, annotation="int")
+        workers = inspect.Parameter("workers", inspect.Parameter.KEYWORD_ONLY, default=0, annotation="int")
         return inspect.Signature([number, *named, workers])
 
     def task(self) -> Task:

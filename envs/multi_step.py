@@ -46,10 +46,6 @@ class MultiStepVectorEnv(ReachVectorEnv):
             last, observation = observation, self.observe()
         return Transition(observation, reward, self.terminated.copy(), self.truncated.copy(), info, last)
 
-    def state(self) -> dict[str, Any]:
-        """Return scenes, episodes, random generators and counters; see :meth:`ReachVectorEnv.state`."""
-        return {**super().state(), "episodes": self.episodes_state()}
-
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same kind and number."""
         super().restore(state)

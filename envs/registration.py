@@ -68,14 +68,10 @@ ENV_IDS = (*TASKS, *OWN_ARM_TASKS, *STEP_TASKS, *REPLANNING_TASKS)
 
 def register_all() -> None:
     """Register every id with Gymnasium; a second call changes nothing."""
+    own_arm, step = ({a: TASKS[b] for a, b in shared.items()} for shared in (OWN_ARM_TASKS, STEP_TASKS))
     tables = (
-        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS),
-        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", {a: TASKS[b] for a, b in OWN_ARM_TASKS.items()}),
-        (
-            "velocity_env:VelocityEnv",
-            "velocity_env:VelocityVectorEnv",
-            {a: TASKS[b] for a, b in STEP_TASKS.items()},
-        ),
+        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS | own_arm),
+        ("velocity_env:VelocityEnv", "velocity_env:VelocityVectorEnv", step),
         ("replanning_env:ReplanningEnv", "replanning_env:ReplanningVectorEnv", REPLANNING_TASKS),
     )
     for single, batch, table in tables:

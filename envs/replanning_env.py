@@ -251,10 +251,10 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         rows, now = np.flatnonzero(revised), self._episodes.now
         if not rows.size:
             return
-        scaled = self._stages.scale_time(take(plan, rows))
-        now.reachable[rows] &= scaled.reachable
-        now.stretch[rows] = np.maximum(now.stretch[rows], scaled.stretch)
-        put(self._plan, rows, scaled.plan)
+        plan, (stretch, within) = self._stages.scale_time(take(plan, rows))
+        now.reachable[rows] &= within
+        now.stretch[rows] = np.maximum(now.stretch[rows], stretch)
+        put(self._plan, rows, plan)
         self._plan_start.step[rows], self._plan_start.begun[rows] = now.steps[rows], True
         times = self._episodes.time
         for row in rows:

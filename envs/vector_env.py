@@ -297,8 +297,12 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "generators": [generator.bit_generator.state for generator in self.generators],
             "scenes": self._check_running().as_options(),
             "physics_steps": self.physics_steps,
-            "episodes": None,
+            "episodes": self.episodes_state(),
         }
+
+    def episodes_state(self) -> dict[str, Any] | None:
+        """Return the state of episodes of several steps, without their scenes; None for episodes of one."""
+        return None
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same kind and number."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -20,7 +20,6 @@ from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.episode_state import Episodes, Segment
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
-from viapoint.envs.sim.simulator import SimulationLog
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
@@ -56,19 +55,6 @@ class StepObservationLayout(ObservationLayout):
             "time_left": np.clip(self.time_limit - time, 0.0, self.time_limit)[:, None],
         }
         return {**observation, **{name: part.astype(np.float32) for name, part in parts.items()}}
-
-
-class StepReferences(NamedTuple):
-    """References of one control step for the n episodes that stay within reach."""
-
-    rows: Int
-    """Episodes, shape (n,)."""
-    motion: Motion
-    """References at the beginning and after each physics step, shape (n, S + 1, D) each."""
-    controls: Float
-    """Actuator controls, shape (n, S, U)."""
-    jerk_cost: Float
-    """Jerk cost of the references, shape (n,), [m^2/s^5]."""
 
 
 class VelocityVectorEnv(MultiStepVectorEnv):
@@ -154,10 +140,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         scenes, episodes = self._check_running(), self._episodes
         actions = checked_actions(actions, self.num_envs, self.action_names)
         before, first = self._outcome(scenes), episodes.now.steps == 0
-        velocity = self.steering.decode(actions, scenes.start, scenes.goal)
-        references = self._build_references(velocity)
-        if references.rows.size:
-            self._measure(references, self._simulator.rollout(references.rows, references.controls))
+        self._advance(self.steering.decode(actions, scenes.start, scenes.goal))
         after = self._outcome(scenes)
         self.terminated = after.is_success | after.collision | ~after.reachable | after.unstable
         over = episodes.now.steps >= self.control_steps * self.steering.physics_steps
@@ -172,23 +155,19 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         info = {**after._asdict(), **terms.as_info(), "reward_progress": progress}
         return Decision(self.observe(), terms.total() + progress, info)
 
-    def _build_references(self, velocity: Float) -> StepReferences:
-        """Return references and controls of one control step; where they leave the reach, the arm stays."""
+    def _advance(self, velocity: Float) -> None:
+        """Follow a velocity for one control step; where the references leave the reach, the arm stays."""
+        assert self.scenes is not None
         motion = self.steering.follow(self._motion, velocity)
-        cost = self.steering.jerk_cost(self._motion, velocity)
         reachable = (np.asarray(self.arm.reach_margin(motion.position)) >= 0.0).all(axis=-1)
         self._episodes.now.reachable[:] = reachable
         rows = np.flatnonzero(reachable)
-        some = take(motion, rows)
-        controls = self.arm.controls(*(part[:, :-1] for part in some)) if rows.size else np.zeros((0, 0, 0))
-        return StepReferences(rows, some, controls, cost[rows])
-
-    def _measure(self, references: StepReferences, log: SimulationLog) -> None:
-        """Add one control step to the episodes."""
-        assert self.scenes is not None
-        rows, motion, _, cost = references
-        scenes, planned = self.scenes.take(rows), motion.position[:, 1:]
-        number = log.joints.shape[1]
+        if not rows.size:
+            return
+        cost = self.steering.jerk_cost(self._motion, velocity)[rows]
+        motion, scenes = take(motion, rows), self.scenes.take(rows)
+        log = self._simulator.rollout(rows, self.arm.controls(*(part[:, :-1] for part in motion)))
+        number, planned = log.joints.shape[1], motion.position[:, 1:]
         hand = np.asarray(self.arm.hand_position(log.joints))
         obstacles, present = scenes.obstacles, scenes.present
         model = self.task.collision_model

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, cast
 
@@ -69,15 +69,6 @@ def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> fl
     if not is_number(value) or not least <= float(value) < np.inf:
         raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
     return float(value)
-
-
-def refuse_unknown(unknown: Mapping[str, Any], known: Iterable[str]) -> None:
-    """Raise TypeError for unknown keyword arguments; the message lists the known ones."""
-    if unknown:
-        allowed = [name for name in known if name not in ("num_envs", "unknown", "return")]
-        raise TypeError(
-            f"unknown keyword argument {', '.join(map(repr, sorted(unknown)))}; allowed are {', '.join(allowed)}"
-        )
 
 
 def reset_options(options: Any) -> dict[str, Any]:

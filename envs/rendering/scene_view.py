@@ -183,9 +183,8 @@ class SceneView:
             centre = np.array([*centre[:2], 0.5 * (self._floor + top)])
             half = np.array([*half[:2], 0.5 * (top - self._floor)])
         for geom in shape.from_box(centre, quaternion, half).geoms():
-            shapes.geom(
-                geom.type, geom.size, geom.position, np.stack(rotation_axes(geom.quaternion), axis=-1), colour
-            )
+            turn = np.stack(rotation_axes(geom.quaternion), axis=-1)
+            shapes.geom(geom.type, geom.size, geom.position, colour, turn=turn)
 
     def _draw_movement(self, shapes: ShapeWriter, movement: Movement, step: int) -> None:
         """Draw the planned path, its via-points, and the executed path up to `step`, red after the first contact."""

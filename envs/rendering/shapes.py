@@ -30,18 +30,18 @@ class ShapeWriter:
 
     def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
         """Add a sphere at `centre` (3,) [m]."""
-        self._add(Shape.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+        self.geom(Shape.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
 
     def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
         """Add a flat cylinder that stands on `centre` (3,) [m]."""
         middle = np.array([*centre[:2], centre[2] + height / 2.0])
-        self._add(Shape.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
+        self.geom(Shape.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
 
     def rod(
         self, first: Float, second: Float, radius: float, colour: Colour, glow: float = MATT
     ) -> Geom | None:
         """Add a capsule from `first` (3,) to `second` (3,) [m]."""
-        geom = self._add(Shape.mjGEOM_CAPSULE, (radius,) * 3, first, colour, glow)
+        geom = self.geom(Shape.mjGEOM_CAPSULE, (radius,) * 3, first, colour, glow)
         if geom is not None:
             mujoco.mjv_connector(geom, Shape.mjGEOM_CAPSULE, radius, first, second)
         return geom
@@ -63,7 +63,7 @@ class ShapeWriter:
         vault = VAULT * radius
         self.disc(foot, radius, top - vault - foot[2], colour)
         head = np.array([*foot[:2], top - vault])
-        self._add(Shape.mjGEOM_ELLIPSOID, (radius, radius, vault), head, colour, MATT)
+        self.geom(Shape.mjGEOM_ELLIPSOID, (radius, radius, vault), head, colour)
 
     def wall(self, foot: Float, half_axis: Float, top: float, radius: float, colour: Colour) -> None:
         """Add a rounded wall about `foot` (3,) along `half_axis` (3,), up to the height `top` [m]."""
@@ -76,21 +76,18 @@ class ShapeWriter:
         along = half_axis / half
         turn = np.stack((along, (-along[1], along[0], 0.0), (0.0, 0.0, 1.0)), axis=-1)
         middle = np.array([*foot[:2], (foot[2] + crest) / 2.0])
-        self._add(Shape.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, MATT, turn)
+        self.geom(Shape.mjGEOM_BOX, (half, radius, (crest - foot[2]) / 2.0), middle, colour, turn=turn)
 
-    def geom(self, kind: int, size: tuple[float, ...], centre: Float, turn: Float, colour: Colour) -> None:
-        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; the columns of `turn` (3, 3) are its axes."""
-        self._add(kind, size, centre, colour, MATT, turn)
-
-    def _add(
+    def geom(
         self,
         kind: int,
         size: tuple[float, ...],
         centre: Float,
         colour: Colour,
-        glow: float,
+        glow: float = MATT,
         turn: Float | None = None,
     ) -> Geom | None:
+        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; the columns of `turn` (3, 3) are its axes."""
         if self._scene.ngeom >= self._scene.maxgeom:
             return None
         geom = self._scene.geoms[self._scene.ngeom]

@@ -17,7 +17,7 @@ from viapoint.envs.sim.episode_state import Segment
 from viapoint.envs.sim.executor import GROUP
 from viapoint.envs.sim.outcome import sum_in_order
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
-from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
+from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, TimeScale, required_time_scale
 
 PROLONGED, ENOUGH = 6, 1.002
 """Greatest number of times that a plan in motion is prolonged, and the remaining factor that needs no further one."""
@@ -34,17 +34,6 @@ def groups_of(steps: Int) -> list[Int]:
             groups.append([])
         groups[-1].append(int(index))
     return [np.sort(np.array(group)) for group in groups]
-
-
-class ScaledPlan(NamedTuple):
-    """Plans in motion that are slow enough for the arm."""
-
-    plan: MovingPlan
-    """N plans with scaled durations."""
-    stretch: Float
-    """Factor by which each was slowed down, shape (N,)."""
-    reachable: Bool
-    """True where the plan stays within the arm's reach, shape (N,)."""
 
 
 class Decisions(NamedTuple):
@@ -92,8 +81,8 @@ class ReplanningExecutor:
     def __init__(self, simulator: Simulator) -> None:
         self.simulator, self.arm = simulator, simulator.arm
 
-    def scale_time(self, plan: MovingPlan) -> ScaledPlan:
-        """Slow plans down where the arm's limits require it.
+    def scale_time(self, plan: MovingPlan) -> tuple[MovingPlan, TimeScale]:
+        """Return plans that are as slow as the arm's limits require, and their time scaling.
 
         Scaling the time of a plan that begins in motion would change its initial velocity. Its total duration is
         prolonged instead, which changes its path, and prolonged again where that is not enough.
@@ -111,7 +100,7 @@ class ReplanningExecutor:
             rows, again = rows[again > ENOUGH], again[again > ENOUGH]
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
-        return ScaledPlan(slower, stretch, within & self._reachable(slower))
+        return slower, TimeScale(stretch, within & self._reachable(slower))
 
     def build_references(self, decisions: Decisions) -> DecisionReferences:
         """Sample one group at the physics rate and compute the controls that track the plans."""
