@@ -224,15 +224,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def draw_episodes(
         self, seed: int | Sequence[int | None] | None, rows: Int, options: Mapping[str, Any]
     ) -> NextEpisodes:
-        """Draw the next episodes of some environments; the running ones go on.
+        """Draw the next episodes of the environments `rows`; the running ones go on.
 
-        Args:
-            seed: Seeds of all environments, see :meth:`reset`.
-            rows: Environments, shape (n,).
-            options: Options of :meth:`reset` without `reset_mask`, one entry for each row where they are batched.
-
-        Raises:
-            ValueError: A given scene is impossible.
+        Seeds and options are those of :meth:`reset`, without `reset_mask`; batched options have an entry for each row.
         """
         seeded, first_seed = self._seeded(seed, rows)
         return NextEpisodes(rows, self._draw(seeded, rows, options), seeded, first_seed)

@@ -86,14 +86,9 @@ class ReplanningDecoder:
         """Shortest revised movement; a plan with less time left is not revised, [s]."""
 
     def default(self, plan: MovingPlan, time: Float, begun: Bool, start: Float, goal: Float) -> NominalPlan:
-        """Return the plans of zero actions.
+        """Return the plans of zero actions, `time` after the beginning of N movements under way, shape (N,), [s].
 
-        Args:
-            plan: N movements under way.
-            time: Time since they began, shape (N,), [s].
-            begun: True if they have begun, shape (N,).
-            start: Starts of the episodes, shape (N, D), [m].
-            goal: Present goals, shape (N, D), [m].
+        The other arguments are parts of the result, see :class:`NominalPlan`.
         """
         trajectory, end, number = plan.trajectory(), plan.duration, self.layout.n_via
         changed = (plan.waypoints[:, -1] != goal).any(axis=-1)

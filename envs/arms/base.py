@@ -20,8 +20,9 @@ SELF_MARGIN = 0.002
 class Arm(Protocol):
     """Arm: its size and reach, forward and inverse kinematics, and the controls that track a movement.
 
-    The functions are batched over leading dimensions and accept NumPy arrays and torch tensors. Positions are in the
-    frame of the arm's base, which is the world.
+    The functions are batched over leading dimensions and accept NumPy arrays and torch tensors. Joint angles have shape
+    (..., J), [rad]; hand positions have shape (..., D), [m], in the frame of the arm's base, which is the world.
+    Movements are positions, velocities, [m/s], and accelerations, [m/s^2], of the hand at T times, shape (..., T, D).
 
     Example:
         >>> import numpy as np
@@ -94,27 +95,16 @@ class Arm(Protocol):
         """
 
     def hand_position(self, joints: Array) -> Array:
-        """Return the hand's position by forward kinematics, shape (..., D), [m].
-
-        Args:
-            joints: Joint angles, shape (..., J), [rad].
-        """
+        """Return the hand's position by forward kinematics, shape (..., D), [m]."""
 
     def links(self, joints: Array) -> Array:
-        """Return both ends of the axis of each capsule, equal for spheres, shape (..., L, 2, D), [m].
-
-        Args:
-            joints: Joint angles, shape (..., J), [rad].
-        """
+        """Return both ends of the axis of each capsule, equal for spheres, shape (..., L, 2, D), [m]."""
 
     def self_clearance(self, joints: Array) -> Array:
         """Return the least clearance of the arm from itself and the table, shape (...,), [m]; at most MAX_CLEARANCE.
 
         It is negative exactly where the simulated arm is in contact without obstacles. Links that may touch one another
         do not count.
-
-        Args:
-            joints: Joint angles, shape (..., J), [rad].
         """
 
     def planned_self_clearance(self, links: Array) -> Array:
@@ -131,9 +121,6 @@ class Arm(Protocol):
 
         Each position has one configuration, which depends on it smoothly. Positions out of reach give angles of a
         position nearby, not an error; check :meth:`reach_margin`.
-
-        Args:
-            hand: Hand positions, shape (..., D), [m].
         """
 
     def reach_margin(self, hand: Array) -> Array:
@@ -142,19 +129,13 @@ class Arm(Protocol):
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the factor by which a movement's duration must grow to keep the arm's limits, shape (...,), 1 or more.
 
-        Args:
-            position: Hand positions at T times, not necessarily evenly spaced, shape (..., T, D), [m].
-            velocity: Hand velocities, shape (..., T, D), [m/s].
-            acceleration: Hand accelerations, shape (..., T, D), [m/s^2].
+        The times need not be evenly spaced.
         """
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the actuator controls that make the hand follow references, shape (..., T, U).
 
-        Args:
-            position: Hand positions at T consecutive physics steps, shape (..., T, D), [m].
-            velocity: Hand velocities, shape (..., T, D), [m/s].
-            acceleration: Hand accelerations, shape (..., T, D), [m/s^2].
+        The times are consecutive physics steps.
         """
 
 

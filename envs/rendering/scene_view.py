@@ -12,7 +12,7 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns, shape_number
+from viapoint.envs.geometry.rows import rotation_axes, shape_columns, shape_number
 from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.envs.rendering.shapes import GLOWING, ShapeWriter, resampled
@@ -158,13 +158,12 @@ class SceneView:
         dimension, top = self.arm.dimension, TALL if self.whole_arm else LOW
         for row in np.flatnonzero(scene.present[0]):
             numbers = scene.obstacles[0, row]
-            kind, *_ = shape_columns(numbers)
-            if has_shapes(numbers) and kind != shape_number("capsule"):
-                self._draw_shape(shapes, numbers, PALETTE.contact if row == in_contact else PALETTE.obstacle)
+            colour: Colour = PALETTE.contact if row == in_contact else PALETTE.obstacle
+            if shape_columns(numbers).kind != shape_number("capsule"):
+                self._draw_shape(shapes, numbers, colour)
                 continue
             centre, radius = in_space(numbers[:dimension], self._floor), float(numbers[-1])
             half_axis = in_space(numbers[dimension : 2 * dimension], 0.0)
-            colour: Colour = PALETTE.contact if row == in_contact else PALETTE.obstacle
             if dimension == 3 and half_axis.any():
                 shapes.rod(centre - half_axis, centre + half_axis, radius, colour)
             elif dimension == 3:

@@ -112,15 +112,10 @@ class Simulator:
     def rollout_among_moving(
         self, sims: NDArray[np.int64], controls: Float, places: Float, steps: NDArray[np.int64]
     ) -> SimulationLog:
-        """Run simulations under controls among moving obstacles, each for its own number of steps.
+        """Run simulations as :meth:`rollout`, each for its own number of `steps`, 1 to T, among moving obstacles.
 
-        All run for the greatest number of steps; then each is set back to its state after its own steps.
-
-        Args:
-            sims: The simulations in increasing order, shape (n,).
-            controls: Shape (n, T, U).
-            places: Centres of the obstacles before each step, NaN for absent ones, shape (n, T, rows, D), [m].
-            steps: Physics steps of each simulation, 1 to T, shape (n,).
+        All run for T steps; then each is set back to its state after its own steps. The centres of the obstacles before
+        each step, `places`, have shape (n, T, rows, D), [m]; those of absent ones are NaN.
         """
         number = controls.shape[1]
         warnings = self._warnings(sims)
