@@ -1,4 +1,4 @@
-"""Base classes of environments whose episodes are several steps."""
+"""Base class of environments whose episodes are several steps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Observation
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import Rollout
-from viapoint.envs.single_env import ReachEnv
 from viapoint.envs.vector_env import ReachVectorEnv, Transition
 
 
@@ -22,15 +20,7 @@ class MultiStepVectorEnv(ReachVectorEnv):
     A subclass defines one step in `execute_actions`, which sets `terminated` and `truncated`.
     """
 
-    terminated: Bool
-    """True where the last step terminated the episode, shape (num_envs,)."""
-    truncated: Bool
-    """True where the last step truncated the episode, shape (num_envs,)."""
     _episodes: Episodes
-
-    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
-        super().__init__(num_envs, **kwargs)
-        self.terminated, self.truncated = np.zeros((2, self.num_envs), dtype=bool)
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
@@ -78,30 +68,3 @@ class MultiStepVectorEnv(ReachVectorEnv):
     @abstractmethod
     def _film(self, sim: int, scene: Any) -> Any:
         """Render the running episode of one environment."""
-
-
-class MultiStepEnv(ReachEnv):
-    """One environment of a :class:`MultiStepVectorEnv`."""
-
-    batch: MultiStepVectorEnv
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self._over = True
-
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`."""
-        result = super().reset(seed=seed, options=options)
-        self._over = False
-        return result
-
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Make one step; see :meth:`ReachEnv.step`."""
-        if self._over:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        observation, reward, _, _, info = super().step(action)
-        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
-        self._over = terminated or truncated
-        return observation, reward, terminated, truncated, info

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import RecordVideo
 
-from viapoint.envs.multi_step import MultiStepEnv
+from viapoint.envs.multi_step import MultiStepVectorEnv
 
 EVERY_FRAME = "rgb_array_list"
 """Render mode that returns all frames of a movement."""
@@ -50,5 +50,5 @@ class RecordMovements(RecordVideo[Any, Any]):
         frames: Any = self.env.render()
         self.recorded_frames.extend(frames[self._shown :])
         # In episodes of several steps, each step returns the frames from the beginning of the episode.
-        if isinstance(self.env.unwrapped, MultiStepEnv):
+        if isinstance(getattr(self.env.unwrapped, "batch", None), MultiStepVectorEnv):
             self._shown = len(frames)

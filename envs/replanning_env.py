@@ -17,7 +17,7 @@ from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import ReplanningObservationLayout
 from viapoint.envs.mdp.rewards import replanning_rewards
-from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
+from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
@@ -27,6 +27,7 @@ from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
+from viapoint.envs.single_env import ReachEnv
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 HISTORY_NAMES = ("time", *MovingPlan._fields)
@@ -326,7 +327,7 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         return self._renderer.episode(scene, self._history[sim], self._rollout(sim))
 
 
-class ReplanningEnv(MultiStepEnv):
+class ReplanningEnv(ReachEnv):
     """One environment of a :class:`ReplanningVectorEnv`, with the same keyword arguments.
 
     Example:

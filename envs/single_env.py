@@ -48,6 +48,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self.task = self.batch.task
         self.action_layout = self.batch.action_layout
         self.observation_layout = self.batch.observation_layout
+        self._over = True
 
     @property
     def last_rollout(self) -> Rollout | None:
@@ -78,22 +79,28 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         self.batch.use_generator(self._np_random, self._np_random_seed)
         observation, info = self.batch.reset(seed=seed, options=options)
         self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
+        self._over = False
         if self.render_mode == "human":
             self.batch.render()
         return _only(observation), info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Execute one movement, which ends the episode.
+        """Execute one action, see :meth:`ReachVectorEnv.step`; where it is a movement, it ends the episode.
 
         Args:
             action: Shape (m,), in [-1, 1]; components beyond are clipped.
         """
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
         shape: Any = self.action_space.shape
         given = real_numbers(action, shape)
         if given.shape != shape:
             raise ValueError(f"action must have shape {shape}, got {given.shape}")
         observation, reward, info = self.batch.execute_actions(given[None])
-        return _only(observation), float(reward[0]), True, False, {k: v[0].item() for k, v in info.items()}
+        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
+        self._over = terminated or truncated
+        values = {name: value[0].item() for name, value in info.items()}
+        return _only(observation), float(reward[0]), terminated, truncated, values
 
     def render(self) -> Any:
         """Render the last movement in the render mode; after a reset, the scene."""

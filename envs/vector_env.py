@@ -167,6 +167,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Random generators of the environments' scenes; empty before the first reset."""
         self.scenes: Scenes | None = None
         """Scenes of the running episodes; None before the first reset."""
+        self.terminated = np.ones(self.num_envs, dtype=bool)
+        """True where the last step terminated the episode, shape (num_envs,)."""
+        self.truncated = ~self.terminated
+        """True where the last step truncated the episode, shape (num_envs,)."""
         self._last: Execution | None = None
         self.action_names = self.action_layout.names
         self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
@@ -265,14 +269,16 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def transition(self, actions: Any) -> Transition:
         """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
-        rows, everyone = np.arange(self.num_envs), np.ones(self.num_envs, dtype=bool)
+        rows = np.arange(self.num_envs)
         # The next scenes depend on no outcome, so they are drawn during the physics.
         (observation, reward, info), following = self._execute(
             self._decode(actions), lambda: self._draw(self.generators, rows, {})
         )
         assert following is not None
         self._start(rows, following.result())
-        return Transition(self.observe(), reward, everyone, ~everyone, info, observation)
+        return Transition(
+            self.observe(), reward, self.terminated.copy(), self.truncated.copy(), info, observation
+        )
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and counters as values and arrays for :meth:`restore`.

@@ -16,10 +16,11 @@ from viapoint.envs.common.validation import checked_actions
 from viapoint.envs.config import VelocityConfig
 from viapoint.envs.mdp.observation import FARTHEST, ObservationLayout
 from viapoint.envs.mdp.rewards import StepRewardWeights, step_rewards
-from viapoint.envs.multi_step import MultiStepEnv, MultiStepVectorEnv
+from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.episode_state import Episodes, Segment
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
+from viapoint.envs.single_env import ReachEnv
 from viapoint.envs.vector_env import Decision, ReachVectorEnv
 
 
@@ -217,7 +218,7 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         return self._renderer.movement(scene, plan.take([sim]), self._rollout(sim))
 
 
-class VelocityEnv(MultiStepEnv):
+class VelocityEnv(ReachEnv):
     """One environment of a :class:`VelocityVectorEnv`, with the same keyword arguments.
 
     Example:

@@ -53,10 +53,6 @@ class MovingPlan(NamedTuple):
             self.waypoints, self.durations, start_velocity=self.velocity, start_acceleration=self.acceleration
         )
 
-    def states(self, time: Float) -> Motion:
-        """Return the commands at one time per plan, shape (N,), [s]."""
-        return Motion(*(part[:, 0] for part in self.trajectory().sample(time[:, None])))
-
 
 class NominalPlan(NamedTuple):
     """Plans that N hands follow on a zero action."""

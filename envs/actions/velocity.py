@@ -71,11 +71,6 @@ class Steering:
         return (f"{self.top_speed:g} m/s",) * self.dimension
 
     @property
-    def size(self) -> int:
-        """Number of components, D."""
-        return self.dimension
-
-    @property
     def physics_steps(self) -> int:
         """Physics steps S of a control step."""
         return round(self.control_step / self.timestep)

@@ -134,13 +134,6 @@ class Simulator:
         unstable = (self._warnings(sims) > warnings) & stopped | ~np.isfinite(joints[each, last]).all(axis=-1)
         return SimulationLog(joints, contact, unstable, None)
 
-    def data(self, sim: int, joints: Float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return model and data of one simulation with the arm at `joints`, for rendering."""
-        model, data = self.batch.get_model(sim), self.batch.get_data(sim)
-        data.qpos[:] = joints
-        mujoco.mj_forward(model, data)
-        return model, data
-
     def _warnings(self, sims: NDArray[np.int64]) -> Any:
         return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
 
