@@ -141,11 +141,7 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start new episodes; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`.
-
-        Raises:
-            ValueError: A given scene is impossible; the environments are unchanged.
-        """
+        """Start new episodes; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`."""
         options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         seeds = seeds_of(seed, self.num_envs)

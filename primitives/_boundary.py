@@ -22,15 +22,10 @@ def read_arguments(
     /,
     **required: Any,
 ) -> tuple[Namespace, list[Any], Ends]:
-    """Convert the arguments of a movement to one library and dtype.
+    """Convert the arguments of a movement to one library and dtype, see `as_floats`.
 
-    Args:
-        ends: values of END_NAMES; only the goal's may be FREE.
-        optional: further arguments by name, None where omitted.
-        **required: arrays by argument name.
-
-    Returns:
-        The namespace, the required and the optional arrays, and the boundary values by name.
+    `ends` are the values of END_NAMES, of which only the goal's may be FREE. They are returned by name, after the
+    namespace and the other arrays.
     """
     named = dict(zip(END_NAMES, ends, strict=True))
     optional = optional or {}

@@ -55,11 +55,7 @@ def multiply(p: Floats, q: Floats) -> Floats:
 
 
 def unit_size(array: Any, axis: tuple[int, ...]) -> tuple[Any, Any]:
-    """Scale an array to a size of about 1 along the axes, so that no square over- or underflows.
-
-    Returns:
-        The array times 2^-n, which is exact, and n.
-    """
+    """Return an array times 2^-n, of a size of about 1 along the axes, so that no square over- or underflows, and n."""
     exponent = np.frexp(np.abs(array).max(axis=axis, keepdims=True))[1]
     return np.ldexp(array, -exponent), exponent
 

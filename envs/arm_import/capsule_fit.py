@@ -55,13 +55,8 @@ def cover_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, tolerance:
     """Return capsules and spheres that together contain a geom, in the world's frame.
 
     Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
-    covered. Planes, height fields and other unbounded geoms have no capsules.
-
-    Args:
-        model: Model of the arm.
-        data: Positions of its parts.
-        geom: Index of the geom.
-        tolerance: Greatest distance of a point of the capsules from the geom, [m].
+    covered, with a distance of `tolerance`, [m], between capsules and geom at most. Planes, height fields and other
+    unbounded geoms have no capsules.
 
     Raises:
         ValueError: The geom needs more than MOST_CAPSULES capsules, or is flat.

@@ -189,13 +189,7 @@ def _write(
 ) -> mujoco.MjSpec:
     """Return the arm as a complete model: one body and hinge for each link, and its capsules.
 
-    Args:
-        parsed: Arm in the form of its file.
-        frames: Joint frames at angle 0.
-        origin: Point that becomes the origin, shape (3,), [m].
-        capsules: Links.
-        may_touch: Pairs of links, by their joints, between which contacts do not count.
-        hand_radius: Radius of the hand, [m].
+    A point `origin`, (3,), [m], becomes the origin. Contacts between pairs of links that `may_touch` do not count.
     """
     spec = read_spec(STAGE)
     spec.add_numeric(name="velocity_limit", data=parsed.velocity_limit, size=len(parsed.joints))

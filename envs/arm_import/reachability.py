@@ -87,7 +87,9 @@ class Feasibility:
         ]
         axes = [np.concatenate((each[0] - beyond[::-1], each, each[-1] + beyond)) for each in inner]
         positions = grid(axes)
-        feasible = self.positions_feasible(positions.reshape(-1, 3)).reshape(positions.shape[:3])
+        flat = positions.reshape(-1, 3)
+        joints = solve_inverse_kinematics(self.chain, self.hand_offset, self.home, flat)
+        feasible = self.feasible(flat, joints).reshape(positions.shape[:3])
         first, last = [len(beyond)] * 3, [len(beyond) + len(each) - 1 for each in inner]
         inside = tuple(slice(b, e + 1) for b, e in zip(first, last, strict=True))
         if not feasible[inside].all():
@@ -101,17 +103,10 @@ class Feasibility:
         _check_size(corners)
         return as_box(corners)
 
-    def positions_feasible(self, hand: Float) -> Bool:
-        """Return True for hand positions that are feasible, shape (N,)."""
-        return self.feasible(hand, solve_inverse_kinematics(self.chain, self.hand_offset, self.home, hand))
-
     def feasible(self, hand: Float, joints: Float, *, factor: float = 1.0) -> Bool:
         """Return True for configurations that put the hand at its position with all margins, shape (N,).
 
-        Args:
-            hand: Hand positions, shape (N, 3), [m].
-            joints: Configurations, shape (N, J), [rad].
-            factor: Factor by which margins may be smaller and rotations greater, 1 or more.
+        Margins may be smaller, and rotations greater, by a `factor` of 1 or more.
         """
         (error, rotation), (inside, above, apart) = self._errors(hand, joints), self._margins(joints)
         good = (error < HAND_TOLERANCE) & (rotation < ORIENTATION_TOLERANCE * factor)

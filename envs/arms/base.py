@@ -183,12 +183,8 @@ class CollisionModel:
     def with_self_clearance(self, least: Any, links: Any, time_axis: int | None = None) -> Any:
         """Return clearances from obstacles, negative where a planned arm comes closer than SELF_MARGIN to itself.
 
-        Elsewhere the clearance from itself does not count: it is small in many configurations that are safe.
-
-        Args:
-            least: Clearances from obstacles, with the shape of the result.
-            links: Planned axes of the capsules, shape (..., L, 2, D), [m].
-            time_axis: Axis of time over which the minimum is taken; None for the clearance at each time.
+        Elsewhere the clearance from itself does not count: it is small in many configurations that are safe. The
+        minimum is taken over `time_axis`, if that is given.
         """
         found = np.asarray(self.arm.planned_self_clearance(links)) - SELF_MARGIN
         found = found if time_axis is None else found.min(axis=time_axis)

@@ -38,14 +38,10 @@ class Canvas:
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, supersampling: int = 1) -> None:
-        """Open a context for pictures of a size, independent of the model's own offscreen size.
+        """Open a context for pictures of a size in pixels, independent of the model's own offscreen size.
 
-        Args:
-            model: Model to render; `vis.quality.offsamples` is its number of samples per pixel.
-            width: Width of a picture, in pixels.
-            height: Height of a picture, in pixels.
-            supersampling: Factor by which pictures are rendered larger in both directions, and then averaged. Samples
-                per pixel smooth the edges of bodies, but not those of shadows.
+        Pictures are rendered larger in both directions by the factor `supersampling`, and then averaged. The samples
+        per pixel, `vis.quality.offsamples` of the model, smooth the edges of bodies, but not those of shadows.
 
         Raises:
             GLUnavailableError: No OpenGL library can be used.

@@ -156,14 +156,9 @@ class EpisodeState(NamedTuple):
 
 
 class Episodes:
-    """Running episodes of N environments, which began at different times.
+    """Running episodes of N environments, which began at different times, of `max_steps` physics steps at most.
 
-    Args:
-        arm: Arm that moves.
-        num_envs: Number of environments N.
-        timestep: Length of a physics step, [s].
-        max_steps: Physics steps of an episode at most.
-        records: Further arrays by name, shape (N, ...) each, that belong to the state of the episodes.
+    `records` are further arrays by name, shape (N, ...) each, that belong to the state of the episodes.
     """
 
     def __init__(
