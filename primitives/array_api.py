@@ -87,7 +87,7 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
     xp, arrays = (np, _numpy_floats(named)) if plain else _foreign_floats(named)
     for name, array in zip(named, arrays, strict=True):
         if array is not None and array is not FREE and not (finite := xp.isfinite(array)).all():
-            require(xp, finite, name, array, "must be finite")
+            require(finite, name, array, "must be finite")
     return xp, arrays
 
 
@@ -152,7 +152,7 @@ def _foreign_floats(named: dict[str, Any]) -> tuple[Namespace, list[Any]]:
     return xp, arrays
 
 
-def require(xp: Namespace, holds: Array, name: str, array: Array, requirement: str) -> None:
+def require(holds: Array, name: str, array: Array, requirement: str) -> None:
     """Raise ValueError with the first entry of `array` for which `holds` is False."""
     if holds.all():
         return

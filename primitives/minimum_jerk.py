@@ -67,7 +67,7 @@ def point_to_point(
     )
     require_vectors("start", start)
     require_vectors("goal", goal, start.shape[-1])
-    require(xp, duration > 0, "duration", duration, "must be positive")
+    require(duration > 0, "duration", duration, "must be positive")
     shapes = {"start": tuple(start.shape[:-1]), "goal": tuple(goal.shape[:-1])}
     batch = broadcast_batch(
         **shapes, duration=tuple(duration.shape), **check_end_shapes(ends, start.shape[-1])
@@ -151,12 +151,12 @@ def _check_durations(xp: Namespace, waypoints: Array, durations: Array) -> None:
     positive = durations > 0
     if positive.all():
         return
-    require(xp, durations >= 0, "durations", durations, "must not be negative")
+    require(durations >= 0, "durations", durations, "must not be negative")
     total = xp.sum(durations, axis=-1)
-    require(xp, xp.any(positive, axis=-1), "durations", total, "must not all be 0; their sum")
+    require(xp.any(positive, axis=-1), "durations", total, "must not all be 0; their sum")
     still = (waypoints[..., 1:, :] == waypoints[..., :-1, :]).all(axis=-1)
     full = broadcast_to(xp, durations, tuple(still.shape))
-    require(xp, (full > 0) | still, "durations", full, "may be 0 only between equal waypoints")
+    require((full > 0) | still, "durations", full, "may be 0 only between equal waypoints")
 
 
 def minimum_jerk_coefficients(
@@ -192,7 +192,7 @@ def minimum_jerk_coefficients(
     """
     names = ("x0", "dx0", "ddx0", "xT", "dxT", "ddxT", "T")
     xp, arrays = as_floats(**dict(zip(names, (x0, dx0, ddx0, xT, dxT, ddxT, T), strict=True)))
-    require(xp, arrays[-1] > 0, "T", arrays[-1], "must be positive")
+    require(arrays[-1] > 0, "T", arrays[-1], "must be positive")
     shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(names, arrays, strict=True)})
     x0, dx0, ddx0, xT, dxT, ddxT, T = (broadcast_to(xp, a, shape)[..., None] for a in arrays)
     ends: Any = dict(zip(END_NAMES, (dx0, ddx0, dxT, ddxT), strict=True))

@@ -63,7 +63,7 @@ def passage_durations(
         duration=duration,
     )
     batch = check_waypoints(waypoints, ends, duration=duration)
-    require(xp, duration > 0, "duration", duration, "must be positive")
+    require(duration > 0, "duration", duration, "must be positive")
     flat_ends = dict(ends)
     for name, value in ends.items():
         if value is not None and value is not FREE:

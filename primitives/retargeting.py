@@ -82,13 +82,13 @@ def retarget(
     batch = _common_batch(trajectory, time, arrival, targets, via)
     time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
     end = broadcast_to(xp, trajectory.duration, batch)
-    require(xp, time >= 0, "time", time, "must not be negative")
-    require(xp, time < end, "time", time, "must lie before the end of the movement")
+    require(time >= 0, "time", time, "must not be negative")
+    require(time < end, "time", time, "must lie before the end of the movement")
     if freeze > 0:
         frozen = end - time < freeze
         arrival = xp.where(frozen, end, arrival)
         targets, via = _keep_old_target(trajectory, frozen, targets, via)
-    require(xp, arrival > time, "arrival", arrival, "must lie after time")
+    require(arrival > time, "arrival", arrival, "must lie after time")
     return _plan(trajectory, time, arrival - time, targets, via)
 
 

@@ -50,7 +50,7 @@ def minimum_duration(
     for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):
         if limit is None:
             continue
-        require(xp, limit > 0, name, limit, "must be positive")
+        require(limit > 0, name, limit, "must be positive")
         if limit.ndim and limit.shape[-1] not in (1, trajectory.dimension):
             allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
             raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")

@@ -294,7 +294,7 @@ class Trajectory:
         """
         xp = self.namespace
         (duration,) = self.floats(duration=duration)
-        require(xp, duration > 0, "duration", duration, "must be positive")
+        require(duration > 0, "duration", duration, "must be positive")
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
         end = own(duration)[..., None]
         factor = end / self.end

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.actions.via_points import Motion, frame
+from viapoint.envs.actions.via_points import AXES, Motion, frame
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import is_number
 
-AXES = ("along", "across", "above")
 STEP_TOLERANCE = 1e-6
 """Relative rounding error of numbers of single precision."""
 

@@ -15,10 +15,10 @@ from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 Timing = Literal["optimal", "learned"]
 
+AXES = ("along", "across", "above")
+"""Names of the axes of the frame of start and goal, see :func:`frame`."""
 LOG_SPLIT = float(np.log(4.0))
 """Log ratio of neighbouring segments' durations for an action of 1: a factor of four."""
-
-
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 """Bounds of the duration range, [s]."""
 MOST_VIAS = 16
@@ -111,8 +111,7 @@ class ActionLayout:
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the components, in order."""
-        axes = ("along", "across", "above")[: self.dimension]
-        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in axes]
+        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in AXES[: self.dimension]]
         splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
         return (*vias, "duration", *splits)
 

@@ -200,13 +200,13 @@ class PlanarArm:
         """
         xp = np if isinstance(position, np.ndarray) else namespace_of(position)
         joints, upper_arm, forearm, sine = self._configurations(position, xp)
-        rates = self._rates(position, upper_arm, forearm, sine, velocity)
+        rates = self._rates(position, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
         # Differentiating J q' = v gives J q'' = a - J' q', and -J' q' is the sum of centripetal terms along the links.
         relative = tuple(
             acceleration[..., i] + centripetal[0] * upper_arm[i] + centripetal[1] * forearm[i] for i in (0, 1)
         )
-        accelerations = self._rates(position, upper_arm, forearm, sine, xp.stack(relative, axis=-1))
+        accelerations = self._rates(position, forearm, sine, xp.stack(relative, axis=-1))
         cosine = upper_arm[0] * forearm[0] + upper_arm[1] * forearm[1]
         torques = self._torques(cosine, sine, rates, accelerations)
         return xp.stack(
@@ -244,12 +244,7 @@ class PlanarArm:
         return shoulder, (cosine, sine)
 
     def _rates(
-        self,
-        hand: Array,
-        upper_arm: tuple[Array, Array],
-        forearm: tuple[Array, Array],
-        sine: Array,
-        rate: Array,
+        self, hand: Array, forearm: tuple[Array, Array], sine: Array, rate: Array
     ) -> tuple[Array, Array]:
         """Return the joint rates that give the hand `rate`: the inverse Jacobian times `rate`."""
         l1, l2 = self.lengths

@@ -105,7 +105,7 @@ class Simulator:
         warnings = self._warnings(sims)
         out = self.batch.rollout(steps, controls, record=self.recorded, ids=sims)
         self.physics_steps += steps * len(sims)
-        unstable = (self._warnings(sims) > warnings) | ~_finite(out["qpos"])
+        unstable = (self._warnings(sims) > warnings) | ~np.isfinite(out["qpos"]).all(axis=(1, 2))
         traced = LinkPositions(out["site_xpos"], *self._traced) if self._traced else None
         return SimulationLog(out["qpos"], out["ncon"] > 0, unstable, traced)
 
@@ -173,7 +173,3 @@ class Simulator:
             axis, radius = kind.bound(half)
             self._bounds[sim, geom] = norm(axis) + radius if kind.sizes else 0.0
             self._boxes[sim, geom] = np.concatenate((np.zeros_like(half), half), axis=-1)
-
-
-def _finite(joints: Float) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(joints).all(axis=(1, 2)))
