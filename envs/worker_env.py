@@ -163,14 +163,11 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
         """Execute one action in each environment; where an episode ends, start the next."""
         results = self._execute("transition", actions)
-        ended = [each.last_observation is not None for each in results]
-        lasts = [
-            each.last_observation if e else each.observation for each, e in zip(results, ended, strict=True)
-        ]
-        merged = merge([each._replace(last_observation=None) for each in results])
-        step: tuple[Observation, Any, Any, Any, dict[str, Any]] = merged._replace(
-            last_observation=merge(lasts) if any(ended) else None
-        ).as_step()
+        if any(each.last_observation for each in results):  # None where no episode ended
+            results = [
+                each._replace(last_observation=each.last_observation or each.observation) for each in results
+            ]
+        step: tuple[Observation, Any, Any, Any, dict[str, Any]] = merge(results).as_step()
         return step
 
     def execute_actions(self, actions: Any) -> Any:
