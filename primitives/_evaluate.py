@@ -96,10 +96,9 @@ def _current_segment_into(current: Any, time: Any, starts: Any) -> None:
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
     """Return (..., S, T), True where start_s <= time < start_(s+1), S >= 2; the last segment has no end."""
     reached = time[..., None, :] >= starts[..., 1:, None]
-    parts = [~reached[..., :1, :], reached[..., -1:, :]]
-    if reached.shape[-2] > 1:
-        parts.insert(1, reached[..., :-1, :] & ~reached[..., 1:, :])
-    return xp.concat(parts, axis=-2)
+    edge = xp.ones_like(reached[..., :1, :])
+    reached = xp.concat([edge, reached, ~edge], axis=-2)
+    return reached[..., :-1, :] & ~reached[..., 1:, :]
 
 
 def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array:

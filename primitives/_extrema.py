@@ -59,8 +59,8 @@ def axis_extrema(pieces: Pieces) -> Extrema:
     polynomials, _ = pieces.polynomials()
     u = _with_ends(root_candidates(differentiate(polynomials)))
     values = evaluate(polynomials[..., None, :], u)
-    low = _read(pieces, _best(pieces, u, -values, per_axis=True))
-    high = _read(pieces, _best(pieces, u, values, per_axis=True))
+    low = _read(pieces, _best(pieces, u, -values))
+    high = _read(pieces, _best(pieces, u, values))
     return Extrema(*low, *high)
 
 
@@ -71,8 +71,8 @@ def largest_norm(pieces: Pieces) -> Array:
     square = ordered_sum(multiply(polynomials, polynomials), -2)
     change = ordered_sum(multiply(polynomials, differentiate(polynomials)), -2)
     u = _with_ends(root_candidates(change))
-    place = _best(pieces, u, evaluate(square[..., None, :], u), per_axis=False)
-    values, _ = _read(pieces, place)
+    score = evaluate(square[..., None, :], u)
+    values, _ = _read(pieces, _best(pieces, u[..., None, :], score[..., None, :]))
     limit = largest_exponent(xp, values.dtype)
     exponent = np.clip(exponent, -limit, limit)
     down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
@@ -85,14 +85,11 @@ def _with_ends(u: Floats) -> Floats:
     return np.concatenate([edge, u, edge + 1.0], axis=-1)
 
 
-def _best(pieces: Pieces, u: Floats, score: Floats, *, per_axis: bool) -> tuple[Any, Floats]:
-    """Return segment and unit time of the best candidate, each (..., D) or (..., 1); the earliest if several."""
+def _best(pieces: Pieces, u: Floats, score: Floats) -> tuple[Any, Floats]:
+    """Return segment and unit time, (..., D) each, of the best of candidates (..., S, D, P): the earliest of equals."""
     empty = to_numpy(pieces.rates) <= 0
-    score = np.where(empty[..., None, None] if per_axis else empty[..., None], -np.inf, score)
-    if per_axis:  # (..., S, D, P) -> (..., D, S, P)
-        u, score = np.swapaxes(u, -3, -2), np.swapaxes(score, -3, -2)
-    else:
-        u, score = u[..., None, :, :], score[..., None, :, :]
+    score = np.where(empty[..., None, None], -np.inf, score)
+    u, score = np.swapaxes(u, -3, -2), np.swapaxes(score, -3, -2)  # (..., D, S, P)
     count = u.shape[-1]
     u, score = (np.reshape(a, (*a.shape[:-2], a.shape[-2] * count)) for a in (u, score))
     chosen = np.argmax(score, axis=-1)
