@@ -94,10 +94,9 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         )  # fmt: skip
         self.time_limit = float(self._ends.limit * timestep)
         """Time limit of an episode, [s]."""
-        self.observation_layout = ReplanningObservationLayout(
-            dimension=base.dimension, joint_range=base.joint_range, n_rows=base.n_rows, shapes=base.shapes,
-            n_via=action.n_via, time_limit=self.time_limit,
-        )  # fmt: skip
+        self.observation_layout = ReplanningObservationLayout.of(
+            task.arm, base.n_rows, base.shapes, n_via=action.n_via, time_limit=self.time_limit
+        )
         self._change_sampler = ChangeSampler(
             model, self.changes, durations=(shortest, action.centre_duration, longest)
         )

@@ -98,10 +98,10 @@ class VelocityVectorEnv(MultiStepVectorEnv):
         """Control steps of an episode at most."""
         speed, acceleration = self.steering.greatest
         twin = self.task.observation
-        self.observation_layout = StepObservationLayout(
-            dimension=twin.dimension, joint_range=twin.joint_range, n_rows=twin.n_rows, shapes=twin.shapes,
-            speed=speed, acceleration=acceleration, time_limit=self.control_steps * self.steering.control_step,
-        )  # fmt: skip
+        time_limit = self.control_steps * self.steering.control_step
+        self.observation_layout = StepObservationLayout.of(
+            arm, twin.n_rows, twin.shapes, speed=speed, acceleration=acceleration, time_limit=time_limit
+        )
         self.action_names = self.steering.names
         self._motion = Motion.at_rest(np.zeros((self.num_envs, arm.dimension)))
         self._rest = np.zeros(self.num_envs, dtype=np.int64)

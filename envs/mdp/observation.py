@@ -6,7 +6,7 @@ import functools
 import itertools
 from collections.abc import Container
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -76,9 +76,11 @@ class ObservationLayout:
     """Names of the shapes that obstacles may have."""
 
     @classmethod
-    def of(cls, arm: Arm, n_rows: int, shapes: tuple[str, ...] = CAPSULES) -> ObservationLayout:
+    def of(cls, arm: Arm, n_rows: int, shapes: tuple[str, ...] = CAPSULES, **further: Any) -> Self:
         """Return the layout for an arm and at most `n_rows` obstacles of some shapes."""
-        return cls(dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows, shapes=shapes)
+        return cls(
+            dimension=arm.dimension, joint_range=arm.joint_range, n_rows=n_rows, shapes=shapes, **further
+        )
 
     @functools.cached_property
     def _joint_bounds(self) -> tuple[Float, Float]:

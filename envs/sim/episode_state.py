@@ -127,14 +127,10 @@ class EpisodeState(NamedTuple):
     def outcome(
         self, success: Bool, goal_error: Float, duration: Float, straight_cost: Float, timestep: float
     ) -> Outcome:
-        """Return the metrics so far.
+        """Return the metrics so far, of which the first three are given.
 
-        Args:
-            success: True where the hand has arrived and the episode is sound, shape (N,).
-            goal_error: Distance from the goal, shape (N,), [m].
-            duration: Duration of the movements, shape (N,), [s].
-            straight_cost: Jerk cost of the straight movement of that duration, shape (N,), [m^2/s^5].
-            timestep: Length of a physics step, [s].
+        `straight_cost` is the jerk cost of straight movements of these durations, shape (N,), [m^2/s^5], and `timestep`
+        the length of a physics step, [s].
         """
         return Outcome(
             is_success=success,

@@ -15,7 +15,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.episode_state import EpisodeState, Segment
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.simulator import SimulationLog, Simulator
-from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, required_time_scale
+from viapoint.envs.sim.time_scaling import CHECK_INTERVAL, TimeScale, required_time_scale
 
 GROUP = 64
 """Movements of one group: few enough for the processor's cache, many enough for the engine's threads."""
@@ -30,10 +30,8 @@ class ScaledMovements(NamedTuple):
     """Scenes that they take place in."""
     plan: Plan
     """Via-points and scaled durations."""
-    stretch: Float
-    """Factor by which each movement was slowed down, shape (n,)."""
-    within: Bool
-    """False where time scaling found the plan out of reach, shape (n,)."""
+    scale: TimeScale
+    """Time scaling of each movement."""
     duration: Float
     """Scaled total duration, shape (n,), [s]."""
     steps: Int
@@ -114,12 +112,12 @@ class Executor:
 
     def scale_time(self, scenes: Scenes, plan: Plan) -> ScaledMovements:
         """Slow movements down where the arm's limits require it."""
-        stretch, within = required_time_scale(self.arm, plan)
-        scaled = Plan(plan.waypoints, plan.durations * stretch[:, None])
+        scale = required_time_scale(self.arm, plan)
+        scaled = Plan(plan.waypoints, plan.durations * scale.stretch[:, None])
         duration = np.asarray(scaled.durations.sum(axis=-1))
         steps = np.ceil((duration + SETTLING) / self.simulator.timestep - 1e-9).astype(np.int64)
         sims = np.arange(len(steps))
-        return ScaledMovements(sims, scenes, scaled, stretch, within, duration, steps)
+        return ScaledMovements(sims, scenes, scaled, scale, duration, steps)
 
     def build_references(self, movements: ScaledMovements) -> TrackingReferences:
         """Sample one group of movements at the physics rate and compute the controls that track them."""
@@ -133,7 +131,7 @@ class Executor:
             movements=movements,
             planned=position[:, 1:],
             controls=self.arm.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1]),
-            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & movements.within,
+            reachable=(self.arm.reach_margin(seen) >= 0.0).all(axis=-1) & movements.scale.within,
             jerk_cost=np.asarray(trajectory.cost()),
             clearance=self.simulator.collision_model.least_clearance(seen, scenes.obstacles, scenes.present),
         )
@@ -161,7 +159,7 @@ class Executor:
             min_clearance=self._with_terminal_clearance(state, run, scenes),
             planned_clearance=references.clearance,
             jerk_cost=references.jerk_cost,
-            stretch=movements.stretch,
+            stretch=movements.scale.stretch,
             reachable=run,
         )
         goal_error = norm(state.hand - scenes.goal)

@@ -76,13 +76,9 @@ class Simulator:
     def place(
         self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
     ) -> None:
-        """Place arms at rest, and obstacles.
+        """Place the arms of n simulations at rest with joint angles (n, J), [rad], and obstacles.
 
-        Args:
-            sims: The simulations, shape (n,).
-            joints: Shape (n, J), [rad].
-            obstacles: Rows of either kind, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
-            present: True for rows that are obstacles, shape (n, rows).
+        Obstacles are rows of either kind, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
         """
         self.batch.state[sims] = self._rest_state
         self.batch.bind("qpos")[sims] = joints
