@@ -41,7 +41,7 @@ def main() -> None:
 
     browser.SIZE = SIZE
     window = browser.Browser()
-    with LivePage("viapoint/PandaObstacles-v0", port=0, seed=3) as page:
+    with LivePage("viapoint/PandaObstacles-v0", port=0, seed=47) as page:
         tab = window.tab(page.url)
         tab.call(
             "Emulation.setDeviceMetricsOverride",
