@@ -15,7 +15,9 @@ def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
     """
     square = dot(axis, axis)
     along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)
-    rest = [o - along * a for o, a in zip(offset, axis, strict=True)]
+    rest = []
+    for o, a in zip(offset, axis, strict=True):
+        rest.append(o - along * a)
     return dot(rest, rest)
 
 

@@ -162,9 +162,9 @@ class Executor:
             stretch=movements.scale.stretch,
             reachable=run,
         )
-        goal_error = norm(state.hand - scenes.goal)
+        goal_error, distance = norm(state.hand - scenes.goal), norm(scenes.goal - scenes.start)
+        cost = straight_jerk_cost(distance, movements.duration)
         success = (state.last_speed < REST_SPEED) & (goal_error < GOAL_TOLERANCE) & state.sound
-        cost = straight_jerk_cost(norm(scenes.goal - scenes.start), movements.duration)
         timestep = self.simulator.timestep
         outcome = state.outcome(success, goal_error, movements.duration, cost, timestep)
         return MeasuredMovements(references, log, state.joints, outcome)

@@ -1,5 +1,6 @@
 """Environments in actors of Ray: equal seeds give the episodes of one process, and dead actors are replaced."""
 
+import contextlib
 import importlib
 import os
 import sys
@@ -32,6 +33,14 @@ def ray(ray_lock):
     import_ray().shutdown()
 
 
+def kill(ray, actor):
+    """Kill an actor and wait until it is dead: until then it may answer another call."""
+    ray.kill(actor)
+    with contextlib.suppress(ray.exceptions.RayActorError):
+        while True:
+            ray.get(actor.__ray_ready__.remote())
+
+
 def assert_same(mine, theirs):
     """Check results of `VecEnv`, apart from wall times."""
     if isinstance(mine, dict):
@@ -58,7 +67,7 @@ def test_actors_of_a_native_batch_change_nothing_even_if_they_die(env_id, ray, m
     assert_same(env.reset(), alone.reset())
     for step in range(7):
         if step in (1, 6):  # before the first snapshot and after one
-            ray.kill(env.venv._workers[1].handle._actor)
+            kill(ray, env.venv._workers[1].handle._actor)
         assert_same(env.step(actions(env, step)), alone.step(actions(env, step)))
         assert_same(env.last_outcome, alone.last_outcome)
     assert (env.restarts, env.lost_episodes) == (2, 0)
@@ -80,7 +89,7 @@ def test_any_environment_of_gymnasium_runs_and_lost_episodes_are_no_failures(ray
     assert env.get_attr("mark", indices=[-1]) == [7]
     assert env.env_method("get_wrapper_attr", "gravity", indices=[2, 0]) == [9.8, 9.8]
     assert env.env_is_wrapped(Monitor) == [True] * 3
-    ray.kill(env._actors[1]._actor)
+    kill(ray, env._actors[1]._actor)
     last = env._observation
     observation, reward, done, infos = env.step(pushes[0])
     assert_same(observation[:1], alone.step(pushes[0])[0][:1])
@@ -95,7 +104,7 @@ def test_any_environment_of_gymnasium_runs_and_lost_episodes_are_no_failures(ray
     assert "lost" not in infos[0]
     assert (env.restarts, env.lost_episodes) == (1, 2)
     assert not any("lost" in info for info in env.step(pushes[1])[3])
-    ray.kill(env._actors[0]._actor)  # noticed by a question that is no step
+    kill(ray, env._actors[0]._actor)  # noticed by a question that is no step
     assert env.get_attr("render_mode") == [None] * 3
     assert [bool(info.get("lost")) for info in env.step(pushes[2])[3]] == [True, False, False]
     env.seed(1)
