@@ -15,7 +15,7 @@ def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
     """
     square = dot(axis, axis)
     along = (dot(offset, axis) / (square + (square <= TINY))).clip(-1.0, 1.0)
-    rest = []
+    rest = []  # a comprehension is a call in Python 3.11, and this runs several times in each step
     for o, a in zip(offset, axis, strict=True):
         rest.append(o - along * a)
     return dot(rest, rest)

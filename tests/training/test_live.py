@@ -27,6 +27,7 @@ from viapoint.training import load_agent
 from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
 from viapoint.training.config.checks import SHIPPED_IDS
+from viapoint.training.io.mp4 import write_mp4
 from viapoint.training.live import drawing, movements, obstacle_editing, playback
 from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
@@ -36,7 +37,6 @@ from viapoint.training.live.scene_draws import (
 )
 from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
 from viapoint.training.live.setting import Setting, Shared
-from viapoint.training.plotting.video import write_mp4
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"

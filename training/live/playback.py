@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from viapoint.envs.common.types import Float, Frame
+from viapoint.training.io.mp4 import write_mp4
 from viapoint.training.live.job_thread import TICK
-from viapoint.training.plotting.video import write_mp4
 
 if TYPE_CHECKING:
     import viser
