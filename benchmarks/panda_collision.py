@@ -43,8 +43,8 @@ from viapoint.envs.geometry.convex_mesh import hull_triangles
 from viapoint.envs.geometry.distance import point_distance_squared
 
 ASSETS = Path(__file__).parents[1] / "envs" / "assets"
-TOLERANCE, BASE_TOLERANCE = 0.025, 0.06
-"""Greatest excess of a capsule, and of those of the base, which only the arm itself can hit, [m]."""
+TOLERANCE = 0.025
+"""Greatest excess of a capsule, [m]."""
 TIP, TIP_FOOT, TIP_CUT = np.array([0.0, 0.0, 0.1034]), 0.0915, 0.0905
 """Hand in the frame of the gripper, other end of the capsule that ends there, and the height above which it contains
 the fingers, [m]."""
@@ -157,7 +157,7 @@ def fit(folder: Path) -> dict[str, list[LinkCapsule]]:
     parts = {name: read_stl(folder / f"{name}.stl") for name in (*LINKS, "hand")} | {"fingers": low}
     found = {}
     for name, points in parts.items():
-        fitted = cover_points(points, BASE_TOLERANCE if name == "link0" else TOLERANCE - 2e-4)
+        fitted = cover_points(points, TOLERANCE - 2e-4)
         found[name] = [rounded(each.ends, each.radius) for each in fitted]
         body = ConvexMesh.hull(points)
         excess = (each.radius + np.asarray(body.distance(np.array(each.ends))).max() for each in found[name])
@@ -205,14 +205,14 @@ def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[str, s
     """
     whole = (ASSETS / "panda.xml").read_text(encoding="utf-8")
     whole = re.sub(r"  Collision: .*?-->", COMMENT, whole, flags=re.DOTALL)
-    lines, body = [], "link0"
+    lines, body = [], ""
     for line in whole.splitlines():
         name = re.search(r'<body name="(\w+)"', line)
         body = name.group(1) if name else body
         if "<geom name=" not in line or "table" in line:
             lines.append(line)
-        if ('name="table" type' in line) if body == "link0" else ("<inertial" in line):
-            indent = " " * (len(line) - len(line.lstrip()))
+        if '<body name="link0"' in line or "<inertial" in line:
+            indent = " " * (len(line) - len(line.lstrip()) + 2 * (body == "link0"))
             lines += [indent + each for each in geom_lines(body, capsules[body], skipped)]
     return "\n".join(lines) + "\n"
 

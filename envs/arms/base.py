@@ -159,7 +159,12 @@ class CollisionModel:
         return self.whole_arm and self.arm.may_touch_itself
 
     def least_clearance(
-        self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
+        self,
+        hand: Float,
+        obstacles: Float,
+        present: Bool,
+        joints: Float | None = None,
+        floor: float = -np.inf,
     ) -> Float:
         """Return the least clearance over time and obstacles, shape (N,).
 
@@ -170,12 +175,14 @@ class CollisionModel:
             obstacles: Obstacles at rest, shape (N, n, 2 D + 1), [m].
             present: True for rows that are obstacles, shape (N, n).
             joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
+            floor: Value below which the result need not be exact, [m].
         """
         least, checks_itself = np.full(len(hand), MAX_CLEARANCE), self.may_touch_itself and joints is None
         links = self._links(hand, joints) if obstacles.shape[1] or checks_itself else None
         if obstacles.shape[1]:
             if links is not None and self.arm.traced:
-                least = nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present)
+                traced, radii = ends_of(links), self.arm.link_radii
+                least = nearest_approach(traced, radii, obstacles, present, floor=floor)
             else:
                 least = self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1)
         return np.asarray(self.with_self_clearance(least, links, time_axis=1) if checks_itself else least)

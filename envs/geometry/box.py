@@ -67,27 +67,13 @@ class Box(Shape):
         enters the box has its deepest point where two of the planes are equally far: a problem of six lines.
         """
         xp = namespace_of(start[0])
-        *vectors, x, y, z = spread(*start, *along, *self._half)
-        start, along, half = list(vectors[:3]), list(vectors[3:]), [x, y, z]
-
-        def rise(t: Array) -> Array:
-            places = [p + t * u for p, u in zip(start, along, strict=True)]
-            excess = [q - clamp(q, -h, h) for q, h in zip(places, half, strict=True)]
-            return dot(along, excess)
-
-        low, high = xp.zeros_like(start[0]), xp.ones_like(start[0])
-        falling, rising = rise(low), rise(high)
-        ends = xp.where(falling >= 0.0, low, high)
-        within = (falling < 0.0) & (rising > 0.0)
-        for p, u, h in zip(start, along, half, strict=True):
-            for face in (-h, h):
-                t = clamp(safe_ratio(face - p, u), 0.0, 1.0)
-                at = rise(t)
-                later, sooner = (at < 0.0) & (t > low), (at >= 0.0) & (t < high)
-                low, falling = xp.where(later, t, low), xp.where(later, at, falling)
-                high, rising = xp.where(sooner, t, high), xp.where(sooner, at, rising)
-        t = low + (high - low) * safe_ratio(falling, falling - rising)
-        t = clamp(xp.where(within, t, ends), 0.0, 1.0)
+        vectors = spread(*start, *along, *self._half)
+        falling, rising = _rise(vectors, 0.0), _rise(vectors, 1.0)
+        t = xp.where(falling >= 0.0, xp.zeros_like(falling), xp.ones_like(falling))
+        between = (falling < 0.0) & (rising > 0.0)
+        if between.any():
+            t[between] = _root([each[between] for each in vectors], falling[between], rising[between])
+        start, along, half = vectors[:3], vectors[3:6], vectors[6:]
         inside = _signed([p + t * u for p, u in zip(start, along, strict=True)], half) < CONTACT
         if inside.any():
             some = [each[inside] for each in (*start, *along, *half)]
@@ -99,6 +85,27 @@ class Box(Shape):
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
         return np.asarray(np.sign(directions) * to_numpy(self.size))
+
+
+def _rise(vectors: Components, t: Array | float) -> Array:
+    """Return half the derivative by t of the squared distance from a box; components of start, along and half sizes."""
+    start, along, half = vectors[:3], vectors[3:6], vectors[6:]
+    places = [p + t * u for p, u in zip(start, along, strict=True)]
+    return dot(along, [q - clamp(q, -h, h) for q, h in zip(places, half, strict=True)])
+
+
+def _root(vectors: Components, falling: Array, rising: Array) -> Array:
+    """Return where :func:`_rise` is 0, if it is `falling` < 0 at t = 0 and `rising` > 0 at t = 1."""
+    xp = namespace_of(falling)
+    low, high = xp.zeros_like(falling), xp.ones_like(falling)
+    for p, u, h in zip(vectors[:3], vectors[3:6], vectors[6:], strict=True):
+        for face in (-h, h):
+            t = clamp(safe_ratio(face - p, u), 0.0, 1.0)
+            at = _rise(vectors, t)
+            later, sooner = (at < 0.0) & (t > low), (at >= 0.0) & (t < high)
+            low, falling = xp.where(later, t, low), xp.where(later, at, falling)
+            high, rising = xp.where(sooner, t, high), xp.where(sooner, at, rising)
+    return clamp(low + (high - low) * safe_ratio(falling, falling - rising), 0.0, 1.0)
 
 
 def _signed(points: Components, half: Components) -> Array:

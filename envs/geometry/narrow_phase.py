@@ -42,7 +42,12 @@ def ends_of(links: Float) -> LinkPositions:
 
 
 def nearest_approach(
-    traced: LinkPositions, radii: tuple[float, ...], obstacles: Float, present: Bool, last: Int | None = None
+    traced: LinkPositions,
+    radii: tuple[float, ...],
+    obstacles: Float,
+    present: Bool,
+    last: Int | None = None,
+    floor: float = -np.inf,
 ) -> Float:
     """Return the least clearance of links over a movement and all obstacles, shape (N,), [m]; at most MAX_CLEARANCE.
 
@@ -52,6 +57,7 @@ def nearest_approach(
         obstacles: Rows of obstacles of either kind, shape (N, n, .), [m].
         present: True for rows that are obstacles, shape (N, n).
         last: Index of each movement's last time, shape (N,); by default all times count.
+        floor: Value below which the result need not be exact, [m].
     """
     least = np.full(len(obstacles), MAX_CLEARANCE)
     if not present.any():
@@ -82,10 +88,10 @@ def nearest_approach(
         return clearance(each, row, link, middles[each, stretch, None])[:, 0]
 
     # All times of the stretches that are still near enough after their middles.
-    each, ball, nearest = branch_and_bound(bounds.reshape(len(least), -1), least, at_middle)
+    each, ball, nearest = branch_and_bound(bounds.reshape(len(least), -1), least, at_middle, floor)
     row, ball = np.divmod(ball, bounds.shape[-1])
     stretch, link = np.divmod(ball, len(size))
-    nearer = nearest - excursion[each, stretch, link] < least[each]
+    nearer = (nearest - excursion[each, stretch, link] < least[each]) & (least[each] >= floor)
     each, row, stretch, link = each[nearer], row[nearer], stretch[nearer], link[nearer]
     times = np.minimum(starts[stretch, None] + np.arange(STRETCH), last[each, None])
     np.minimum.at(least, each, clearance(each, row, link, times).min(axis=-1))

@@ -29,7 +29,7 @@ Distribution = SceneDistribution | SpaceDistribution
 
 FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
-TOGETHER = 640
+TOGETHER = 1280
 """Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""

@@ -45,8 +45,9 @@ class SpatialObstacles:
 
     def __init__(self, collision_model: CollisionModel, distribution: SpaceDistribution) -> None:
         self._collision_model, self._distribution = collision_model, distribution
-        self._names = np.array(distribution.possible)
-        self._families = [scene_families(3)[name] for name in distribution.possible]
+        # A name that stands twice among them is one family with twice the probability.
+        names, self._number = np.unique(distribution.possible, return_inverse=True)
+        self._families = [scene_families(3)[name] for name in names]
         self._above = np.array([family.passes_above for family in self._families], dtype=bool)
         self._rigid = np.array([family.rigid for family in self._families], dtype=np.int64)
 
@@ -162,7 +163,8 @@ class SpatialObstacles:
 
     def _which(self, u: Float) -> Int:
         """Return the index of the family that a uniform number stands for."""
-        return np.minimum((u * len(self._names)).astype(np.int64), len(self._names) - 1)
+        last = len(self._number) - 1
+        return np.asarray(self._number[np.minimum((u * (last + 1)).astype(np.int64), last)])
 
     def _site(
         self, feasible: FeasiblePath, u: Float, hardness: Float, swept: SweptVolume | None = None

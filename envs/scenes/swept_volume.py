@@ -9,7 +9,7 @@ import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Float, Index, Int, Single
-from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
+from viapoint.envs.geometry.broad_phase import HalfLinks, ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.geometry.narrow_phase import branch_and_bound
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
@@ -75,7 +75,9 @@ class LinkBodies(NamedTuple):
             return least.reshape(shape)
         margins = np.zeros(self.balls.shape[2:]) + margin
         around = (self.around[:, None] + margins).astype(np.float32).reshape(-1)
-        bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows).reshape(len(least), -1)
+        size = (self.radii[:, None] + margins).astype(np.float32).reshape(-1)
+        links = HalfLinks(self._half_axes(), size) if has_shapes(rows) else None
+        bound = ball_bounds(self.balls.reshape(len(rows), 5, -1), around, rows, links).reshape(len(least), -1)
 
         def exact(one: Index, ball: Index) -> Float:
             row, ball = np.divmod(one * bound.shape[-1] + ball, places)
@@ -91,6 +93,11 @@ class LinkBodies(NamedTuple):
     def take(self, movements: Int) -> LinkBodies:
         """Return some of the movements."""
         return self._replace(ends=self.ends[:, :, movements], balls=self.balls[movements])
+
+    def _half_axes(self) -> Single:
+        """Return halves of the links' axes, shape (N, 3, B * T), [m]."""
+        half = np.float32(0.5) * (self.ends[1] - self.ends[0])
+        return np.asarray(np.moveaxis(half, 1, 0).reshape(half.shape[1], 3, -1))
 
     def _between(self, rows: Float, row: Index, ball: Index) -> Float:
         """Return clearances, shape (M,), [m], of pairs of an obstacle and a link at one time."""

@@ -127,7 +127,7 @@ def blocks_straight_movement(collision_model: CollisionModel, scenes: Scenes) ->
     if not scenes.obstacles.size:
         return np.zeros(len(scenes.start), dtype=bool)
     lines = _lines(scenes.start, scenes.goal)
-    least = collision_model.least_clearance(lines, scenes.obstacles, scenes.present)
+    least = collision_model.least_clearance(lines, scenes.obstacles, scenes.present, floor=-IN_THE_WAY)
     return np.asarray(least < -IN_THE_WAY)
 
 

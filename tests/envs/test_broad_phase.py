@@ -5,7 +5,7 @@ import pytest
 
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
+from viapoint.envs.geometry.broad_phase import HalfLinks, ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
 from viapoint.envs.geometry.rows import obstacles_from_rows, pair_distance, shape_rows
 from viapoint.envs.geometry.shapes import SHAPES
@@ -133,6 +133,24 @@ def test_balls_are_bounded_from_below_by_shapes_and_closely_by_boxes(kind, gener
     assert (bounds <= clearance + 1e-6)[clearance > -1.0].all()  # no arm is deeper in a half-space
     if kind == "box":
         assert (bounds >= clearance - 1e-4)[present].all()
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule"])
+def test_links_in_balls_have_bounds_between_those_of_the_balls_and_their_clearance(kind, generator):
+    centres = generator.uniform(-1.0, 1.0, (N, 3, 50)).astype(np.float32)
+    half = generator.uniform(-0.2, 0.2, (N, 3, 50)).astype(np.float32)
+    radii = generator.uniform(0.0, 0.1, 50).astype(np.float32)
+    rows = shapes(kind, generator, (N, ROWS))
+    scene, row, ball = (each.ravel() for each in np.indices((N, ROWS, 50)))
+    ends = (centres + sign * half for sign in (-1.0, 1.0))
+    distance = pair_distance(rows[scene, row], *(end[scene, :, ball] for end in ends))
+    clearance = distance.reshape(N, ROWS, 50) - radii
+    lifted, around = lift_quadratic(centres), np.sqrt((half * half).sum(axis=1)) + radii
+    of_balls = ball_bounds(lifted, around, rows)
+    bounds = ball_bounds(lifted, around, rows, HalfLinks(half, radii))
+    assert (bounds <= clearance + 1e-6).all()
+    assert (bounds >= of_balls - 1e-5).all()
+    assert (bounds > of_balls + 0.05).any() == (kind != "capsule")
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
