@@ -40,7 +40,7 @@ class DrawOrder(NamedTuple):
     groups: tuple[int, ...]
     """Attempts that are drawn one after the other at a scene."""
     ahead: int
-    """Greatest number of attempts, over all scenes, for which several groups are drawn at once."""
+    """Attempts, for one scene or for each two of several, up to which several groups are drawn at once."""
 
 
 def sample_ends(

@@ -31,6 +31,8 @@ FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
 TOGETHER = 1280
 """Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
+MOST_AHEAD = 320
+"""Greatest number of attempts, over all scenes, for which several groups are drawn at once."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
 SHARED_GROUPS = 8
@@ -252,6 +254,7 @@ class AttemptNumbers:
     def __init__(self, generators: Sequence[np.random.Generator], size: int, order: DrawOrder) -> None:
         self._generators, self._size, self._order = generators, size, order
         self._apart = len({id(each.bit_generator) for each in generators}) == len(generators)
+        self._ahead = min(order.ahead * max(len(generators) // 2, 1), MOST_AHEAD)
         self._group = 0
         self._groups: tuple[int, ...] = ()
         self._states: list[list[Any]] = []
@@ -271,7 +274,7 @@ class AttemptNumbers:
         groups = self._order.groups[self._group :]
         self._groups = groups[:1]
         for attempts in groups[1:] if self._apart else ():
-            if len(scenes) * (sum(self._groups) + attempts) > self._order.ahead:
+            if len(scenes) * (sum(self._groups) + attempts) > self._ahead:
                 break
             self._groups += (attempts,)
         self._group += len(self._groups)

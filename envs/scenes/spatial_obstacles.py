@@ -194,16 +194,26 @@ class SpatialObstacles:
 
     def _room(self, bodies: LinkBodies, rows: Float, most: float, **limits: Any) -> Float:
         """Return the clearance that each obstacle has to spare, shape (N, n), [m]; it must be greater at the ends."""
+        return bodies.clearance(rows, most, self._margins(bodies), **limits)
+
+    def _margins(self, bodies: LinkBodies) -> Float:
+        """Return the least clearance at each time, shape (T,), [m]."""
         margin = np.full(bodies.balls.shape[-1], self._distribution.link_margin)
         margin[[0, -1]] = self._distribution.end_margin
-        return bodies.clearance(rows, most, margin, **limits)
+        return margin
 
     def _free(self, bodies: LinkBodies, built: Float) -> Bool:
         """Return which of K structures, shape (N, K, n, 7), leave room for the links and are within bounds."""
         number, several, parts = built.shape[:3]
-        inside = np.asarray((_within_bounds(built) | (built[..., -1] <= 0.0)).all(axis=-1))
-        rows = np.where(inside[..., None, None], built, 0.0).reshape(number, several * parts, self._row_size)
-        return np.asarray(inside & (self._room(bodies, rows, SOME, floor=0.0, together=parts) > 0.0))
+        free = np.asarray((_within_bounds(built) | (built[..., -1] <= 0.0)).all(axis=-1))
+        if several > 1:  # most structures do not fit
+            hits = bodies.hits(built.reshape(number, several * parts, self._row_size), self._margins(bodies))
+            free &= ~hits.reshape(built.shape[:3]).any(axis=-1)
+        some = np.flatnonzero(free.any(axis=-1))
+        rows = np.where(free[some, :, None, None], built[some], 0.0)
+        rows = rows.reshape(len(some), several * parts, self._row_size)
+        free[some] &= self._room(bodies.take(some), rows, SOME, floor=0.0, together=parts) > 0.0
+        return free
 
     def _keep_blocking(self, fits: Bool, feasible: FeasiblePath, built: Float) -> None:
         """Strike out the first structures that the straight movement does not hit, shape (N, STRUCTURES)."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.common.types import Float, Index, Int, Single
+from viapoint.envs.common.types import Bool, Float, Index, Int, Single
 from viapoint.envs.geometry.broad_phase import HalfLinks, ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import segment_distance_squared
 from viapoint.envs.geometry.narrow_phase import branch_and_bound
@@ -21,6 +21,8 @@ LENGTH = 1e-4
 """Length of the link that stands for a hand alone, [m]: a link must have a length."""
 ABOVE = 0.06
 """Greatest horizontal distance of links that count as above the hand, [m]."""
+HIT_STEP = 3
+"""Steps between the times at which ends of links are looked at."""
 SIZE_ROUNDING = 1e-4
 """Upper bound of the rounding error of a distance, [m]."""
 
@@ -85,6 +87,20 @@ class LinkBodies(NamedTuple):
 
         branch_and_bound(bound, least, exact, floor)
         return least.reshape(shape)
+
+    def hits(self, rows: Float, margin: Float) -> Bool:
+        """Return which obstacles certainly come closer than a margin to a link, shape (N, n).
+
+        A test without exact distances: spheres around one end of each link are compared, at some of the times.
+
+        Args:
+            rows: Obstacles of either kind, shape (N, n, .), [m].
+            margin: Margin at each time, shape (T,), [m].
+        """
+        places = np.moveaxis(self.ends[1, ..., ::HIT_STEP], 0, 1)
+        around = (self.radii[:, None] + margin[::HIT_STEP]).astype(np.float32).reshape(-1)
+        bounds = ball_bounds(lift_quadratic(places).reshape(len(rows), 5, -1), around, rows)
+        return np.asarray((bounds < -SIZE_ROUNDING).any(axis=-1))
 
     def every_other(self) -> LinkBodies:
         """Return the links at every other time."""
