@@ -21,8 +21,8 @@ LENGTH = 1e-4
 """Length of the link that stands for a hand alone, [m]: a link must have a length."""
 ABOVE = 0.06
 """Greatest horizontal distance of links that count as above the hand, [m]."""
-HIT_STEP = 3
-"""Steps between the times at which ends of links are looked at."""
+HIT_STEP, HIT_DEPTH = 3, 1e-3
+"""Steps between the times at which ends of links are looked at, and depth above the rounding errors, [m]."""
 SIZE_ROUNDING = 1e-4
 """Upper bound of the rounding error of a distance, [m]."""
 
@@ -94,13 +94,13 @@ class LinkBodies(NamedTuple):
         A test without exact distances: spheres around one end of each link are compared, at some of the times.
 
         Args:
-            rows: Obstacles of either kind, shape (N, n, .), [m].
+            rows: Capsules and boxes, shape (N, n, .), [m]; the bounds of other shapes are not close enough.
             margin: Margin at each time, shape (T,), [m].
         """
         places = np.moveaxis(self.ends[1, ..., ::HIT_STEP], 0, 1)
         around = (self.radii[:, None] + margin[::HIT_STEP]).astype(np.float32).reshape(-1)
         bounds = ball_bounds(lift_quadratic(places).reshape(len(rows), 5, -1), around, rows)
-        return np.asarray((bounds < -SIZE_ROUNDING).any(axis=-1))
+        return np.asarray((bounds < -HIT_DEPTH).any(axis=-1))
 
     def every_other(self) -> LinkBodies:
         """Return the links at every other time."""

@@ -95,6 +95,16 @@ def test_rows_that_belong_together_have_one_clearance(generator, bodies):
     assert (floored != plain).any()
 
 
+@pytest.mark.parametrize("kind", ["capsule", "box"])
+def test_obstacles_that_are_hit_come_closer_than_the_margin(kind, generator, bodies):
+    rows, margin = shapes(kind, generator, (N, ROWS)), generator.uniform(0.0, 0.02, TIMES)
+    clearance = bodies.clearance(rows, np.inf, margin)
+    for more in np.linspace(0.0, 0.1, 51):
+        hits = bodies.hits(rows, margin + more)
+        assert (clearance[hits] < more).all()
+        assert hits.sum() > 0.5 * (clearance < more).sum() > 0.0
+
+
 def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
     sampler, found = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
     for together in (1, 30, 10_000):
