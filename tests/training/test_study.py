@@ -13,7 +13,7 @@ from viapoint.training import Study, run_study
 from viapoint.training.io.files import read_json
 from viapoint.training.study import jobs, run, timing
 from viapoint.training.study.config import rows_of
-from viapoint.training.study.page import fill_tables, render_page, row, table
+from viapoint.training.study.page import effort, fill_tables, render_page, row, table
 from viapoint.training.study.results import gather
 
 ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
@@ -272,6 +272,20 @@ def test_a_file_is_named_in_its_errors(tmp_path):
             Study.from_yaml(path)
     with pytest.raises(ValueError, match=r"only must be some of train, .* got 'trian'"):
         run_study(Study.from_dict({"environments": [ENV]}), only=["trian"])
+
+
+@pytest.mark.parametrize(
+    ("stopped", "stalling", "words"),
+    [
+        (["stalled"], 0.3, "400,000, until it stalled"),
+        (["budget"], 0.3, "400,000, cut short"),
+        (["budget", "stalled"], 0.3, "400,000, cut short"),
+        (["budget"], None, "400,000"),
+    ],
+)
+def test_trainings_that_wait_for_a_stall_say_whether_it_came(stopped, stalling, words):
+    made = {"training": {"stop_when_stalled": stalling}}
+    assert effort({"made": made, "training": {"decisions": 400000, "stopped": stopped}}) == words
 
 
 def test_tables_of_other_pages_are_filled_in(done, tmp_path):

@@ -187,8 +187,10 @@ def effort(each: Numbers) -> str:
     training = each.get("training")
     if not training or each.get("untrained"):
         return "-"
-    stopped = training.get("stopped", [])
-    ended = ", until it stalled" if stopped == ["stalled"] else ", cut short" if "stalled" in stopped else ""
+    stalling = each["made"]["training"].get("stop_when_stalled") is not None
+    ended = (
+        ", until it stalled" if training.get("stopped") == ["stalled"] else ", cut short" if stalling else ""
+    )
     return f"{training['decisions']:,}{ended}"
 
 
