@@ -187,10 +187,9 @@ def effort(each: Numbers) -> str:
     training = each.get("training")
     if not training or each.get("untrained"):
         return "-"
-    stalling = each["made"]["training"].get("stop_when_stalled") is not None
-    ended = (
-        ", until it stalled" if training.get("stopped") == ["stalled"] else ", cut short" if stalling else ""
-    )
+    ended = ""
+    if each["made"]["training"].get("stop_when_stalled") is not None:
+        ended = ", until it stalled" if training.get("stopped") == ["stalled"] else ", cut short"
     return f"{training['decisions']:,}{ended}"
 
 
