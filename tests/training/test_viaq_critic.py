@@ -35,7 +35,7 @@ from viapoint.training.algorithms.obstacle_parts import (
     whole_obstacles,
 )
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.algorithms.pair_networks import PairMinimum, networks_of
+from viapoint.training.algorithms.pair_networks import UNIT, PairMinimum, networks_of
 from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy, MinimumCriticTD3Policy
 from viapoint.training.algorithms.viaq import ViaQ
 from viapoint.training.algorithms.viaq_critic import Values, _Saturated
@@ -496,9 +496,8 @@ def test_round_shapes_may_turn_about_their_axis():
     assert [kind for kind, each in zip(KINDS, changed, strict=True) if each] == ["box"]
 
 
-@pytest.mark.parametrize("instants", [1, 6, 7])
-def test_gaps_of_shapes_are_those_of_the_axis_at_its_point_nearest_to_the_part(instants):
-    poses, _, _ = scene(number=1, instants=instants)
+def test_gaps_of_shapes_are_those_of_the_axis_at_its_point_nearest_to_the_part():
+    poses, _, _ = scene(number=1)
     pairs, (_, _, columns) = ShapePairs(len(KINDS), True), shape_pairs(1)
     columns = [each[:, None, None] for each in columns]
     apart, axis = (
@@ -511,10 +510,34 @@ def test_gaps_of_shapes_are_those_of_the_axis_at_its_point_nearest_to_the_part(i
     nearest = points.norm(dim=1).argmin(dim=0)
     points = points.gather(0, nearest[None, None].expand(1, 3, *nearest.shape))[0]
     wanted = pairs.gap([*points], None, columns, poses) - radius
-    np.testing.assert_allclose(gap[..., ::2], wanted[..., ::2], atol=1e-3)
-    for t in range(1, instants, 2):
-        neighbours = gap[..., range(t - 1, min(t + 2, instants), 2)]
-        assert torch.equal(gap[..., t], neighbours.amin(dim=-1))
+    np.testing.assert_allclose(gap, wanted, atol=1e-3)
+
+
+@pytest.mark.parametrize("instants", [1, 2, 6, 7])
+def test_near_pairs_with_shapes_are_at_every_second_instant_and_around_it(instants):
+    rows = np.concatenate(
+        [random_obstacles(kind, np.zeros((1, 3)), np.random.default_rng(0)) for kind in KINDS]
+    )
+    parts = whole_obstacles(rows[None], KINDS)
+    for networks in ((0, 1), (0, 0, 1)):
+        poses, _, _ = scene(number=1, instants=instants, networks=networks)
+        network = PairMinimum(3, networks, 8, geometry=ShapePairs(len(KINDS), True))
+        with torch.no_grad():
+            values = network._values(
+                poses, parts, torch.zeros(len(KINDS), dtype=torch.long), torch.arange(len(KINDS))
+            )
+            everywhere = network.of_near_pairs(poses, parts, np.inf)
+            least = network.of_near_pairs(poses, parts, 0.0)
+        assert torch.allclose(everywhere, network(poses, parts), atol=1e-6)
+        apart = parts.centre[0].T[:, None, :, None, None] - poses.centre[:, :, 0].transpose(0, 1)[:, :, None]
+        axis = poses.axis[:, :, 0].transpose(0, 1)[:, :, None]
+        gap = network.geometry.gap([*apart], [*axis], [*parts.columns[0].T[..., None, None]], poses)
+        for plan in range(gap.shape[2]):
+            found = gap[:, :, plan, ::2].numpy()
+            body, part, second = np.nonzero(found == found.min())
+            around = [abs(2 * second - t) <= 1 for t in range(instants)]
+            near = min(values[part[k], plan, body[k], t].min() for t, k in enumerate(around) if k.any())
+            assert torch.isclose(least[0, plan], near * UNIT, atol=1e-6)
 
 
 def test_the_nearest_shapes_are_among_the_near_pairs():

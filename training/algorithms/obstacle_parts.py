@@ -146,6 +146,9 @@ class PairGeometry(Protocol):
     all pairs, which training always uses."""
     near_coarse: float
     """Gap up to which pairs count where values only select plans to check, [m]."""
+    every: int
+    """1 if gaps are computed at all instants; 2 if at every second one, with the smaller one of the neighbours in
+    between."""
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return invariants of the pose of a part relative to a body."""
@@ -169,6 +172,7 @@ class CapsulePairs:
 
     near: float | None = None
     near_coarse = 0.12
+    every = 1
 
     def __init__(self, dimension: int, links: bool) -> None:
         self.inputs = 4 if not links else 2 * dimension + (1 if dimension == 2 else 0)
@@ -214,6 +218,7 @@ class ShapePairs:
     """Factor of features without a unit, in the networks' scale of lengths, [m]."""
     near: float | None = 0.09
     near_coarse = 0.06
+    every = 2
 
     def __init__(self, n_shapes: int, links: bool) -> None:
         self.inputs = 6 + 3 * links + n_shapes
@@ -249,23 +254,15 @@ class ShapePairs:
     def gap(
         self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor], poses: Poses
     ) -> Tensor:
-        """Return the distance from the box of the point of the body's axis nearest to the part, less the radius.
-
-        It is computed at every second instant. In between it is the smaller one of the neighbours.
-        """
+        """Return the distance from the box of the point of the body's axis nearest to the part, less the radius."""
         frame, half = columns[:9], columns[9:12]
-        centre = _in_frame([each[..., ::2] for each in apart], frame)  # of the part, seen from the body
+        centre = _in_frame(apart, frame)  # of the part, seen from the body
         if axis is None or poses.half_length is None or poses.radius is None:
-            found = _box_distance(centre, half)
-        else:
-            along = _in_frame([each[..., ::2] for each in axis], frame)
-            length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
-            t = torch.minimum(torch.maximum(_dot(centre, along), -length), length)
-            found = _box_distance([c - t * u for c, u in zip(centre, along, strict=True)], half) - radius
-        gap = found.repeat_interleave(2, dim=-1)[..., : poses.time.shape[-1]]
-        between = gap[..., 1:-1:2]
-        torch.minimum(between, gap[..., 2::2], out=between)
-        return gap
+            return _box_distance(centre, half)
+        along = _in_frame(axis, frame)
+        length, radius = (each[:, None, None, None] for each in (poses.half_length, poses.radius))
+        t = torch.minimum(torch.maximum(_dot(centre, along), -length), length)
+        return _box_distance([c - t * u for c, u in zip(centre, along, strict=True)], half) - radius
 
 
 def pair_features(
@@ -318,7 +315,7 @@ def _distance_from_axis(apart: list[Tensor], axis: list[Tensor] | None, poses: P
 def _dot(first: list[Tensor], second: list[Tensor]) -> Tensor:
     total = first[0] * second[0]
     for u, v in zip(first[1:], second[1:], strict=True):
-        total = total + u * v
+        total += u * v
     return total
 
 

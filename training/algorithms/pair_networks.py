@@ -150,28 +150,39 @@ class PairMinimum(nn.Module):
         plans, number = poses.centre.shape[3], int(parts.present[scene].sum())
         if not number:
             return torch.full((plans,), NO_OBSTACLE)
-        part, described, drift = (
-            each[scene, :number, ..., None, None] for each in (parts.centre, parts.columns, parts.velocity)
+        part, columns, drift = (
+            each[scene, :number].T[..., None, None] for each in (parts.centre, parts.columns, parts.velocity)
+        )  # shape (., R, 1, 1) each
+        moves, time, instants = bool(drift.any()), poses.time[scene], poses.time.shape[-1]
+        vectors = (poses.centre,) if poses.axis is None else (poses.centre, poses.axis)
+        centre, *axes = (each[:, :, scene].transpose(0, 1) for each in vectors)  # shape (D, L, H, T) each
+        part, drift = part[: len(centre)], drift[: len(centre)]
+        every = self.geometry.every
+        first = [each[..., ::every].contiguous()[:, :, None] for each in (centre, *axes)]
+        place = part + drift * time[..., ::every] if moves else part
+        gap = self.geometry.gap(  # shape (L, R, H, .)
+            [here - there for here, there in zip(place, first[0], strict=True)],
+            [*first[1]] if axes else None,
+            [*columns],
+            poses,
         )
-        if bool(drift.any()):
-            part = part + drift * poses.time[scene]
-        dimensions = range(poses.centre.shape[1])
-        apart = [part[:, i] - poses.centre[:, i, scene, None] for i in dimensions]  # shape (L, R, H, T) each
-        axis = None if poses.axis is None else [poses.axis[:, i, scene, None] for i in dimensions]
-        columns = [described[:, i] for i in range(described.shape[1])]
-        distance = self.geometry.gap(apart, axis, columns, poses)
-        nearest = distance.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
-        bodies, rows, _, instants = distance.shape
-        evaluated = (distance <= (nearest + near)[:, None]).flatten(0, 1)
-        of_body, plan, instant = evaluated.nonzero(as_tuple=True)
+        nearest = gap.amin(dim=(0, 1)).amin(dim=1)  # in two steps, as this is three times as fast
+        is_near = gap <= (nearest + near)[:, None]
+        if every == 2:
+            is_near = is_near.repeat_interleave(2, dim=-1)[..., :instants]
+            is_near[..., 1:-1:2] |= is_near[..., 2::2]
+        bodies, rows = is_near.shape[:2]
+        of_body, plan, instant = is_near.flatten(0, 1).nonzero(as_tuple=True)
         pose = plan * instants + instant
-        flat = of_body * (plans * instants) + pose
-        body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(flat), of_body)
+        body, row = (of_body // rows, of_body % rows) if bodies > 1 else (torch.zeros_like(plan), of_body)
         along = body * (plans * instants) + pose
+        place = part[..., 0, 0].index_select(1, row)
+        if moves:
+            place = place + drift[..., 0, 0].index_select(1, row) * time.flatten().index_select(0, pose)
         features = self.geometry.features(
-            [each.expand_as(distance).flatten().index_select(0, flat) for each in apart],
-            None if axis is None else [each.flatten().index_select(0, along) for each in axis],
-            [each[:, 0, 0].index_select(0, row) for each in columns],
+            [*(place - centre.flatten(1).index_select(1, along))],
+            [*axes[0].flatten(1).index_select(1, along)] if axes else None,
+            [*columns[..., 0, 0].index_select(1, row)],
         )
         features += self._sizes(poses, body)
         if len(self.networks.nearness) == 1:
