@@ -80,7 +80,7 @@ def test_every_row_is_that_of_its_files(done):
     assert found["viaq"]["training"]["decisions"] == 64
     compared = record["environments"][ENV]["compared"]
     assert "probability" in compared[0]["sets"]["test"]
-    assert set(compared[1]["sets"]["hard"]) == {"difference", "p_value"}
+    assert set(compared[1]["sets"]["hard"]) == {"difference", "p_values"}
 
 
 def test_the_page_and_the_figures_are_made_of_the_record(done):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -232,7 +231,6 @@ FILTERS = {
     "short": short,
     "seeds": seeds,
     "effort": effort,
-    "median": statistics.median,
 }
 """Filters of templates by name."""
 FUNCTIONS: dict[str, Any] = {

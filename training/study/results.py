@@ -343,11 +343,11 @@ def _improvement(first: Sequence[float], second: Sequence[float]) -> Numbers:
 
 
 def _scene_by_scene(first: Sequence[Numbers], second: Sequence[Numbers]) -> Numbers:
-    """Return the difference of success: its median, least and greatest value over seeds, and the greatest p-value."""
+    """Return the difference of success: its median, least and greatest value over seeds, and extreme p-values."""
     other = outcome(second, "is_success")[0] > 0.5
     tests = [mcnemar(row, other) for row in outcome(first, "is_success") > 0.5]
     differences = [test.difference for test in tests]
     return {
         "difference": [float(np.median(differences)), min(differences), max(differences)],
-        "p_value": max(test.p_value for test in tests),
+        "p_values": [extreme(test.p_value for test in tests) for extreme in (min, max)],
     }
