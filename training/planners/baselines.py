@@ -168,7 +168,7 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
 
 def refined_search(total: int) -> Callable[[SceneSimulation], Method]:
     """Return a factory of searches; half of the checks on refinement solve more scenes (docs/geometry-search.md)."""
-    rounds = 2 if total < 256 else 4
+    rounds = 2 if total < 512 else 4
     return lambda simulation: GeometrySearch(
         simulation.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
     )
