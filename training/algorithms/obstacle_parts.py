@@ -147,8 +147,8 @@ class PairGeometry(Protocol):
     near_coarse: float
     """Gap up to which pairs count where values only select plans to check, [m]."""
     every: int
-    """1 if gaps are computed at all instants; 2 if at every second one, with the smaller one of the neighbours in
-    between."""
+    """1 if gaps are computed at all instants; 2 if at every second one. In between, a pair is then near if it is so at
+    the instant before or after."""
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return invariants of the pose of a part relative to a body."""

@@ -158,11 +158,11 @@ class PairMinimum(nn.Module):
         centre, *axes = (each[:, :, scene].transpose(0, 1) for each in vectors)  # shape (D, L, H, T) each
         part, drift = part[: len(centre)], drift[: len(centre)]
         every = self.geometry.every
-        first = [each[..., ::every].contiguous()[:, :, None] for each in (centre, *axes)]
+        sampled = [each[..., ::every].contiguous()[:, :, None] for each in (centre, *axes)]
         place = part + drift * time[..., ::every] if moves else part
         gap = self.geometry.gap(  # shape (L, R, H, .)
-            [here - there for here, there in zip(place, first[0], strict=True)],
-            [*first[1]] if axes else None,
+            [here - there for here, there in zip(place, sampled[0], strict=True)],
+            [*sampled[1]] if axes else None,
             [*columns],
             poses,
         )
