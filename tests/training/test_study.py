@@ -1,5 +1,6 @@
 """Studies: what a YAML file may say, that nothing is done twice, and that pages hold what was measured."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -10,11 +11,12 @@ import pytest
 from PIL import Image
 
 from viapoint.training import Study, run_study
+from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import read_json
 from viapoint.training.study import jobs, run, timing
 from viapoint.training.study.config import rows_of
 from viapoint.training.study.page import effort, fill_tables, render_page, row, table
-from viapoint.training.study.results import gather
+from viapoint.training.study.results import gather, unpacked
 
 ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 SMALL = {
@@ -148,35 +150,65 @@ def test_rows_are_measured_again_on_demand(done, tmp_path):
         run_study(study_of(folder), workers=0, redo=["viaq", "viaqs"])
 
 
-def test_rows_outlive_their_files_until_as_much_is_measured(done, tmp_path):
-    _, record = done
-    empty = study_of(tmp_path)
-    assert rows(gather(empty)) == {}
-    assert gather(empty, record) == record
-    fewer = json.loads(json.dumps(record))
-    for each in fewer["environments"][ENV]["rows"]:
-        each["seeds"] = each.get("seeds", [])[:1]
-    folder, _ = done
-    assert rows(gather(study_of(folder), fewer))["viaq"]["seeds"] == [0, 1]
-    more = json.loads(json.dumps(record))
-    more["environments"][ENV]["rows"][0]["seeds"] = [0, 1, 2]
-    assert rows(gather(study_of(folder), more))["viaq"]["seeds"] == [0, 1, 2]
+def of_seeds(record, seeds):
+    """Return a record in which the agent has been measured with some of its seeds only."""
+    changed = json.loads(json.dumps(record))
+    for each in changed["environments"][ENV]["rows"]:
+        if each["kind"] == "agent":
+            each["runs"] = [run for run in each["runs"] if run["seed"] in seeds]
+            each["seeds"] = seeds
+    return changed
 
 
-@pytest.mark.parametrize("what", ["scenes", "settings"])
-def test_rows_of_other_scenes_or_settings_do_not_stay(done, tmp_path, what):
+def test_rows_outlive_their_files_and_grow_by_seed(done, tmp_path):
+    folder, record = done
+    assert rows(gather(study_of(tmp_path / "empty"))) == {}
+    assert gather(study_of(tmp_path / "empty"), record) == record
+    other = Path(shutil.copytree(folder, tmp_path / "study"))
+    shutil.rmtree(other / "PlanarObstacles-v0" / "viaq" / "seed-1")
+    grown = gather(study_of(other), of_seeds(record, [1]))
+    assert [each["seeds"] for each in grown["environments"][ENV]["rows"][:4]] == [[0, 1]] * 4
+    assert grown == record
+
+
+def test_rows_without_runs_stay_until_as_many_seeds_are_measured(done):
+    folder, record = done
+    for seeds, expected in (([0], [0, 1]), ([0, 1, 2], [0, 1, 2])):
+        earlier = of_seeds(record, seeds)
+        for each in earlier["environments"][ENV]["rows"]:
+            each["runs"] = []
+        assert rows(gather(study_of(folder), earlier))["viaq"]["seeds"] == expected
+
+
+def test_the_solved_scenes_of_every_run_are_in_the_record(done):
+    folder, record = done
+    for each in rows(record)["viaq/4"]["runs"]:
+        path = folder / "PlanarObstacles-v0" / "viaq" / f"seed-{each['seed']}" / "evaluations" / "hard.4.json"
+        solved = unpacked(each["sets"]["hard"]["solved"], each["sets"]["hard"]["scenes"])
+        assert solved.tolist() == [value > 0.5 for value in read_json(path)["outcomes"]["is_success"]]
+
+
+def test_rows_of_other_scenes_do_not_stay(done, tmp_path):
     _, record = done
     changed = json.loads(json.dumps(record))
-    if what == "scenes":
-        changed["environments"][ENV]["sets"]["test"]["sha256"] = "of other scenes"
-    study = study_of(
-        tmp_path, **({"agents": {}, "compare": [], "baselines": ["search16"]} if what == "settings" else {})
-    )
-    found = rows(gather(study, changed))
-    if what == "scenes":
-        assert {name for each in found.values() for name in each["sets"]} == {"hard"}
-    else:
-        assert found == {}  # its search of another kind has the same name
+    changed["environments"][ENV]["sets"]["test"]["sha256"] = "of other scenes"
+    found = rows(gather(study_of(tmp_path), changed))
+    assert {name for each in found.values() for name in each["sets"]} == {"hard"}
+
+
+@pytest.mark.parametrize("of", ["study", "preset"])
+def test_rows_of_other_settings_do_not_stay(done, tmp_path, monkeypatch, of):
+    _, record = done
+    changes = {
+        "agents": {},
+        "compare": [],
+        "baselines": ["search16"],
+    }  # a search of another kind has this name
+    if of == "preset":
+        slower = dataclasses.replace(PRESETS["viaq"], hyperparameters=(("learning_rate", 1e-4),))
+        monkeypatch.setitem(PRESETS, "viaq", slower)
+        changes = {"baselines": [], "compare": []}
+    assert rows(gather(study_of(tmp_path, **changes), record)) == {}
 
 
 def test_a_run_with_other_settings_is_refused_and_others_go_on(done):

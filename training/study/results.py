@@ -1,14 +1,16 @@
 """Record of a study: every number of its page and figures, from the files of its measurements.
 
-Numbers may outlive the files that they came from, so that a study can grow on several machines: a row of the earlier
-record stays if it is of the same method and scenes, and nothing that covers as much has replaced it.
+A row keeps the measurements of each run: which scenes it solved, medians of jerk and time, effort and learning curve.
+So its numbers may outlive the files that they came from, and a row can grow seed by seed on several machines.
 """
 
 from __future__ import annotations
 
+import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +20,11 @@ from viapoint.training.evaluation.statistics import across_seeds, mcnemar, proba
 from viapoint.training.io.files import read_json
 from viapoint.training.io.installed import versions
 from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import resolved
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes
-from viapoint.training.study.config import Agent, Baseline, Environment, Mode, Study
+from viapoint.training.study.config import FIXED, Agent, Baseline, Environment, Mode, Study
 from viapoint.training.study.jobs import (
-    Cell,
+    PACE,
     baseline_record,
     evaluation_path,
     identity_of,
@@ -32,9 +35,16 @@ from viapoint.training.study.jobs import (
     with_checks,
 )
 
+CLOCKS = ("decisions", "simulated_seconds", "seconds")
+"""Clocks of a learning curve."""
+
 Numbers = dict[str, Any]
-Records = Mapping[str, Sequence[Numbers]]
-"""Measurements of a row by set, one for each seed."""
+Runs = Sequence[Numbers]
+"""Measurements of a row, an entry for each seed, or one entry of a baseline.
+
+Entries are `sets` (see :func:`in_one_set`), of an agent `seed`, `training` and perhaps `curve`, of a search of equal
+time `checks`.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +67,11 @@ class Row:
         if isinstance(entry, Agent):
             mode = mode or Mode()
             found |= {"kind": "agent", "seeds_wanted": list(entry.seeds), **mode._asdict()}
-            made: Any = {"training": dict(entry.training), "step_wise": entry.step_wise}
+            made: Any = {
+                "training": dict(entry.training),
+                "step_wise": entry.step_wise,
+                "settings": _settings(entry, env),
+            }
         else:
             found |= {"kind": "baseline", "method": entry.method, "checks": entry.checks}
             fields = ("method", "checks", "time_of", "env_kwargs", "scenes", "n_scenes")
@@ -86,7 +100,7 @@ def rows_in(study: Study, env: Environment) -> list[Row]:
 
 
 def gather(study: Study, before: Numbers | None = None) -> Numbers:
-    """Return the record of a study from its files; rows of an earlier record are kept that are not measured again."""
+    """Return the record of a study from its files, and from the runs of an earlier record that have no files here."""
     record: Numbers = {
         "study": study.name,
         "versions": versions(),
@@ -95,8 +109,19 @@ def gather(study: Study, before: Numbers | None = None) -> Numbers:
             for env in study.environments
         },
     }
-    plain: Numbers = json.loads(json.dumps(record), parse_float=lambda digits: round(float(digits), 6))
+    plain: Numbers = _plain(record)
     return plain
+
+
+def _plain(record: Any) -> Any:
+    """Return plain values as JSON holds them, with six digits."""
+    return json.loads(json.dumps(record), parse_float=lambda digits: round(float(digits), 6))
+
+
+def _settings(agent: Agent, env: Environment) -> Numbers:
+    """Return all settings of an agent's training, those of the preset too."""
+    config = resolved(agent.config(env, agent.seeds[0], Path())).as_json()
+    return {name: value for name, value in config.items() if name not in (*FIXED, *PACE)}
 
 
 def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
@@ -107,25 +132,18 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
     same = [name for name, each in described.items() if old_sets.get(name) == each["sha256"]]
     old = {each["row"]: each for each in known.get("rows", [])}
     times, planner = times_of(study, env), _planner(study, env, sets)
-    rows, records = [], {}
+    rows = []
     for row in rows_in(study, env):
         wanted = row.described(env)
-        found = {name: some for name, some in _records(study, env, row, sets).items() if some}
-        new = _measured(study, env, row, found, planner) if found else None
         kept = _kept(old.get(row.id), wanted, same)
+        runs = _merged((kept or {}).get("runs", []), _plain(list(_runs(study, env, row, sets, planner))))
+        new = _measured(env, row, runs) if runs else None
         chosen = new if new is not None and (kept is None or _covers(new, kept)) else kept
-        if chosen is None:
-            continue
-        time = times.get(row.id, {}).get("median", (kept or {}).get("decision_time"))
-        rows.append({**wanted, **chosen, "decision_time": time})
-        if chosen is new:
-            records[row.id] = found
-    return {
-        "id": env.id,
-        "sets": described,
-        "rows": rows,
-        "compared": _comparisons(study.compare, rows, records, known.get("compared", [])),
-    }
+        if chosen is not None:
+            time = times.get(row.id, {}).get("median", (kept or {}).get("decision_time"))
+            rows.append({**wanted, **chosen, "decision_time": time})
+    compared = _comparisons(study.compare, rows, known.get("compared", []))
+    return {"id": env.id, "sets": described, "rows": rows, "compared": compared}
 
 
 def _described(frozen: FrozenScenes) -> Numbers:
@@ -141,23 +159,34 @@ def _described(frozen: FrozenScenes) -> Numbers:
     }
 
 
-def _records(study: Study, env: Environment, row: Row, sets: Mapping[str, FrozenScenes]) -> Records:
-    """Return the stored measurements of a row by set."""
+def _runs(
+    study: Study, env: Environment, row: Row, sets: Mapping[str, FrozenScenes], planner: Mapping[str, Numbers]
+) -> Iterator[Numbers]:
+    """Yield the runs of a row whose measurements are in files of the study."""
     if isinstance(row.entry, Baseline):
-        return _baseline_records(study, env, row.entry, sets)
-    cells = trained(study, env, row.entry)
+        records = _baseline_records(study, env, row.entry, sets)
+        if records:
+            checks = next(iter(records.values()))["made"]["checks"]
+            equal_time = {} if row.entry.time_of is None else {"checks": checks}
+            yield {**equal_time, "sets": _in_sets(records, planner)}
+        return
     mode = row.mode or Mode()
-    return {
-        name: [
-            record for cell in cells if (record := _evaluation(study, cell, name, frozen, mode)) is not None
-        ]
-        for name, frozen in sets.items()
-    }
+    for cell in trained(study, env, row.entry):
+        folder = study.out / cell.folder
+        found = {
+            name: stored(folder / evaluation_path(name, mode), identity_of(frozen, Run(folder).best, mode))
+            for name, frozen in sets.items()
+        }
+        records = {name: record for name, record in found.items() if record is not None}
+        if records:
+            run = Run(folder)
+            curve = {"curve": _curve(run)} if mode == Mode() else {}
+            yield {"seed": cell.seed, "training": _training(run), **curve, "sets": _in_sets(records, planner)}
 
 
 def _baseline_records(
     study: Study, env: Environment, baseline: Baseline, sets: Mapping[str, FrozenScenes]
-) -> Records:
+) -> dict[str, Numbers]:
     """Return the stored measurements of a baseline by set."""
     found = with_checks(study, env, baseline)
     if found is None:
@@ -165,156 +194,200 @@ def _baseline_records(
     records = {
         name: baseline_record(study, found, env, name, frozen) for name, frozen in sets_of(env, found).items()
     }
-    return {name: [record] for name, record in records.items() if record is not None and name in sets}
+    return {name: record for name, record in records.items() if record is not None and name in sets}
 
 
-def _evaluation(study: Study, cell: Cell, name: str, frozen: FrozenScenes, mode: Mode) -> Numbers | None:
-    """Return the stored measurement of a trained agent, with its seed."""
-    folder = study.out / cell.folder
-    record = stored(folder / evaluation_path(name, mode), identity_of(frozen, Run(folder).best, mode))
-    return None if record is None else {**record, "seed": cell.seed}
-
-
-def _measured(
-    study: Study, env: Environment, row: Row, records: Records, planner: Mapping[str, Numbers]
-) -> Numbers:
-    """Return the numbers of a row: those of the seeds that are measured on all sets on which any is."""
-    sets = sets_of(env, row.entry if isinstance(row.entry, Baseline) else None)
-    found: Numbers = {}
-    if isinstance(row.entry, Agent):
-        seeds = [{each["seed"] for each in some} for some in records.values()]
-        common = sorted(set.intersection(*seeds))
-        records = {name: [each for each in some if each["seed"] in common] for name, some in records.items()}
-        cells = [each for each in trained(study, env, row.entry) if each.seed in common]
-        found = {"seeds": common, "training": _training(cells, study)}
-        if row.mode == Mode():
-            found["curve"] = _curve(cells, study)
-    elif row.entry.time_of is not None:
-        found["checks"] = next(iter(records.values()))[0]["made"]["checks"]
-    found["sets"] = {
-        name: numbers_of(some, sets[name], planner.get(name)) for name, some in records.items() if some
+def _training(run: Run) -> Numbers:
+    """Return the effort of a training, and why it stopped."""
+    if not run.curve:
+        return {}
+    cores = run.folder / "cores.json"
+    last = {name: run.curve[-1][name] for name in CLOCKS}
+    return {
+        **last,
+        "cores": read_json(cores)["cores"] if cores.is_file() else None,
+        "stopped": run.stopped,
     }
-    return found
 
 
-def _training(cells: Sequence[Cell], study: Study) -> Numbers:
-    """Return the effort of the trainings: medians over seeds, and the wall time of each."""
-    runs = [Run(study.out / cell.folder) for cell in cells]
-    last = [run.curve[-1] for run in runs if run.curve]
-    cores = [run.folder / "cores.json" for run in runs]
-    if not last:
+def _curve(run: Run) -> Numbers:
+    """Return the success on validation scenes, and the clocks at these points, shape (points,) each."""
+    clocks = {clock: [each[clock] for each in run.curve] for clock in CLOCKS}
+    return {**clocks, "success": [each["success"]["rate"] for each in run.curve]}
+
+
+def _in_sets(records: Mapping[str, Numbers], planner: Mapping[str, Numbers]) -> Numbers:
+    return {name: in_one_set(record, planner.get(name)) for name, record in records.items()}
+
+
+def in_one_set(record: Numbers, planner: Numbers | None) -> Numbers:
+    """Return the numbers of a run in a set.
+
+    `solved` says which scenes it solved (see :func:`packed`), `jerk_ratio` and `time` [s] are medians of successes, and
+    `jerk` and `duration` medians of multiples of the planner's in the scenes that both solved.
+    """
+    outcomes = {name: np.asarray(values, dtype=float) for name, values in record["outcomes"].items()}
+    solved = outcomes["is_success"] > 0.5
+    number, theirs = len(solved), {} if planner is None else planner["outcomes"]
+    both = solved & (np.asarray(theirs.get("is_success", np.zeros(number)))[:number] > 0.5)
+
+    def beside(name: str) -> float | None:
+        return _median(outcomes[name][both] / np.asarray(theirs[name])[:number][both]) if both.any() else None
+
+    return {
+        "scenes": number,
+        "solved": packed(solved),
+        "collision": float(outcomes["collision"].mean()),
+        "jerk_ratio": _median(outcomes["jerk_ratio"][solved]),
+        "time": _median(outcomes["duration"][solved]),
+        "jerk": beside("jerk_ratio"),
+        "duration": beside("duration"),
+    }
+
+
+def packed(solved: Bool) -> str:
+    """Return booleans as text: eight a byte, the first in the highest bit, bytes in base 64."""
+    return base64.b64encode(np.packbits(solved).tobytes()).decode()
+
+
+def unpacked(text: str, number: int) -> Bool:
+    """Return the booleans of a text, shape (number,)."""
+    return np.unpackbits(np.frombuffer(base64.b64decode(text), np.uint8), count=number).astype(bool)
+
+
+def _measured(env: Environment, row: Row, runs: Runs) -> Numbers:
+    """Return the numbers of a row: those of the runs that are measured on all sets on which any is."""
+    sets = sets_of(env, row.entry if isinstance(row.entry, Baseline) else None)
+    names = [name for name in sets if any(name in run["sets"] for run in runs)]
+    runs = [run for run in runs if all(name in run["sets"] for name in names)]
+    found: Numbers = {
+        "sets": {name: numbers_of([run["sets"][name] for run in runs], sets[name]) for name in names}
+    }
+    if isinstance(row.entry, Agent):
+        found |= {
+            "seeds": [run["seed"] for run in runs],
+            "training": _efforts([run["training"] for run in runs]),
+        }
+        if row.mode == Mode():
+            found["curve"] = _curves([run["curve"] for run in runs])
+    elif row.entry.time_of is not None:
+        found["checks"] = runs[0]["checks"]
+    return {**found, "runs": list(runs)}
+
+
+def _efforts(trainings: Sequence[Numbers]) -> Numbers:
+    """Return the effort of the trainings of a row: medians over seeds, and the wall time of each."""
+    some = [each for each in trainings if each]
+    if not some:
         return {}
     return {
-        "decisions": int(np.median([each["decisions"] for each in last])),
-        "simulated_seconds": float(np.median([each["simulated_seconds"] for each in last])),
-        "seconds": [each["seconds"] for each in last],
-        "cores": sorted({read_json(path)["cores"] for path in cores if path.is_file()}),
-        "stopped": sorted({run.stopped for run in runs if run.stopped is not None}),
+        "decisions": int(np.median([each["decisions"] for each in some])),
+        "simulated_seconds": float(np.median([each["simulated_seconds"] for each in some])),
+        "seconds": [each["seconds"] for each in some],
+        "cores": sorted({each["cores"] for each in some if each["cores"] is not None}),
+        "stopped": sorted({each["stopped"] for each in some if each["stopped"] is not None}),
     }
 
 
-def _curve(cells: Sequence[Cell], study: Study) -> Numbers:
+def _curves(curves: Sequence[Numbers]) -> Numbers:
     """Return success on validation scenes, shape (points, seeds), and three clocks, medians over seeds."""
-    curves = [Run(study.out / cell.folder).curve for cell in cells]
-    points = list(zip(*curves, strict=False))
-    clocks = ("decisions", "simulated_seconds", "seconds")
-    return {
-        **{
-            clock: [float(np.median([each[clock] for each in point])) for point in points] for clock in clocks
-        },
-        "success": [[each["success"]["rate"] for each in point] for point in points],
+    clocks = {
+        clock: [float(np.median(point)) for point in zip(*(each[clock] for each in curves), strict=False)]
+        for clock in CLOCKS
     }
+    points = zip(*(each["success"] for each in curves), strict=False)
+    return {**clocks, "success": [list(point) for point in points]}
 
 
-def numbers_of(records: Sequence[Numbers], frozen: FrozenScenes, planner: Numbers | None) -> Numbers:
-    """Return the numbers of a row on a set.
+def numbers_of(runs: Runs, frozen: FrozenScenes) -> Numbers:
+    """Return the numbers of a row on a set from those of its runs.
 
-    `success` is the interquartile mean over seeds with its 95 % interval, `each` that of each seed, `jerk_ratio` and
-    `time` [s] are medians of successes, then over seeds; `jerk` and `duration` are multiples of the planner's in the
-    same scenes: median, least and greatest over seeds.
+    `success` is the interquartile mean over seeds with its 95 % interval, `each` that of each seed. `jerk_ratio` and
+    `time` [s] are medians over seeds; `jerk` and `duration` are median, least and greatest over seeds.
     """
-    success = outcome(records, "is_success")
-    frozen = frozen.take(slice(0, success.shape[1]))
-    solved = success.astype(bool)
+    number = runs[0]["scenes"]
+    solved = np.array([unpacked(run["solved"], number) for run in runs])
+    frozen = frozen.take(slice(0, number))
 
     def interval(some: Bool) -> list[float]:
-        return list(across_seeds(success[:, some], frozen.band[some], np.random.default_rng(0)))
+        return list(across_seeds(solved[:, some], frozen.band[some], np.random.default_rng(0)))
+
+    def known(name: str) -> list[float]:
+        return [run[name] for run in runs if run[name] is not None]
+
+    def over_seeds(name: str) -> list[float] | None:
+        values = known(name)
+        return [float(np.median(values)), min(values), max(values)] if values else None
 
     families = [str(each) for each in np.unique(frozen.family) if each]
     return {
-        "scenes": int(success.shape[1]),
-        "success": interval(np.ones(success.shape[1], dtype=bool)),
-        "each": success.mean(axis=1).tolist(),
+        "scenes": number,
+        "success": interval(np.ones(number, dtype=bool)),
+        "each": solved.mean(axis=1).tolist(),
         "by_band": {
             band: interval(frozen.band == i) for i, band in enumerate(BANDS) if (frozen.band == i).any()
         },
         "by_family": {each: interval(frozen.family == each) for each in families},
-        "collision": float(outcome(records, "collision").mean()),
-        "jerk_ratio": _median(outcome(records, "jerk_ratio"), solved),
-        "time": _median(outcome(records, "duration"), solved),
-        **_beside_planner(records, solved, planner),
+        "collision": float(np.mean(known("collision"))),
+        "jerk_ratio": _median(known("jerk_ratio")),
+        "time": _median(known("time")),
+        "jerk": over_seeds("jerk"),
+        "duration": over_seeds("duration"),
     }
 
 
-def outcome(records: Sequence[Numbers], name: str) -> Float:
-    """Return an outcome in every scene, shape (records, scenes)."""
-    return np.array([record["outcomes"][name] for record in records], dtype=float)
-
-
-def _median(values: Float, chosen: Bool) -> float | None:
-    """Return the median over seeds of the medians over chosen scenes; None if there is none."""
-    medians = [np.median(row[some]) for row, some in zip(values, chosen, strict=True) if some.any()]
-    return float(np.median(medians)) if medians else None
+def _median(values: Float | Sequence[float]) -> float | None:
+    """Return the median; None without values."""
+    return float(np.median(values)) if len(values) else None
 
 
 def _planner(study: Study, env: Environment, sets: Mapping[str, FrozenScenes]) -> Mapping[str, Numbers]:
     """Return the measurement of the planner's stored solutions on each set that has one."""
-    stored_ones = [
-        each for each in study.baselines if each.method == "stored" and env.name in each.environments
-    ]
-    if not stored_ones:
-        return {}
-    records = _baseline_records(study, env, stored_ones[0], sets)
-    return {name: some[0] for name, some in records.items()}
-
-
-def _beside_planner(records: Sequence[Numbers], success: Bool, planner: Numbers | None) -> Numbers:
-    """Return jerk and duration of successes as multiples of the planner's in the same scenes."""
-    if planner is None:
-        return {"jerk": None, "duration": None}
-    number, result = success.shape[1], {}
-    both = success & outcome([planner], "is_success")[0, :number].astype(bool)
-    for key, name in (("jerk", "jerk_ratio"), ("duration", "duration")):
-        mine, theirs = outcome(records, name), outcome([planner], name)[0, :number]
-        medians = [float(np.median(row[b] / theirs[b])) for row, b in zip(mine, both, strict=True) if b.any()]
-        result[key] = [float(np.median(medians)), min(medians), max(medians)] if medians else None
-    return result
+    for each in study.baselines:
+        if each.method == "stored" and env.name in each.environments:
+            return _baseline_records(study, env, each, sets)
+    return {}
 
 
 def _kept(old: Numbers | None, wanted: Numbers, same: Sequence[str]) -> Numbers | None:
     """Return the measured entries of an earlier row of the same method, on scenes that are the same."""
     if old is None or old.get("made") != wanted["made"]:
         return None
-    sets = {name: each for name, each in old["sets"].items() if name in same}
     names = ("seeds", "training", "curve", "decision_time", "checks")
-    return {**{name: old[name] for name in names if name in old}, "sets": sets} if sets else None
+    kept = {name: old[name] for name in names if name in old}
+    kept["sets"] = {name: each for name, each in old["sets"].items() if name in same}
+    runs = [
+        {**run, "sets": {name: each for name, each in run["sets"].items() if name in same}}
+        for run in old.get("runs", [])
+    ]
+    return {**kept, "runs": [run for run in runs if run["sets"]]} if kept["sets"] else None
+
+
+def _merged(old: Runs, new: Runs) -> list[Numbers]:
+    """Return the runs of both, by seed; a new one replaces an old one if it has a number wherever that has one."""
+    merged = {run.get("seed"): run for run in old}
+    for run in new:
+        before = merged.get(run.get("seed"))
+        if before is None or _has_all(run["sets"], before["sets"]):
+            merged[run.get("seed")] = run
+    return [merged[seed] for seed in sorted(merged, key=lambda seed: seed or 0)]
 
 
 def _covers(new: Numbers, old: Numbers) -> bool:
     """Return whether a new row has as many seeds as an old one, and a number wherever that has one."""
-    fewer = len(new.get("seeds", [])) < len(old.get("seeds", []))
-    return not fewer and all(
-        name in new["sets"]
-        and all(new["sets"][name].get(key) is not None for key in each if each[key] is not None)
-        for name, each in old["sets"].items()
+    return len(new.get("seeds", [])) >= len(old.get("seeds", [])) and _has_all(new["sets"], old["sets"])
+
+
+def _has_all(new: Numbers, old: Numbers) -> bool:
+    """Return whether the numbers by set are known wherever old ones are."""
+    return all(
+        name in new and all(new[name].get(key) is not None for key in each if each[key] is not None)
+        for name, each in old.items()
     )
 
 
 def _comparisons(
-    wanted: Sequence[tuple[str, str]],
-    rows: Sequence[Numbers],
-    records: Mapping[str, Records],
-    old: Sequence[Numbers],
+    wanted: Sequence[tuple[str, str]], rows: Sequence[Numbers], old: Sequence[Numbers]
 ) -> list[Numbers]:
     """Compare pairs of rows: agents run by run, an agent and a baseline scene by scene."""
     by_id = {each["row"]: each for each in rows}
@@ -328,8 +401,16 @@ def _comparisons(
         for name in (each for each in first["sets"] if each in second["sets"]):
             if second["kind"] == "agent":
                 entry["sets"][name] = _improvement(first["sets"][name]["each"], second["sets"][name]["each"])
-            elif all(row in records for row in pair):
-                entry["sets"][name] = _scene_by_scene(*(records[row][name] for row in pair))
+            elif first.get("runs") and second.get("runs"):
+                entry["sets"][name] = _scene_by_scene(
+                    *(
+                        [
+                            unpacked(run["sets"][name]["solved"], run["sets"][name]["scenes"])
+                            for run in each["runs"]
+                        ]
+                        for each in (first, second)
+                    )
+                )
             elif kept is not None and name in kept["sets"]:
                 entry["sets"][name] = kept["sets"][name]
         result += [entry] if entry["sets"] else []
@@ -342,10 +423,9 @@ def _improvement(first: Sequence[float], second: Sequence[float]) -> Numbers:
     return {"probability": list(interval), "pairs": len(first) * len(second)}
 
 
-def _scene_by_scene(first: Sequence[Numbers], second: Sequence[Numbers]) -> Numbers:
+def _scene_by_scene(first: Sequence[Bool], second: Sequence[Bool]) -> Numbers:
     """Return the difference of success: its median, least and greatest value over seeds, and extreme p-values."""
-    other = outcome(second, "is_success")[0] > 0.5
-    tests = [mcnemar(row, other) for row in outcome(first, "is_success") > 0.5]
+    tests = [mcnemar(solved, second[0]) for solved in first]
     differences = [test.difference for test in tests]
     return {
         "difference": [float(np.median(differences)), min(differences), max(differences)],
