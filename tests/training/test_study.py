@@ -180,6 +180,15 @@ def test_rows_without_runs_stay_until_as_many_seeds_are_measured(done):
         assert rows(gather(study_of(folder), earlier))["viaq"]["seeds"] == expected
 
 
+def test_a_run_that_solves_nothing_replaces_an_earlier_one(done, tmp_path):
+    folder, record = Path(shutil.copytree(done[0], tmp_path / "study")), done[1]
+    path = folder / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "test.4.json"
+    measured = read_json(path)
+    measured["outcomes"]["is_success"] = [0.0] * len(measured["outcomes"]["is_success"])
+    path.write_text(json.dumps(measured))
+    assert rows(gather(study_of(folder), record))["viaq/4"]["sets"]["test"]["each"][1] == 0.0
+
+
 def test_the_solved_scenes_of_every_run_are_in_the_record(done):
     folder, record = done
     for each in rows(record)["viaq/4"]["runs"]:

@@ -182,6 +182,18 @@ def test_a_pair_looks_the_same_from_everywhere(d, with_axis):
     assert torch.allclose(features(torch.eye(d, dtype=torch.float64), -1.0), seen, atol=1e-4)
 
 
+def test_features_of_a_link_change_little_when_an_obstacle_turns_a_little():
+    """In the plane, also where the obstacle is parallel to the link: a jump there would be two inputs for one pose."""
+    angle = torch.linspace(0.0, 2.0 * torch.pi, 10_001)
+    half = [0.05 * torch.cos(angle), 0.05 * torch.sin(angle)]
+    for place in ((0.0, 0.1), (0.1, 0.1), (0.2, -0.03)):
+        centre = [torch.full_like(angle, each) for each in place]
+        axis = [torch.ones_like(angle), torch.zeros_like(angle)]
+        seen = torch.stack(pair_features(centre, axis, half, torch.tensor(0.01)))
+        assert (seen[:, 1:] - seen[:, :-1]).abs().max() < 1e-4
+        assert torch.allclose(seen[:, :5000], seen[:, 5000:-1], atol=1e-5)  # half a turn is the same obstacle
+
+
 def scene(number=4, plans=5, instants=6, networks=(0, 1), d=3):
     torch.manual_seed(1)
     bodies = max(len(networks), 1)
@@ -485,6 +497,18 @@ def test_features_of_shapes_do_not_change_with_the_symmetries_of_their_boxes():
     other = [*rotate(columns[:3]), *rotate(columns[3:6]), *rotate(columns[6:9]), *columns[9:]]
     again = pairs.features(rotate(apart), rotate(axis), other)
     np.testing.assert_allclose(torch.stack(again), wanted, atol=1e-5)
+
+
+def test_features_of_shapes_change_little_when_a_body_moves_a_little():
+    """Also where it crosses the planes of symmetry of the box."""
+    pairs, (apart, axis, columns) = ShapePairs(len(KINDS), True), shape_pairs(8)
+    share = torch.linspace(-1.0, 1.0, 10_001)[:, None]
+    for direction in torch.eye(3):
+        moved = [0.5 * each + 0.3 * along * share for each, along in zip(apart, direction, strict=True)]
+        seen = torch.stack([each.expand(len(share), -1) for each in pairs.features(moved, axis, columns)])
+        steps = (seen[:, 1:] - seen[:, :-1]).abs().amax(dim=(0, 1))
+        boxes = torch.arange(8) + 8 * KINDS.index("box")
+        assert steps[boxes].max() < 1e-3
 
 
 def test_round_shapes_may_turn_about_their_axis():

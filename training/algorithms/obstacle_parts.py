@@ -175,7 +175,7 @@ class CapsulePairs:
     every = 1
 
     def __init__(self, dimension: int, links: bool) -> None:
-        self.inputs = 4 if not links else 2 * dimension + (1 if dimension == 2 else 0)
+        self.inputs = 6 if links else 4
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return the features; see :class:`PairGeometry` and :func:`pair_features`."""
@@ -196,16 +196,19 @@ class CapsulePairs:
 class ShapePairs:
     """Description of obstacles of any shape by the pose of the body in the frame of the obstacle's bounding box.
 
-    A box is symmetric under reflections at the three planes through its centre. So the body's centre is reflected into
-    the octant of positive coordinates p, and its axis u with it. Shapes that are symmetric about their z axis (spheres,
-    capsules, cylinders, half-spaces) are turned about it, too, until the centre is at y = 0. The features are
+    The features of a body with centre p and axis u, in this frame, are
 
-        p_i - h_i   how far the centre is beyond each face of the box, at least -NEAREST
-        u_i         the body's axis, if it has one
-        h_i         half lengths, at most NEAREST: faraway faces do not matter
-        one-hot     the shape
+        |p_i| - h_i        how far the centre is beyond each face of the box, at least -NEAREST
+        u_i u_i            the body's axis, if it has one
+        s_i s_j u_i u_j    for i < j, where s_i = p_i / FOLD, limited to -1 and 1
+        h_i                half lengths, at most NEAREST: faraway faces do not matter
+        one-hot            the shape
 
-    In two dimensions the third coordinate is zero.
+    They stay the same if the body's axis is reversed, and under reflections at the three planes through the centre of
+    the box: such a reflection changes the signs of p_i and u_i. They are continuous where the body crosses these
+    planes, as s_i is zero there. Shapes that are symmetric about their z axis (spheres, capsules, cylinders,
+    half-spaces) are turned about it until the body's centre is at y = 0; then s_x = 1 and s_y = 0. In two dimensions
+    the third coordinate is zero.
 
     Args:
         n_shapes: Number of shapes of the task.
@@ -214,6 +217,8 @@ class ShapePairs:
 
     NEAREST = 0.3
     """Depth below a face, and half length, beyond which features stay the same, [m]."""
+    FOLD = 0.05
+    """Distance of the body's centre from a plane of symmetry below which products of components are reduced, [m]."""
     UNIT = 0.125
     """Factor of features without a unit, in the networks' scale of lengths, [m]."""
     near: float | None = 0.09
@@ -221,7 +226,7 @@ class ShapePairs:
     every = 2
 
     def __init__(self, n_shapes: int, links: bool) -> None:
-        self.inputs = 6 + 3 * links + n_shapes
+        self.inputs = 6 + 6 * links + n_shapes
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return the features; see :class:`PairGeometry`."""
@@ -236,12 +241,19 @@ class ShapePairs:
         found = [each.clamp_min(-self.NEAREST) for each in excess]
         if axis is not None:
             a, b, c = _in_frame(axis, frame)
-            # The part is in the direction (x, y, z) from the body, so the body in the opposite one from the part.
-            found += [
-                self.UNIT * torch.where(turned, -(a * x + b * y) / across, -_sign(x) * a),
-                self.UNIT * torch.where(turned, (b * x - a * y).abs() / across, -_sign(y) * b),
-                self.UNIT * -_sign(z) * c,
-            ]
+            u = torch.where(turned, (a * x + b * y) / across, a)
+            v = torch.where(turned, (b * x - a * y) / across, b)
+            fold_x, fold_y, fold_z = ((each / self.FOLD).clamp(-1.0, 1.0) for each in (x, y, z))
+            fold_u, fold_v = torch.where(turned, 1.0, fold_x), torch.where(turned, 0.0, fold_y)
+            products = (
+                u * u,
+                v * v,
+                c * c,
+                u * v * fold_u * fold_v,
+                u * c * fold_u * fold_z,
+                v * c * fold_v * fold_z,
+            )
+            found += [self.UNIT * each for each in products]
         like = torch.zeros_like(found[0])
         found += [each.clamp_max(self.NEAREST) + like for each in half]
         return found + [self.UNIT * each + like for each in one_hot]
@@ -270,9 +282,10 @@ def pair_features(
 ) -> list[Tensor]:
     """Return invariants of the pose of an obstacle part relative to a body.
 
-    A capsule is symmetric under rotations about its axis and under reflections, a sphere under all rotations. The
-    invariants are the components of centre and half-axis along the axis of the body, in the direction of the centre
-    of the part, and perpendicular to both.
+    They do not change if body and part are rotated or reflected together, or if the half-axis is reversed. They are
+    components of the part's centre and half-axis along the body's axis, across it towards the part's centre, and across
+    both. In the plane, products of the components of the half-axis, over its length, replace these. In space, the sign
+    of the half-axis is chosen, so features jump where its component towards the part is zero.
 
     Args:
         centre: D components of the vector from the centre of the body to that of the part, [m].
@@ -288,11 +301,13 @@ def pair_features(
     along, turned = _dot(centre, axis), _dot(half_axis, axis)
     away = _root(square - along * along)
     radial = (across - along * turned) / away
+    if len(centre) == 2:
+        size = _root(length)
+        products = (turned * turned / size, radial * radial / size, 2.0 * turned * radial / size)
+        return [along, away, *products, radius.expand_as(away)]
     sign = torch.where(radial < 0.0, -1.0, 1.0)
-    features = [along, away, turned * sign, radial * sign]
-    if len(centre) == 3:
-        features.append(_root(length - turned * turned - radial * radial))
-    return [*features, radius.expand_as(away)]
+    third = _root(length - turned * turned - radial * radial)
+    return [along, away, turned * sign, radial * sign, third, radius.expand_as(away)]
 
 
 def _distance_from_axis(apart: list[Tensor], axis: list[Tensor] | None, poses: Poses) -> Tensor:
@@ -332,7 +347,3 @@ def _box_distance(place: list[Tensor], half: list[Tensor]) -> Tensor:
     """Return the distance of a point from a box around the origin."""
     beyond = [(p.abs() - h).clamp_min_(0.0) for p, h in zip(place, half, strict=True)]
     return _root(_dot(beyond, beyond))
-
-
-def _sign(values: Tensor) -> Tensor:
-    return torch.where(values < 0.0, -1.0, 1.0)

@@ -1,6 +1,6 @@
 """Record of a study: every number of its page and figures, from the files of its measurements.
 
-A row keeps the measurements of each run: which scenes it solved, medians of jerk and time, effort and learning curve.
+A row keeps the measurements of each run: which scenes it solved, medians of jerk and time, cost and learning curve.
 So its numbers may outlive the files that they came from, and a row can grow seed by seed on several machines.
 """
 
@@ -198,7 +198,7 @@ def _baseline_records(
 
 
 def _training(run: Run) -> Numbers:
-    """Return the effort of a training, and why it stopped."""
+    """Return decisions, simulated time and wall time of a training, its cores, and why it stopped."""
     if not run.curve:
         return {}
     cores = run.folder / "cores.json"
@@ -223,8 +223,9 @@ def _in_sets(records: Mapping[str, Numbers], planner: Mapping[str, Numbers]) -> 
 def in_one_set(record: Numbers, planner: Numbers | None) -> Numbers:
     """Return the numbers of a run in a set.
 
-    `solved` says which scenes it solved (see :func:`packed`), `jerk_ratio` and `time` [s] are medians of successes, and
-    `jerk` and `duration` medians of multiples of the planner's in the scenes that both solved.
+    `solved` says which scenes it solved (see :func:`packed`). `jerk_ratio` and `time`, the duration of the movement
+    [s], are medians of successes; `jerk` and `duration` are medians of jerk and duration as multiples of the planner's,
+    in the scenes that both solved.
     """
     outcomes = {name: np.asarray(values, dtype=float) for name, values in record["outcomes"].items()}
     solved = outcomes["is_success"] > 0.5
@@ -276,7 +277,7 @@ def _measured(env: Environment, row: Row, runs: Runs) -> Numbers:
 
 
 def _efforts(trainings: Sequence[Numbers]) -> Numbers:
-    """Return the effort of the trainings of a row: medians over seeds, and the wall time of each."""
+    """Return decisions and times of the trainings of a row: medians over seeds, and the wall time of each."""
     some = [each for each in trainings if each]
     if not some:
         return {}
@@ -302,8 +303,9 @@ def _curves(curves: Sequence[Numbers]) -> Numbers:
 def numbers_of(runs: Runs, frozen: FrozenScenes) -> Numbers:
     """Return the numbers of a row on a set from those of its runs.
 
-    `success` is the interquartile mean over seeds with its 95 % interval, `each` that of each seed. `jerk_ratio` and
-    `time` [s] are medians over seeds; `jerk` and `duration` are median, least and greatest over seeds.
+    `success` is the interquartile mean over seeds with its 95 % interval, `each` the share of scenes that each seed
+    solved. `jerk_ratio` and `time` are medians over seeds; `jerk` and `duration` are median, least and greatest over
+    seeds (see :func:`in_one_set`).
     """
     number = runs[0]["scenes"]
     solved = np.array([unpacked(run["solved"], number) for run in runs])
@@ -379,9 +381,13 @@ def _covers(new: Numbers, old: Numbers) -> bool:
 
 
 def _has_all(new: Numbers, old: Numbers) -> bool:
-    """Return whether the numbers by set are known wherever old ones are."""
+    """Return whether the numbers by set are known wherever old ones are; without successes there is no jerk."""
     return all(
-        name in new and all(new[name].get(key) is not None for key in each if each[key] is not None)
+        name in new
+        and (
+            new[name]["jerk_ratio"] is None
+            or all(new[name].get(key) is not None for key in each if each[key] is not None)
+        )
         for name, each in old.items()
     )
 
