@@ -21,7 +21,11 @@ pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium
 
 PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v0"
 MESSAGE = "#viapoint-message"
-NO_NOTICES = ".mantine-Notifications-root { display: none }"
+HIDE_NOTICES = """
+document.head.append(Object.assign(document.createElement("style"), {
+    textContent: ".mantine-Notifications-root { display: none }"
+}))
+"""
 SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
 """Displacements, [m]."""
 UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
@@ -165,12 +169,7 @@ def test_a_proposal_is_highlighted_under_the_pointer(opened):
     open_page, open_tab = opened
     tab, session = open_tab(open_page(PLANAR))
     settled(session)
-    # A browser without a graphics card may show a notice about it above the scene.
-    tab.run(
-        "document.head.append(Object.assign(document.createElement('style'), {textContent: '"
-        + NO_NOTICES
-        + "'}))"
-    )
+    tab.run(HIDE_NOTICES)  # without a graphics card there may be a notice about it above the scene
     paths = np.stack([each.path() for each in session._proposals])
     away = np.linalg.norm(paths[:, :, None, None] - paths, axis=-1).min(axis=-1)
     away = np.sort(away, axis=-1)[..., 1]  # distances from the other paths

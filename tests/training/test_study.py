@@ -208,15 +208,12 @@ def test_rows_of_other_scenes_do_not_stay(done, tmp_path):
 @pytest.mark.parametrize("of", ["study", "preset"])
 def test_rows_of_other_settings_do_not_stay(done, tmp_path, monkeypatch, of):
     _, record = done
-    changes = {
-        "agents": {},
-        "compare": [],
-        "baselines": ["search16"],
-    }  # a search of another kind has this name
-    if of == "preset":
+    changes = {"baselines": [], "compare": []}
+    if of == "study":  # in the record, a search of another kind has this name
+        changes |= {"agents": {}, "baselines": ["search16"]}
+    else:
         slower = dataclasses.replace(PRESETS["viaq"], hyperparameters=(("learning_rate", 1e-4),))
         monkeypatch.setitem(PRESETS, "viaq", slower)
-        changes = {"baselines": [], "compare": []}
     assert rows(gather(study_of(tmp_path, **changes), record)) == {}
 
 

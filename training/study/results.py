@@ -136,7 +136,10 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
     for row in rows_in(study, env):
         wanted = row.described(env)
         kept = _kept(old.get(row.id), wanted, same)
-        runs = _merged((kept or {}).get("runs", []), _plain(list(_runs(study, env, row, sets, planner))))
+        measured = _plain(
+            list(_runs(study, env, row, sets, planner))
+        )  # rounded as those of the earlier record
+        runs = _merged((kept or {}).get("runs", []), measured)
         new = _measured(env, row, runs) if runs else None
         chosen = new if new is not None and (kept is None or _covers(new, kept)) else kept
         if chosen is not None:
@@ -172,14 +175,13 @@ def _runs(
         return
     mode = row.mode or Mode()
     for cell in trained(study, env, row.entry):
-        folder = study.out / cell.folder
+        run = Run(study.out / cell.folder)
         found = {
-            name: stored(folder / evaluation_path(name, mode), identity_of(frozen, Run(folder).best, mode))
+            name: stored(run.folder / evaluation_path(name, mode), identity_of(frozen, run.best, mode))
             for name, frozen in sets.items()
         }
         records = {name: record for name, record in found.items() if record is not None}
         if records:
-            run = Run(folder)
             curve = {"curve": _curve(run)} if mode == Mode() else {}
             yield {"seed": cell.seed, "training": _training(run), **curve, "sets": _in_sets(records, planner)}
 
@@ -409,18 +411,17 @@ def _comparisons(
                 entry["sets"][name] = _improvement(first["sets"][name]["each"], second["sets"][name]["each"])
             elif first.get("runs") and second.get("runs"):
                 entry["sets"][name] = _scene_by_scene(
-                    *(
-                        [
-                            unpacked(run["sets"][name]["solved"], run["sets"][name]["scenes"])
-                            for run in each["runs"]
-                        ]
-                        for each in (first, second)
-                    )
+                    *(_solved(each["runs"], name) for each in (first, second))
                 )
             elif kept is not None and name in kept["sets"]:
                 entry["sets"][name] = kept["sets"][name]
         result += [entry] if entry["sets"] else []
     return result
+
+
+def _solved(runs: Runs, name: str) -> Bool:
+    """Return which scenes of a set each run solved, shape (runs, scenes)."""
+    return np.array([unpacked(run["sets"][name]["solved"], run["sets"][name]["scenes"]) for run in runs])
 
 
 def _improvement(first: Sequence[float], second: Sequence[float]) -> Numbers:
@@ -429,7 +430,7 @@ def _improvement(first: Sequence[float], second: Sequence[float]) -> Numbers:
     return {"probability": list(interval), "pairs": len(first) * len(second)}
 
 
-def _scene_by_scene(first: Sequence[Bool], second: Sequence[Bool]) -> Numbers:
+def _scene_by_scene(first: Bool, second: Bool) -> Numbers:
     """Return the difference of success: its median, least and greatest value over seeds, and extreme p-values."""
     tests = [mcnemar(solved, second[0]) for solved in first]
     differences = [test.difference for test in tests]
