@@ -175,7 +175,7 @@ class CapsulePairs:
     every = 1
 
     def __init__(self, dimension: int, links: bool) -> None:
-        self.inputs = 6 if links else 4
+        self.inputs = dimension + 4 if links else 4
 
     def features(self, apart: list[Tensor], axis: list[Tensor] | None, columns: list[Tensor]) -> list[Tensor]:
         """Return the features; see :class:`PairGeometry` and :func:`pair_features`."""
@@ -282,10 +282,12 @@ def pair_features(
 ) -> list[Tensor]:
     """Return invariants of the pose of an obstacle part relative to a body.
 
-    They do not change if body and part are rotated or reflected together, or if the half-axis is reversed. They are
-    components of the part's centre and half-axis along the body's axis, across it towards the part's centre, and across
-    both. In the plane, products of the components of the half-axis, over its length, replace these. In space, the sign
-    of the half-axis is chosen, so features jump where its component towards the part is zero.
+    They do not change if body and part are rotated or reflected together, or if the half-axis is reversed. For a sphere
+    they are the distance of the part, the components of the half-axis towards it (absolute) and across, and the radius.
+    For a body with an axis they are the components of the part's centre along and across this axis; with t and r, the
+    components of the half-axis along the body's axis and across it towards the part, and with the half-axis' length h,
+    the products t t / h, r r / h and 2 t r / h; in space also h, which two components do not determine; the radius.
+    Products do not depend on the sign of the half-axis, so they are continuous where a sign of t or r changes.
 
     Args:
         centre: D components of the vector from the centre of the body to that of the part, [m].
@@ -301,13 +303,10 @@ def pair_features(
     along, turned = _dot(centre, axis), _dot(half_axis, axis)
     away = _root(square - along * along)
     radial = (across - along * turned) / away
-    if len(centre) == 2:
-        size = _root(length)
-        products = (turned * turned / size, radial * radial / size, 2.0 * turned * radial / size)
-        return [along, away, *products, radius.expand_as(away)]
-    sign = torch.where(radial < 0.0, -1.0, 1.0)
-    third = _root(length - turned * turned - radial * radial)
-    return [along, away, turned * sign, radial * sign, third, radius.expand_as(away)]
+    size = _root(length)
+    products = [turned * turned / size, radial * radial / size, 2.0 * turned * radial / size]
+    lengths = [size.expand_as(away)] if len(centre) == 3 else []
+    return [along, away, *products, *lengths, radius.expand_as(away)]
 
 
 def _distance_from_axis(apart: list[Tensor], axis: list[Tensor] | None, poses: Poses) -> Tensor:
