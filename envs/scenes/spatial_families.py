@@ -31,7 +31,9 @@ DEEP = (0.10, 0.18)
 GAP = (0.07, 0.16)
 """Distance from the middle of a gap in a wall to each side, [m]; the gripper is 0.21 m wide."""
 PANEL = (0.10, 0.20)
-"""Half length of walls on either side of a gap, and of the boards of cupboards, [m]."""
+"""Half length of walls on either side of a gap, and of the top boards of cupboards, [m]."""
+DEPTH = (0.04, 0.10)
+"""Half depth of cupboards along the path, [m]; paths rise and fall, so few are above a deep board everywhere."""
 ABOVE = (0.02, 0.15)
 """Height of walls and cupboards above the hand, [m]."""
 DOWN = (0.0, 0.0, -1.0)
@@ -217,7 +219,7 @@ def cupboard(uniforms: Uniforms, site: SpatialSite) -> Structures:
     side = _outwards(site)
     gap, deep = between(GAP, u[..., 2] * (1.0 - site.hardness)), between(PANEL, u[..., 3])
     low, top = site.place[..., 2] - _depth(u, site), site.place[..., 2] + 0.5 * between(ABOVE, u[..., 4])
-    long, panel = between(PANEL, u[..., 5]), site.place + (gap + THICKNESS)[..., None] * side
+    long, panel = between(DEPTH, u[..., 5]), site.place + (gap + THICKNESS)[..., None] * side
     parts = [
         _box(_at_height(panel, 0.5 * (low + top)), side, (THICKNESS, long, 0.5 * (top - low))),
         _box(_at_height(panel + deep[..., None] * side, top + THICKNESS), side, (deep, long, THICKNESS)),

@@ -1,6 +1,8 @@
 """Laws of the families of hard scenes: each is what its name says."""
 
+import contextlib
 import copy
+import dataclasses
 import doctest
 import pickle
 import re
@@ -19,8 +21,9 @@ from viapoint.envs.mdp.task import family_sampler
 from viapoint.envs.scenes import families
 from viapoint.envs.scenes.config import SpaceDistribution
 from viapoint.envs.scenes.families import register_scene_family, scene_families
+from viapoint.envs.scenes.feasible_path import DRAW_ORDER
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS
-from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.sampler import SHARED_GROUPS, SceneSampler
 from viapoint.envs.scenes.scene import check_scenes
 
 PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
@@ -209,6 +212,21 @@ def test_families_of_boxes_are_trained_or_held_out(boxes):
     assert {name for name in BOX_FAMILIES if name in trained} == {"table", "bin", "notch", "cupboard"}
     assert all(families[name].hard != families[name].trained for name in BOX_FAMILIES)
     assert trained - set(BOX_FAMILIES) == set(task_of(SPACE, shapes="capsule").scenes.families)
+
+
+def test_families_that_are_trained_on_fit_before_others_are_drawn_instead(boxes):
+    """Otherwise a family is rarer in random scenes than its place among the families says."""
+    order = DRAW_ORDER[3]._replace(groups=DRAW_ORDER[3].groups[:SHARED_GROUPS])
+    task, seeds, found = boxes.task, range(24), {}
+    for name in set(task.scenes.families):
+        only = dataclasses.replace(task.scenes, families=(name,))
+        sampler, fits = SceneSampler(task.collision_model, only, order=order), 0
+        for seed in seeds:
+            with contextlib.suppress(RuntimeError):
+                sampler([np.random.default_rng(seed)])
+                fits += 1
+        found[name] = fits / len(seeds)
+    assert min(found.values()) > 0.7, found
 
 
 @pytest.fixture
