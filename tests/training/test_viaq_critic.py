@@ -192,8 +192,8 @@ def test_features_of_a_link_change_little_when_an_obstacle_turns_a_little(d):
         axis = [torch.full_like(angle, each) for each in (1.0, 0.0, 0.0)[:d]]
         seen = torch.stack(pair_features(centre, axis, half, torch.tensor(0.01)))
         assert (seen[:, 1:] - seen[:, :-1]).abs().max() < 1e-4
-        if d == 2:
-            assert torch.allclose(seen[:, :5000], seen[:, 5000:-1], atol=1e-5)  # half a turn is the same obstacle
+        if d == 2:  # half a turn is the same obstacle
+            assert torch.allclose(seen[:, :5000], seen[:, 5000:-1], atol=1e-5)
 
 
 def scene(number=4, plans=5, instants=6, networks=(0, 1), d=3):
