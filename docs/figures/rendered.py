@@ -28,8 +28,8 @@ FILES = {
     "PlanarWholeArm": "planar_whole_arm.png",
 }
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
-PASSAGES = {IN_PLANE: (29, 4, 10, 37), IN_SPACE: (62, 102)}
-"""Scenes of `test` in which the shipped agents are shown; in space a gap in a wall, and a bin."""
+PASSAGES = {IN_PLANE: (29, 4, 10, 37), IN_SPACE: (122, 39, 110)}
+"""Scenes of `test` in which the shipped agents are shown; in space a gap in a wall, a bin, and a cupboard."""
 REPLANNING = {"viapoint/PlanarMovingObstacles-v0": (2, 45), "viapoint/PlanarTargetJump-v0": (3,)}
 """Scenes of `validation` in which the shipped agents with replanning are shown."""
 MOMENTS = (0.3, 0.45, 0.6, 1.0)
