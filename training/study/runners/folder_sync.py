@@ -9,8 +9,8 @@ import contextlib
 import io
 import os
 import shutil
-import tarfile
 import threading
+import zipfile
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
@@ -78,16 +78,16 @@ def unpack(changes: Changes, folder: Path) -> None:
 
 def _archive(folder: Path) -> bytes:
     packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w") as archive:
+    with zipfile.ZipFile(packed, "w") as archive:
         for path in sorted(folder.iterdir()):
             if path.is_file() and not UNFINISHED.fullmatch(path.name):
-                archive.add(path, path.name)
+                archive.write(path, path.name)
     return packed.getvalue()
 
 
 def _extract(content: bytes, folder: Path) -> None:
-    with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-        archive.extractall(folder, filter="data")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(folder)
 
 
 class Sender:
