@@ -285,8 +285,8 @@ def pair_features(
     They do not change if body and part are rotated or reflected together, or if the half-axis is reversed. For a sphere
     they are the distance of the part, the components of the half-axis towards it (absolute) and across, and the radius.
     For a body with an axis they are the components of the part's centre along and across this axis; with t and r, the
-    components of the half-axis along the body's axis and across it towards the part, and with the half-axis' length h,
-    the products t t / h, r r / h and 2 t r / h; in space also h, which two components do not determine; the radius.
+    components of the half-axis along the body's axis and across it towards the part, and with the half-axis' length l,
+    the products t t / l, r r / l and 2 t r / l; in space also l, which two components do not determine; the radius.
     Products do not depend on the sign of the half-axis, so they are continuous where a sign of t or r changes.
 
     Args:

@@ -136,9 +136,7 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
     for row in rows_in(study, env):
         wanted = row.described(env)
         kept = _kept(old.get(row.id), wanted, same)
-        measured = _plain(
-            list(_runs(study, env, row, sets, planner))
-        )  # rounded as those of the earlier record
+        measured = _plain(list(_runs(study, env, row, sets, planner)))  # rounded as the earlier record
         runs = _merged((kept or {}).get("runs", []), measured)
         new = _measured(env, row, runs) if runs else None
         chosen = new if new is not None and (kept is None or _covers(new, kept)) else kept
