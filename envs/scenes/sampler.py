@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.common.types import Float, Index, Int
-from viapoint.envs.geometry.rows import CAPSULES, row_size
+from viapoint.envs.common.types import Bool, Float, Index, Int
+from viapoint.envs.geometry.rows import CAPSULES, has_shapes, row_size, shape_columns, shape_number
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, ObstacleSampler, Uniforms, reshaped
 from viapoint.envs.scenes.families import MOST_DRAWN, scene_families
@@ -31,7 +31,7 @@ FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
 TOGETHER = 1280
 """Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
-MOST_AHEAD = 320
+MOST_AHEAD = 800
 """Greatest number of attempts, over all scenes, for which several groups are drawn at once."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
@@ -181,16 +181,18 @@ class SceneSampler:
     def _reshaped(self, uniforms: Uniforms, rows: Index, scenes: Scenes) -> tuple[Index, Scenes]:
         """Return the good attempts and their scenes with obstacles of the distribution's shapes.
 
-        What is inside a capsule may no longer be in the way of the straight movement; such attempts fail.
+        What is inside a capsule may no longer be in the way of the straight movement; such attempts fail. Boxes are
+        parts of structures of boxes, which stay as they are and in the way.
         """
         if not self._reshape_size:
             return rows, scenes
         u = uniforms.take_table(self._obstacles.rows, RESHAPE_NUMBERS)
-        obstacles = reshaped(scenes.obstacles, u, self.distribution.shapes)
-        scenes = scenes._replace(obstacles=obstacles)
-        some = np.flatnonzero(
-            blocks_straight_movement(self.collision_model, scenes) | ~scenes.present.any(-1)
-        )
+        boxes = _has_boxes(scenes.obstacles)
+        scenes = scenes._replace(obstacles=reshaped(scenes.obstacles, u, self.distribution.shapes))
+        good = boxes | ~scenes.present.any(axis=-1)
+        rest = np.flatnonzero(~good)
+        good[rest] = blocks_straight_movement(self.collision_model, scenes.take(rest))
+        some = np.flatnonzero(good)
         return rows[some], scenes.take(some)
 
 
@@ -308,6 +310,14 @@ def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -
     """Return the sampler of a distribution."""
     kind = MixedSampler if distribution.uniform_share else SceneSampler
     return kind(collision_model, distribution)
+
+
+def _has_boxes(obstacles: Float) -> Bool:
+    """Return which of N scenes have a box, shape (N,), from rows of either kind."""
+    if not has_shapes(obstacles):
+        return np.zeros(len(obstacles), dtype=bool)
+    boxes = shape_columns(obstacles).kind == shape_number("box")
+    return np.asarray((boxes & (obstacles[..., -1] > 0.0)).any(axis=-1))
 
 
 def _drawn(distribution: Distribution) -> Distribution:

@@ -106,6 +106,17 @@ class Structures(NamedTuple):
     """Unit vectors along which parts retreat from the arm, shape (N, K, n, 3)."""
 
 
+class _Box(NamedTuple):
+    """Upright boxes at K places of N scenes."""
+
+    centre: Float
+    """Shape (N, K, 3), [m]."""
+    heading: Float
+    """Horizontal vectors along their first axes, shape (N, K, 3)."""
+    half: tuple[Float | float, ...]
+    """Half lengths along the heading, to its left and upwards, shape (N, K) each, [m]."""
+
+
 Builder = Callable[[Uniforms, SpatialSite], Structures]
 
 
@@ -167,14 +178,14 @@ def table(uniforms: Uniforms, site: SpatialSite) -> Structures:
     first = between(THING_HEIGHT, u[..., 5])
     surface = site.place[..., 2] - _depth(u, site) - 2.0 * first
     middle = site.place + 0.1 * (u[..., 4:5] - 0.5) * left(heading)
-    parts = [_box(_at_height(middle, surface - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
+    parts = [_Box(_at_height(middle, surface - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
     for thing in range(3):
         v = _more(u, thing)
         far = 0.8 * size * (2.0 * v[..., :2] - 1.0)
         away = far[..., :1] * heading + far[..., 1:] * left(heading)
         place, half = (middle + away, between(THING_HEIGHT, v[..., 2])) if thing else (site.place, first)
         wide = between(THING_WIDTH, v[..., 3:5])
-        parts.append(_box(_at_height(place, surface + half), heading, (wide[..., 0], wide[..., 1], half)))
+        parts.append(_Box(_at_height(place, surface + half), heading, (wide[..., 0], wide[..., 1], half)))
     return _structures(parts, [DOWN] * 4)
 
 
@@ -184,12 +195,12 @@ def bin_(uniforms: Uniforms, site: SpatialSite) -> Structures:
     end, heading = _end(u, site), rotate(site.heading, 0.5 * np.pi * u[..., 1])
     low, rim = end[..., 2] - _depth(u, site), end[..., 2] + between(RIM, u[..., 2])
     size = between(BIN, u[..., 3:5])
-    parts = [_box(_at_height(end, low - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
+    parts = [_Box(_at_height(end, low - THICKNESS), heading, (size[..., 0], size[..., 1], THICKNESS))]
     for sign in (-1.0, 1.0):
         for axis, wide, along in ((heading, 0, 1), (left(heading), 1, 0)):
             wall = end + sign * (size[..., wide, None] + THICKNESS) * axis
             half = (THICKNESS, size[..., along] + THICKNESS * (1.0 + along), 0.5 * (rim - low))
-            parts.append(_box(_at_height(wall, 0.5 * (rim + low)), axis, half))
+            parts.append(_Box(_at_height(wall, 0.5 * (rim + low)), axis, half))
     return _structures(parts, [DOWN] * 5)
 
 
@@ -201,16 +212,11 @@ def notch(uniforms: Uniforms, site: SpatialSite) -> Structures:
 def wall_window(uniforms: Uniforms, site: SpatialSite) -> Structures:
     """Return a wall across the path with a window: two panels, a sill, and a lintel over the arm."""
     u = uniforms.take(BUILDER_NUMBERS)
-    wall, out = _wall(u, site), _outwards(site)
-    half = between(PANEL, u[..., 5])
+    out, half = _outwards(site), between(PANEL, u[..., 5])
     middle = site.place + (half - 0.08)[..., None] * out
-    lintel = _box(
-        _at_height(middle, site.top + site.sizes.link_margin + THICKNESS), out, (half, THICKNESS, THICKNESS)
-    )
-    up = np.broadcast_to((0.0, 0.0, 1.0), (*lintel.shape[:2], 1, 3))
-    return Structures(
-        np.concatenate((wall.rows, lintel[:, :, None]), axis=2), np.concatenate((wall.retreat, up), axis=2)
-    )
+    top = site.top + site.sizes.link_margin + THICKNESS
+    lintel = _Box(_at_height(middle, top), out, (half, THICKNESS, THICKNESS))
+    return _together(_wall(u, site), _structures([lintel], [(0.0, 0.0, 1.0)]))
 
 
 def cupboard(uniforms: Uniforms, site: SpatialSite) -> Structures:
@@ -221,9 +227,9 @@ def cupboard(uniforms: Uniforms, site: SpatialSite) -> Structures:
     low, top = site.place[..., 2] - _depth(u, site), site.place[..., 2] + 0.5 * between(ABOVE, u[..., 4])
     long, panel = between(DEPTH, u[..., 5]), site.place + (gap + THICKNESS)[..., None] * side
     parts = [
-        _box(_at_height(panel, 0.5 * (low + top)), side, (THICKNESS, long, 0.5 * (top - low))),
-        _box(_at_height(panel + deep[..., None] * side, top + THICKNESS), side, (deep, long, THICKNESS)),
-        _box(_at_height(site.place, low - THICKNESS), side, (gap + THICKNESS, long, THICKNESS)),
+        _Box(_at_height(panel, 0.5 * (low + top)), side, (THICKNESS, long, 0.5 * (top - low))),
+        _Box(_at_height(panel + deep[..., None] * side, top + THICKNESS), side, (deep, long, THICKNESS)),
+        _Box(_at_height(site.place, low - THICKNESS), side, (gap + THICKNESS, long, THICKNESS)),
     ]
     return _structures(parts, [side, side, DOWN])
 
@@ -237,10 +243,10 @@ def cage(uniforms: Uniforms, site: SpatialSite) -> Structures:
     for first in (-1.0, 1.0):
         for second in (-1.0, 1.0):
             corner = end + first * size[..., :1] * sides[0] + second * size[..., 1:] * sides[1]
-            parts.append(_box(_at_height(corner, 0.5 * rim), heading, (THICKNESS, THICKNESS, 0.5 * rim)))
+            parts.append(_Box(_at_height(corner, 0.5 * rim), heading, (THICKNESS, THICKNESS, 0.5 * rim)))
         for axis, wide, along in ((sides[0], 0, 1), (sides[1], 1, 0)):
             rail = _at_height(end + first * size[..., wide, None] * axis, rim + THICKNESS)
-            parts.append(_box(rail, axis, (THICKNESS, size[..., along], THICKNESS)))
+            parts.append(_Box(rail, axis, (THICKNESS, size[..., along], THICKNESS)))
     return _structures(parts, [DOWN] * 8)
 
 
@@ -359,8 +365,8 @@ def _wall(u: Float, site: SpatialSite) -> Structures:
     for sign, number in ((-1.0, u[..., 1]), (1.0, u[..., 2])):
         half = between(PANEL, number)
         panel = middle + (sign * (width + half))[..., None] * across
-        parts.append(_box(_at_height(panel, 0.5 * top), across, (half, THICKNESS, 0.5 * top)))
-    parts.append(_box(_at_height(middle, 0.5 * sill), across, (width, THICKNESS, 0.5 * sill)))
+        parts.append(_Box(_at_height(panel, 0.5 * top), across, (half, THICKNESS, 0.5 * top)))
+    parts.append(_Box(_at_height(middle, 0.5 * sill), across, (width, THICKNESS, 0.5 * sill)))
     return _structures(parts, [-across, across, DOWN])
 
 
@@ -370,14 +376,13 @@ def _end(u: Float, site: SpatialSite) -> Float:
     return np.where(u[..., 5:] < 0.5, start, goal)
 
 
-def _box(centre: Float, heading: Float, half: tuple[Float | float, ...]) -> Float:
-    """Return boxes with half lengths along the heading, to its left and upwards, at least 5 mm."""
-    sizes = np.stack([np.broadcast_to(np.maximum(each, 0.005), centre.shape[:-1]) for each in half], axis=-1)
-    return box_rows(centre, heading, sizes)
-
-
-def _structures(parts: list[Float], retreats: list[Float | tuple[float, ...]]) -> Structures:
-    """Return boxes and the directions of their retreat."""
-    rows = np.stack(parts, axis=-2)
-    each = [np.broadcast_to(retreat, rows[..., 0, :3].shape) for retreat in retreats]
-    return Structures(rows, np.stack(each, axis=-2))
+def _structures(parts: list[_Box], retreats: list[Float | tuple[float, ...]]) -> Structures:
+    """Return upright boxes, with half lengths of at least 5 mm, and the directions of their retreat."""
+    shape = (*parts[0].centre.shape[:2], len(parts))
+    centre, heading, half = np.empty((*shape, 3)), np.empty((*shape, 3)), np.empty((*shape, 3))
+    retreat = np.empty((*shape, 3))
+    for i, part in enumerate(parts):
+        centre[:, :, i], heading[:, :, i], retreat[:, :, i] = part.centre, part.heading, retreats[i]
+        for axis in range(3):
+            half[:, :, i, axis] = part.half[axis]
+    return Structures(box_rows(centre, heading, np.maximum(half, 0.005)), retreat)
