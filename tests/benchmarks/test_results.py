@@ -1,5 +1,6 @@
 """The page of results, and the tables of other pages, are those that the study makes of its record."""
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -46,6 +47,20 @@ def test_every_table_of_the_study_is_on_a_page_that_it_fills(study):
     for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         there = re.search(r"^<!-- table:", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
         assert path in pages or not there, path
+
+
+def test_shipped_agents_are_those_of_seed_0(record):
+    first = {
+        name: run["weights"]
+        for name, numbers in record["environments"].items()
+        for each in numbers["rows"]
+        for run in each["runs"]
+        if each["row"] == "viaq" and run["seed"] == 0 and "weights" in run
+    }
+    assert first
+    for name, weights in first.items():
+        shipped = ROOT / "training" / "pretrained" / name.removeprefix("viapoint/") / "weights.safetensors"
+        assert hashlib.sha256(shipped.read_bytes()).hexdigest() == weights, name
 
 
 def test_the_record_holds_rows_of_the_study_alone(study, record):

@@ -259,15 +259,16 @@ def _hash_of_file(path: Path, time: int, size: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def identity_of(frozen: FrozenScenes, model: Path, mode: Mode) -> Record:
-    """Return the entries that identify the evaluation of an agent."""
+def weights_hash(model: Path) -> str:
+    """Return the SHA-256 of the weights of a model folder."""
     weights = model / "weights.safetensors"
     state = weights.stat()
-    return {
-        "scenes": frozen.sha256,
-        "weights": _hash_of_file(weights, state.st_mtime_ns, state.st_size),
-        "mode": mode.name,
-    }
+    return _hash_of_file(weights, state.st_mtime_ns, state.st_size)
+
+
+def identity_of(frozen: FrozenScenes, model: Path, mode: Mode) -> Record:
+    """Return the entries that identify the evaluation of an agent."""
+    return {"scenes": frozen.sha256, "weights": weights_hash(model), "mode": mode.name}
 
 
 def identity(baseline: Baseline, env: Environment, frozen: FrozenScenes) -> Record:

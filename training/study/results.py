@@ -32,6 +32,7 @@ from viapoint.training.study.jobs import (
     stored,
     times_of,
     trained,
+    weights_hash,
     with_checks,
 )
 
@@ -180,8 +181,8 @@ def _runs(
         }
         records = {name: record for name, record in found.items() if record is not None}
         if records:
-            curve = {"curve": _curve(run)} if mode == Mode() else {}
-            yield {"seed": cell.seed, "training": _training(run), **curve, "sets": _in_sets(records, planner)}
+            own = {"curve": _curve(run), "weights": weights_hash(run.best)} if mode == Mode() else {}
+            yield {"seed": cell.seed, "training": _training(run), **own, "sets": _in_sets(records, planner)}
 
 
 def _baseline_records(
