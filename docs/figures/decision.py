@@ -71,7 +71,7 @@ def decide() -> Decision:
     with torch.no_grad():
         actions, merits = policy.propose(batch)
         margin = policy.critic(policy.inputs(batch, actions)).margin[0].numpy()
-    checked = [int(row) for row in policy._promising(merits)[0]]
+    checked = [int(row) for row in policy._promising(merits, CHECKS)[0]]
     action = policy.decide(batch)[0]
     chosen = int(np.abs(actions[0] - action).max(axis=-1).argmin())
     clearance = check_plans(batch, actions[:, checked], env.unwrapped.task).clearance[0]
