@@ -29,6 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -66,18 +67,15 @@ def random_shape(kind: str, generator: np.random.Generator) -> Shape:
         "position": generator.uniform(-0.2, 0.2, 3),
         "quaternion": quaternion / np.linalg.norm(quaternion),
     }
-    first, *others = generator.uniform(0.02, 0.2, 3)
-    if kind == "box":
-        return Box((first, *others), **pose)
-    if kind == "half_space":
-        return HalfSpace(**pose)
+    numbers = generator.uniform(0.02, 0.2, 3)
     if kind == "convex_mesh":
         return ConvexMesh.hull(0.1 * generator.normal(size=(20, 3)), **pose)
     if kind == "point_cloud":
-        return PointCloud(0.1 * generator.normal(size=(40, 3)), 0.3 * first, **pose)
-    if kind == "sphere":
-        return Sphere(first, **pose)
-    return SHAPES[kind](first, others[0], **pose)  # type: ignore[call-arg]
+        return PointCloud(0.1 * generator.normal(size=(40, 3)), 0.3 * numbers[0], **pose)
+    values, left = {}, list(numbers)
+    for name, shape in SHAPES[kind].sizes.items():
+        values[name] = np.reshape([left.pop(0) for _ in range(math.prod(shape))], shape)
+    return SHAPES[kind](**values, **pose)
 
 
 class Probes(NamedTuple):

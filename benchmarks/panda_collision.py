@@ -15,6 +15,7 @@ Columns, for each link and all that moves with it, the base first:
 
     forearm_and_flange   least distances within reach of geometry and capsules of forearm and flange, which are not
                          compared, [mm], and share of the positions in which their capsules touch, [%]
+    not_compared         pairs of bodies that are not compared, by reason
 
 Outside and excess are measured at points on the surfaces. The excess that the fit prints is exact, but that of single
 capsules: parts of the same link may fill it.
@@ -27,6 +28,7 @@ import itertools
 import json
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,7 +77,7 @@ SELF_BITS, TABLE_BIT = 4, 4
 OFF_TABLE, DARK = BODIES[4:], BODIES[6:]
 """Bodies that must not touch the table, and those with the darker colour."""
 FOREARM, FLANGE_LINK = "link5", "link7"
-"""Links that are not compared although their capsules touch within reach; :func:`forearm_and_hand` measures why not."""
+"""Links that are not compared although their capsules touch within reach; :func:`forearm_and_flange` has the reason."""
 HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
 """Configuration in which bodies that touch may touch anywhere, [rad]."""
 SAMPLES = 100_000
@@ -171,11 +173,8 @@ def fit(folder: Path) -> dict[str, list[LinkCapsule]]:
     return found
 
 
-def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> set[tuple[str, str]]:
-    """Return the pairs of bodies, the one nearer to the base first, that need not be compared.
-
-    Neighbours, which may touch, are not among them: MuJoCo leaves them out.
-    """
+def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> dict[tuple[str, str], str]:
+    """Return the pairs of bodies that are not compared, the one nearer to the base first, with the reason."""
     arm = serial_arm(
         model_text(capsules, set()), name="all", joint_names=PANDA.joint_names, hand_site="hand", ik=PANDA.ik,
         workspace=PANDA.workspace,
@@ -186,15 +185,18 @@ def skipped_pairs(capsules: dict[str, list[LinkCapsule]]) -> set[tuple[str, str]
     for i, j in arm.self_pairs:
         one, other = sorted((names[i], names[j]), key=BODIES.index)
         pairs.setdefault((one, other), []).append((i, j))
-    skipped = {(FOREARM, FLANGE_LINK)}
+    skipped = dict.fromkeys(itertools.pairwise(LINKS), "adjacent")
+    skipped |= {(LINKS[-2], "gripper"): "adjacent", (FOREARM, FLANGE_LINK): "only capsules overlap"}
     for bodies, some in pairs.items():
         pair = replace(arm, self_pairs=tuple(some), off_table=())
-        if pair.self_clearance(np.array(HOME)) < 0.0 or (pair.self_clearance(joints) > 0.0).all():
-            skipped.add(bodies)
+        if pair.self_clearance(np.array(HOME)) < 0.0:
+            skipped.setdefault(bodies, "touch at home")
+        elif (pair.self_clearance(joints) > 0.0).all():
+            skipped.setdefault(bodies, "never touch")
     return skipped
 
 
-def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[str, str]]) -> str:
+def model_text(capsules: dict[str, list[LinkCapsule]], skipped: Collection[tuple[str, str]]) -> str:
     """Return `panda.xml` with other capsules; all bodies collide but neighbours and some pairs.
 
     Body k, counted from the base, has the contact bit SELF_BITS + k, and collides with the bits of the bodies before it
@@ -218,7 +220,7 @@ def model_text(capsules: dict[str, list[LinkCapsule]], skipped: set[tuple[str, s
     return "\n".join(lines) + "\n"
 
 
-def geom_lines(body: str, capsules: list[LinkCapsule], skipped: set[tuple[str, str]]) -> list[str]:
+def geom_lines(body: str, capsules: list[LinkCapsule], skipped: Collection[tuple[str, str]]) -> list[str]:
     """Return the geoms of a body."""
     place = BODIES.index(body)
     contype = 1 << (SELF_BITS + place) | (place > 0) | (TABLE_BIT if body in OFF_TABLE else 0)
@@ -370,7 +372,10 @@ def main() -> None:
     options = parser.parse_args()
     capsules, file = fit(options.meshes), ASSETS / "panda.xml"
     skipped = skipped_pairs(capsules)
-    print(f"bodies that are not compared: {sorted(skipped)}")
+    not_compared: dict[str, list[str]] = {}
+    for pair, reason in sorted(skipped.items()):
+        not_compared.setdefault(reason, []).append("-".join(pair))
+    print(f"bodies that are not compared: {not_compared}")
     text = model_text(capsules, skipped)
     if options.write:
         file.write_text(text, encoding="utf-8")
@@ -385,8 +390,8 @@ def main() -> None:
     apart = forearm_and_flange(bodies)
     print(f"forearm and flange within reach: {apart}")
     if options.out:
-        text = json.dumps({"links": found, "forearm_and_flange": apart}, indent=1)
-        options.out.write_text(text + "\n", encoding="utf-8")
+        results = {"links": found, "forearm_and_flange": apart, "not_compared": not_compared}
+        options.out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

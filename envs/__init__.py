@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from viapoint.envs.record_video import RecordMovements
     from viapoint.envs.replanning_env import ReplanningEnv, ReplanningVectorEnv
     from viapoint.envs.scenes.families import register_scene_family
+    from viapoint.envs.scenes.options import scene_from_json, scene_to_json
     from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
     from viapoint.envs.single_env import ReachEnv
     from viapoint.envs.vector_env import ReachVectorEnv
@@ -62,6 +63,7 @@ else:
         "record_video": ("RecordMovements",),
         "replanning_env": ("ReplanningEnv", "ReplanningVectorEnv"),
         "scenes.families": ("register_scene_family",),
+        "scenes.options": ("scene_from_json", "scene_to_json"),
         "scenes.scene": ("TARGETS", "rows_of_lights"),
         "single_env": ("ReachEnv",),
         "vector_env": ("ReachVectorEnv",),
@@ -116,5 +118,7 @@ __all__ = [
     "register_arm",
     "register_scene_family",
     "rows_of_lights",
+    "scene_from_json",
+    "scene_to_json",
     "signed_distances",
 ]

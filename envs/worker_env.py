@@ -25,15 +25,26 @@ from viapoint.envs.common.validation import (
     seeds_of,
     whole_number,
 )
+from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.worker_process import WorkerDiedError, WorkerProcess
 
 
 class BatchServer:
-    """Native batch of environments that a worker runs; the arms are those that the keyword arguments may name."""
+    """Native batch of environments that a worker runs; the keyword arguments may name the given arms and shapes."""
 
-    def __init__(self, kind: Any, num_envs: int, kwargs: Mapping[str, Any], arms: Iterable[Any]) -> None:
+    def __init__(
+        self,
+        kind: Any,
+        num_envs: int,
+        kwargs: Mapping[str, Any],
+        arms: Iterable[Any],
+        shapes: Mapping[str, type[Shape]],
+    ) -> None:
         for arm in arms:
             register_arm(arm)
+        SHAPES.clear()  # rows of scenes name shapes by their place in the table
+        SHAPES.update(shapes)
         self.env = kind(num_envs, **kwargs)
         self._next: Any = None
 
@@ -120,10 +131,9 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         bounds = np.linspace(0, self.num_envs, self.n_workers + 1).astype(int).tolist()
         self.parts = [slice(*pair) for pair in pairwise(bounds)]
         """Environments of each process."""
+        mine = {**kwargs, "threads": threads}
         servers = [
-            partial(
-                BatchServer, kind, part.stop - part.start, {**kwargs, "threads": threads}, list(ARMS.values())
-            )
+            partial(BatchServer, kind, part.stop - part.start, mine, list(ARMS.values()), dict(SHAPES))
             for part in self.parts
         ]
         self._workers = self._start(servers, threads)

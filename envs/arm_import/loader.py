@@ -58,7 +58,7 @@ def load_arm(
     torque_limit: ArrayLike | None = None,
     velocity_limit: ArrayLike | None = None,
     hand_radius: float = 0.02,
-    tolerance: float = 0.03,
+    tolerance: float = 0.025,
 ) -> SerialArm:
     """Load an arm from an MJCF file.
 

@@ -76,3 +76,23 @@ def in_space(points: N, height: float = 0.0) -> N:
         return points
     raised: N = np.concatenate((points, np.full_like(points[..., :1], height)), axis=-1)  # type: ignore[assignment]
     return raised
+
+
+def frozen(array: Any) -> Any:
+    """Return a NumPy array after making it read-only."""
+    array.flags.writeable = False
+    return array
+
+
+def safe_ratio(numerator: Array, denominator: Array) -> Array:
+    """Return a quotient, or 0 where the denominator is 0."""
+    xp = namespace_of(denominator)
+    zero = denominator == 0.0
+    return xp.where(zero, 0.0, numerator / xp.where(zero, 1.0, denominator))
+
+
+def spread(*arrays: Array) -> list[Array]:
+    """Return arrays, broadcast to one shape of at least one axis."""
+    xp = namespace_of(arrays[0])
+    shape = np.broadcast_shapes(*(tuple(a.shape) for a in arrays))
+    return [xp.broadcast_to(a, shape) for a in arrays]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any, cast
 
@@ -135,3 +135,22 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     if len(seeds) != num_envs:
         raise ValueError(f"seed must be a whole number or {num_envs} of them, got {len(seeds)}")
     return seeds
+
+
+def as_constants(name: str, values: Any, wanted: str, fits: Callable[..., bool]) -> Float:
+    """Return real numbers as a new array, without a gradient.
+
+    Args:
+        name: Name of the argument for errors.
+        values: Array or nested lists.
+        wanted: Description of the shape for errors.
+        fits: Function that returns True for an allowed shape, given as its lengths.
+    """
+    try:
+        array = as_real_array(values)
+    except RuntimeError:  # of torch, which converts no tensors with a gradient
+        raise ValueError(f"{name} must not require a gradient, use {name}.detach()") from None
+    if array is None or not fits(*array.shape):
+        got = "no real numbers" if array is None else f"shape {array.shape}"
+        raise ValueError(f"{name} must have shape {wanted}, got {got}")
+    return array.astype(np.float64)

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, NamedTuple, Self
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import frozen, norm, spread
 from viapoint.envs.common.types import Float, Index
-from viapoint.envs.common.validation import as_real_array
+from viapoint.envs.common.validation import as_constants
 from viapoint.envs.geometry.segments import nearest_on_segments
 from viapoint.envs.geometry.shape import (
     Components,
@@ -23,14 +23,16 @@ from viapoint.envs.geometry.shape import (
     length,
     lowest_of_lines,
     nearest_to_origin,
-    spread,
 )
 from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
 
 DENT = 1e-6
 """Depth of a vertex below the hull, as a share of the mesh's size, from which a mesh is not convex."""
-COPLANAR = 1e-8
-"""Relative difference of planes below which they are one plane."""
+COPLANAR = 2e-7
+"""Distance from a face's plane, as a share of the mesh's size, within which triangles belong to the face: several times
+the rounding of vertices in single precision."""
+FOOT_TOLERANCE = 1e-8
+"""Relative height above other planes up to which the foot of a perpendicular lies on its face."""
 
 
 class Polytope(NamedTuple):
@@ -44,6 +46,8 @@ class Polytope(NamedTuple):
     """One end of each edge, shape (E, 3), [m]."""
     edges: Float
     """Vectors to the other end, shape (E, 3), [m]."""
+    depth: float
+    """Greatest depth of a vertex below the plane of its own face, from rounding, [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +76,12 @@ class ConvexMesh(Shape):
     @classmethod
     def hull(cls, points: Any, **pose: Any) -> Self:
         """Return the convex hull of points, shape (K, 3), [m]; `pose` are position, quaternion and name."""
-        vertices = _checked_vertices(cls, points, pose.get("name", ""))
-        return cls(vertices[np.unique(hull_triangles(vertices))], **pose)
+        try:
+            vertices = _checked_vertices(points)
+            vertices = vertices[np.unique(hull_triangles(vertices))]
+        except ValueError as error:
+            raise cls._refusal(pose.get("name", ""), str(error)) from None
+        return cls(vertices, **pose)
 
     @property
     def bounding_sphere(self) -> tuple[Array, Array]:
@@ -96,11 +104,10 @@ class ConvexMesh(Shape):
 
     def _check(self) -> None:
         try:
-            vertices = _checked_vertices(type(self), self.vertices, self.name)
-            _check_convex(vertices, self.faces)
+            object.__setattr__(self, "vertices", frozen(_checked_vertices(self.vertices)))
+            _check_convex(self.vertices, self.polytope, self.faces)
         except ValueError as error:
             raise self._error(str(error)) from None
-        object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", None)
 
     def _signed(self, points: Components) -> Array:
@@ -128,7 +135,7 @@ class ConvexMesh(Shape):
         body, number = self.polytope, points.shape[1]
         face, edge = np.zeros(number, np.intp), np.zeros(number, np.intp)
         on_face = np.ones(number, dtype=bool)
-        size = COPLANAR * (1.0 + np.abs(body.offsets).max())
+        size = FOOT_TOLERANCE * (1.0 + np.abs(body.offsets).max()) + 2.0 * body.depth
         points = points.astype(np.float64, copy=False)
         for some in blocks(number, len(body.offsets)):
             heights = body.normals @ points[:, some] - body.offsets[:, None]
@@ -192,7 +199,7 @@ def hull_triangles(vertices: Float) -> Index:
     different, index = np.unique(vertices, axis=0, return_index=True)
     size = np.ptp(vertices, axis=0).max()
     unit = (different - vertices.mean(axis=0)) / (size if size > 0.0 else 1.0)
-    if len(unit) < 4 or np.linalg.svd(unit - unit.mean(axis=0))[1][2] < DENT:
+    if len(unit) < 4 or np.linalg.svd(unit - unit.mean(axis=0), compute_uv=False)[2] < DENT:
         raise ValueError("vertices must span a volume, they lie in a plane; use a thin box or a point cloud")
     spec = mujoco.MjSpec()
     spec.add_mesh(name="hull", uservert=unit.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
@@ -203,22 +210,20 @@ def hull_triangles(vertices: Float) -> Index:
     return np.asarray(index[faces])
 
 
-def _checked_vertices(cls: type[ConvexMesh], points: Any, name: str) -> Float:
+def _checked_vertices(points: Any) -> Float:
     """Return vertices as an array, shape (V, 3)."""
-    array = as_real_array(points)
-    if array is None or array.ndim != 2 or array.shape[-1] != 3 or len(array) < 4:
-        got = "no real numbers" if array is None else f"shape {array.shape}"
-        raise ValueError(f"vertices must have shape (V, 3) with V at least 4, got {got}")
+    array = as_constants(
+        "vertices", points, "(V, 3) with V at least 4", lambda *s: s[1:] == (3,) and s[0] > 3
+    )
     if not np.isfinite(array).all():
         raise ValueError(f"vertices must be finite, got {array[~np.isfinite(array).all(axis=1)][0].tolist()}")
-    return array.astype(np.float64)
+    return array
 
 
-def _check_convex(vertices: Float, faces: Any) -> None:
+def _check_convex(vertices: Float, body: Polytope, faces: Any) -> None:
     """Check that all vertices lie on their hull, and that the faces, if given, enclose all of it."""
-    triangles = hull_triangles(vertices)
-    normals, offsets = _planes(vertices, triangles)
-    depth = (offsets - vertices @ normals.T).min(axis=1)
+    parts = blocks(len(vertices), len(body.offsets))
+    depth = np.concatenate([(body.offsets - vertices[some] @ body.normals.T).min(axis=1) for some in parts])
     deepest, size = int(depth.argmax()), np.ptp(vertices, axis=0).max()
     hint = "ConvexMesh.hull(vertices) is the hull"
     if depth[deepest] > DENT * size:
@@ -233,7 +238,8 @@ def _check_convex(vertices: Float, faces: Any) -> None:
         raise ValueError(f"faces must be triangles, integers of shape (F, 3), got shape {corners.shape}")
     if corners.size and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(f"faces must be indices of the {len(vertices)} vertices, got {corners.max()}")
-    enclosed, whole = abs(_volumes(vertices, corners).sum()), np.abs(_volumes(vertices, triangles)).sum()
+    enclosed = abs(_volumes(vertices, corners).sum())
+    whole = np.abs(_volumes(vertices, hull_triangles(vertices))).sum()
     if abs(enclosed - whole) > 10.0 * DENT * whole:
         raise ValueError(
             f"faces are not those of a convex mesh: they enclose {enclosed:.4g} m^3, their hull "
@@ -247,29 +253,70 @@ def _volumes(vertices: Float, triangles: Any) -> Float:
     return np.asarray((a * np.cross(b, c)).sum(axis=1) / 6.0)
 
 
-def _planes(vertices: Float, triangles: Index) -> tuple[Float, Float]:
-    """Return outer unit normals and offsets of the planes of triangles; no vertex is above a plane."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    normals = normals / norm(normals)[:, None]
-    normals = (
-        normals * np.where((normals * (a - vertices.mean(axis=0))).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    )
-    return normals, (vertices @ normals.T).max(axis=0)
-
-
 def _polytope(vertices: Float) -> Polytope:
-    """Return the planes and edges of the hull of vertices; triangles of one plane become one face."""
+    """Return the planes and edges of the hull of vertices; triangles of one plane become one face.
+
+    The normal of a face is along the sum of its triangles' area vectors, which depends on its outline alone, so that
+    triangles of nearly no area do not matter. Edges between triangles of one face are none.
+    """
     triangles = hull_triangles(vertices)
-    normals, offsets = _planes(vertices, triangles)
-    near = np.abs(normals[:, None] - normals).max(axis=-1) < COPLANAR
-    plane = (near & (np.abs(offsets[:, None] - offsets) < COPLANAR)).argmax(axis=1)
-    sides: dict[tuple[int, int], set[int]] = {}
-    for corners, face in zip(triangles, plane, strict=True):
-        for i in range(3):
-            first, second = sorted((int(corners[i - 1]), int(corners[i])))
-            sides.setdefault((first, second), set()).add(int(face))
-    edges = np.array([ends for ends, faces in sides.items() if len(faces) > 1])
-    kept = np.unique(plane)
+    areas, height = _area_vectors(vertices, triangles)
+    wide = height > DENT * np.ptp(vertices, axis=0).max()
+    if not (np.isfinite(height).all() and wide.any()):
+        raise ValueError("vertices must have a hull with finite planes; give them in metres")
+    pairs, ends = _neighbours(triangles)
+    face = _faces(vertices, triangles, areas, pairs)
+    kept = np.unique(face[wide])
+    normals = np.zeros_like(areas)
+    np.add.at(normals, face, areas)
+    normals = normals[kept] / norm(normals[kept])[:, None]
+    parts = blocks(len(vertices), len(kept))
+    offsets = np.max([(normals @ vertices[some].T).max(axis=1) for some in parts], axis=0)
+    own = np.searchsorted(kept, face).clip(max=len(kept) - 1)
+    inner = offsets[own, None] - np.einsum("fij,fj->fi", vertices[triangles], normals[own])
+    edges = np.unique(ends[face[pairs[:, 0]] != face[pairs[:, 1]]], axis=0)
     starts = vertices[edges[:, 0]]
-    return Polytope(normals[kept], offsets[kept], starts, vertices[edges[:, 1]] - starts)
+    depth = inner[kept[own] == face].max()
+    return Polytope(normals, offsets, starts, vertices[edges[:, 1]] - starts, float(depth))
+
+
+def _area_vectors(vertices: Float, triangles: Index) -> tuple[Float, Float]:
+    """Return outward normals of triangles, as long as twice their areas, and their least heights, [m]."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    with np.errstate(all="ignore"):
+        areas = np.cross(b - a, c - a)
+        areas[(areas * (a - vertices.mean(axis=0))).sum(axis=1) < 0.0] *= -1.0
+        return areas, norm(areas) / np.max([norm(b - a), norm(c - b), norm(a - c)], axis=0)
+
+
+def _neighbours(triangles: Index) -> tuple[Index, Index]:
+    """Return pairs of triangles with a common edge, shape (P, 2), and the vertices at the ends of these edges."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(sides.T)
+    same = (sides[order[1:]] == sides[order[:-1]]).all(axis=1)
+    return np.stack((order[:-1], order[1:]), axis=1)[same] // 3, sides[order[1:]][same]
+
+
+def _faces(vertices: Float, triangles: Index, areas: Float, pairs: Index) -> Index:
+    """Return the face of each triangle as the index of the face's largest triangle, shape (F,).
+
+    A face grows from its largest triangle across common edges, as long as the corners lie in that triangle's plane.
+    """
+    adjacent: list[list[int]] = [[] for _ in triangles]
+    for first, second in pairs.tolist():
+        adjacent[first].append(second)
+        adjacent[second].append(first)
+    size, tolerance = norm(areas), COPLANAR * np.ptp(vertices, axis=0).max()
+    face = np.full(len(triangles), -1)
+    for seed in np.argsort(-size, kind="stable").tolist():
+        if face[seed] >= 0:
+            continue
+        face[seed], grown = seed, [seed]
+        normal = areas[seed] / max(size[seed], np.finfo(float).tiny)
+        while grown:
+            for other in adjacent[grown.pop()]:
+                corners = vertices[triangles[other]] - vertices[triangles[seed, 0]]
+                if face[other] < 0 and np.abs(corners @ normal).max() <= tolerance:
+                    face[other] = seed
+                    grown.append(other)
+    return face

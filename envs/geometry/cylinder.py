@@ -8,9 +8,9 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import clamp
+from viapoint.envs.common.arrays import clamp, safe_ratio, spread
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape, best_of, safe_ratio, spread
+from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape, best_of
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 NEWTON_STEPS = 12

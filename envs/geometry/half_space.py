@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import as_constants
 from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape, quaternion_to
 from viapoint.primitives.array_api import Array, namespace_of, to_numpy
 
@@ -43,7 +44,14 @@ class HalfSpace(Shape):
             position: A point of the surface, shape (3,), [m].
             name: Name for error messages.
         """
-        return cls(position=position, quaternion=quaternion_to(normal), name=name)
+        try:
+            outward = as_constants("normal", normal, "(3,)", lambda *shape: shape == (3,))
+        except ValueError as error:
+            raise cls._refusal(name, str(error)) from None
+        longest = np.abs(outward).max()
+        if not 0.0 < longest < np.inf:
+            raise cls._refusal(name, f"normal must be finite and not zero, got {outward.tolist()}")
+        return cls(position=position, quaternion=quaternion_to(outward / longest), name=name)
 
     @property
     def bounding_sphere(self) -> tuple[Array, Array]:

@@ -8,9 +8,9 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import TINY
+from viapoint.envs.common.arrays import TINY, frozen, spread
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_real_array
+from viapoint.envs.common.validation import as_constants
 from viapoint.envs.geometry.shape import (
     OUTLINE_POINTS,
     Components,
@@ -19,7 +19,6 @@ from viapoint.envs.geometry.shape import (
     blocks,
     bounds_of_points,
     length,
-    spread,
 )
 from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
 
@@ -67,17 +66,18 @@ class PointCloud(Shape):
         return [geom.position[:2] + circle for geom in self.geoms()]
 
     def _check(self) -> None:
-        array = as_real_array(self.points)
-        if array is None or array.ndim != 2 or array.shape[-1] != 3 or not len(array):
-            got = "no real numbers" if array is None else f"shape {array.shape}"
-            raise self._error(f"points must have shape (K, 3) with K at least 1, got {got}")
+        wanted = "(K, 3) with K at least 1"
+        try:
+            array = as_constants("points", self.points, wanted, lambda *s: s[1:] == (3,) and s[0] > 0)
+        except ValueError as error:
+            raise self._error(str(error)) from None
         if not (finite := np.isfinite(array).all(axis=1)).all():
             wrong = int(finite.argmin())
             raise self._error(
                 f"points must be finite, got {array[wrong].tolist()} at index {wrong} ({(~finite).sum()} of "
                 f"{len(array)} points); remove them: points[np.isfinite(points).all(axis=1)]"
             )
-        object.__setattr__(self, "points", array.astype(np.float64))
+        object.__setattr__(self, "points", frozen(array))
 
     def _signed(self, points: Components) -> Array:
         xp = namespace_of(points[0])

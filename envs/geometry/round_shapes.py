@@ -10,6 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import as_constants
 from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
 from viapoint.envs.geometry.shape import (
     FLAT,
@@ -113,9 +114,19 @@ class Capsule(Shape):
             radius: [m].
             name: Name for error messages.
         """
-        first, second = (in_space(np.asarray(end, dtype=np.float64)) for end in (first, second))
+        sizes = ((3,), (2,))
+        try:
+            first, second = (
+                in_space(as_constants("ends", end, "(3,) or (2,)", lambda *shape: shape in sizes))
+                for end in (first, second)
+            )
+        except ValueError as error:
+            raise cls._refusal(name, str(error)) from None
         half = 0.5 * (second - first)
         turn, size = quaternion_to(half), norm(half)
+        if not 0.0 < size < np.inf:
+            reason = f"ends must be finite and different, got {first.tolist()} and {second.tolist()}"
+            raise cls._refusal(name, f"{reason}; a capsule without a length is a Sphere")
         return cls(radius, size, position=0.5 * (first + second), quaternion=turn, name=name)
 
     @property

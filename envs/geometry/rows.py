@@ -30,6 +30,8 @@ SHAPE_SIZE = 8
 """Numbers of the shape in a row."""
 POSE_SIZE = 13
 """Number of values of one obstacle in an observation after those of its kind."""
+LISTS = "a list of shapes, dictionaries or rows of numbers"
+"""Allowed obstacles, for error messages."""
 
 
 class ShapeColumns(NamedTuple):
@@ -157,8 +159,8 @@ def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSUL
     """Return obstacles as the rows of scenes, shape (n, row_size), [m].
 
     Args:
-        obstacles: Shapes and dictionaries, or one list of them for each of N scenes; anything else is returned as it
-            is, such as rows.
+        obstacles: Shapes and dictionaries, or one list of them for each of N scenes; rows of numbers are returned as
+            they are.
         dimension: D. In the plane, spheres, capsules and centres lie at the height 0, and boxes and cylinders stand
             upright; their heights do not matter.
         shapes: Names of the shapes that the scenes may have. Spheres count as capsules where they have no name of their
@@ -169,20 +171,19 @@ def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSUL
         that a scene lacks are zero.
 
     Raises:
-        ValueError: A shape is not allowed in scenes, or does not lie in the plane.
+        ValueError: The obstacles are no list of shapes, dictionaries or numbers, or a shape is not allowed in scenes or
+            does not lie in the plane.
 
     Example:
         >>> from viapoint.envs import Capsule, obstacle_rows
         >>> obstacle_rows([Capsule.between((0.0, 0.3), (0.2, 0.3), radius=0.02)], dimension=2).round(3).tolist()
         [[0.1, 0.3, 0.1, 0.0, 0.02]]
     """
-    if not isinstance(obstacles, list | tuple):
-        return obstacles
-    if any(isinstance(each, Shape | Mapping) for each in obstacles):
+    refuse_single(obstacles)
+    if is_shape_list(obstacles):
         return np.array([_row(i, o, dimension, tuple(shapes)) for i, o in enumerate(as_obstacles(obstacles))])
-    inner = [each for each in obstacles if isinstance(each, list | tuple)]
-    if not any(isinstance(each, Shape | Mapping) for scene in inner for each in scene):
-        return obstacles
+    if not _has_lists(obstacles):
+        return _checked_numbers(obstacles)
     rows = np.zeros((len(obstacles), max(map(len, obstacles)), row_size(dimension, shapes)))
     for i, scene in enumerate(obstacles):
         try:
@@ -191,6 +192,50 @@ def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSUL
         except ValueError as error:
             raise ValueError(f"scene {i}: {error}") from None
     return rows
+
+
+def obstacle_names(obstacles: Any) -> list[list[str]]:
+    """Return the names of the obstacles that :func:`obstacle_rows` takes, empty where there is none.
+
+    Returns:
+        One list for all scenes, or one for each of N scenes; rows of numbers have no names.
+    """
+    if is_shape_list(obstacles):
+        return [[each.name for each in as_obstacles(obstacles)]]
+    return [obstacle_names(scene)[0] for scene in obstacles] if _has_lists(obstacles) else [[]]
+
+
+def refuse_single(obstacles: Any) -> None:
+    """Raise ValueError for one shape or dictionary that is in no list."""
+    if isinstance(obstacles, Shape | Mapping):
+        raise ValueError(f"obstacles must be {LISTS}; put a single obstacle in a list, got {obstacles!r:.80}")
+
+
+def is_shape_list(obstacles: Any) -> bool:
+    """Return True for a list of shapes and dictionaries."""
+    return isinstance(obstacles, list | tuple) and any(
+        isinstance(each, Shape | Mapping) for each in obstacles
+    )
+
+
+def _has_lists(obstacles: Any) -> bool:
+    """Return True for lists of shapes and dictionaries, one for each scene."""
+    return isinstance(obstacles, list | tuple) and any(map(is_shape_list, obstacles))
+
+
+def _checked_numbers(obstacles: Any) -> Any:
+    """Return obstacles that are real numbers as they are.
+
+    Raises:
+        ValueError: The obstacles are something else.
+    """
+    try:
+        real = np.asarray(obstacles).dtype.kind in "fiub"
+    except (TypeError, ValueError):
+        real = False
+    if not real:
+        raise ValueError(f"obstacles must be {LISTS}, got {obstacles!r:.80}")
+    return obstacles
 
 
 def obstacles_from_rows(rows: Float) -> list[Shape]:
@@ -222,7 +267,9 @@ def obstacles_from_rows(rows: Float) -> list[Shape]:
     return found
 
 
-def observation_rows(obstacles: Sequence[Shape], n_rows: int, shapes: Sequence[str] | None = None) -> Single:
+def observation_rows(
+    obstacles: Sequence[Shape | Mapping[str, Any]], n_rows: int, shapes: Sequence[str] | None = None
+) -> Single:
     """Return obstacles as rows of numbers for networks, one for each; absent rows are zero.
 
     A row is (shape one-hot, centre 3, rotation 6, half lengths 3, present): the centre and half lengths are those of
@@ -230,9 +277,12 @@ def observation_rows(obstacles: Sequence[Shape], n_rows: int, shapes: Sequence[s
     et al., On the continuity of rotation representations in neural networks, 2019).
 
     Args:
-        obstacles: Shapes.
+        obstacles: Shapes and dictionaries.
         n_rows: Number of rows.
         shapes: Names of the shapes of the one-hot part; by default all of SHAPES.
+
+    Raises:
+        ValueError: There are too many obstacles, or one is not allowed or has none of the shapes.
 
     Example:
         >>> from viapoint.envs import Box, observation_rows
@@ -240,11 +290,15 @@ def observation_rows(obstacles: Sequence[Shape], n_rows: int, shapes: Sequence[s
         >>> rows[0, 7:].astype(float).round(3).tolist()  # behind the one-hot
         [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.2, 0.25, 1.0]
     """
-    if len(obstacles) > n_rows:
-        raise ValueError(f"there may be at most {n_rows} obstacles, got {len(obstacles)}")
+    refuse_single(obstacles)
+    given = as_obstacles(obstacles)
+    if len(given) > n_rows:
+        raise ValueError(f"there may be at most {n_rows} obstacles, got {len(given)}")
     kinds = list(SHAPES if shapes is None else shapes)
     rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
-    for row, each in zip(rows, obstacles, strict=False):
+    for i, (row, each) in enumerate(zip(rows, given, strict=False)):
+        if each.kind not in kinds:
+            raise ValueError(f"{_numbered(i, each)}: the shapes are {', '.join(kinds)}, not {each.kind}")
         row[kinds.index(each.kind)] = 1.0
         centre, half = each.box()
         row[len(kinds) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
@@ -309,6 +363,11 @@ def check_shapes(shapes: Any) -> tuple[str, ...]:
     return names
 
 
+def _numbered(index: int, obstacle: Shape) -> str:
+    """Return number and name of an obstacle, for error messages."""
+    return f"obstacle {index}{f' {obstacle.name!r}' if obstacle.name else ''}"
+
+
 def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -> Float:
     """Return an obstacle as a row of a scene."""
     kind = obstacle.kind
@@ -321,16 +380,17 @@ def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -
             reason += f"; make it with shapes={(*shapes, kind)!r}"
         else:
             reason += ", which is for distances only"
-        raise ValueError(f"obstacle {index}: {reason}")
+        raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
     wanted = {**obstacle.sizes, "position": (3,), "quaternion": (4,)}
     for name, shape in wanted.items():
         if (got := tuple(getattr(obstacle, name).shape)) != shape:
             batch = got[: len(got) - len(shape)]
-            raise ValueError(f"obstacle {index}: {obstacle.kind} must be one shape, got a batch of {batch}")
+            reason = f"{obstacle.kind} must be one shape, got a batch of {batch}"
+            raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
     try:
         centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()
     except ValueError as error:
-        raise ValueError(f"obstacle {index}: {error}") from None
+        raise ValueError(f"{_numbered(index, obstacle)}: {error}") from None
     quaternion = to_numpy(obstacle.quaternion).astype(np.float64)
     if shapes == CAPSULES:
         axis = to_numpy(obstacle.half_axis) if isinstance(obstacle, Capsule) else np.zeros(3)

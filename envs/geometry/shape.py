@@ -29,7 +29,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import TINY, clamp, dot, norm
+from viapoint.envs.common.arrays import TINY, clamp, dot, frozen, norm
 from viapoint.envs.common.types import Float
 from viapoint.primitives.array_api import (
     Array,
@@ -51,7 +51,7 @@ BLOCK = 1 << 16
 """Numbers of a temporary table."""
 SEARCH_STEPS = 40
 """Steps of the golden-section search; its interval is then 5e-9 of the segment."""
-GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """Share of the interval that remains after a step of the golden-section search."""
 FLAT = 1e-9
 """Greatest height of obstacles in the plane, [m]; rounding of quaternions."""
@@ -85,7 +85,7 @@ class Shape(abc.ABC):
 
     Parameters may have leading axes, which are those of a batch: `Sphere(radius, position)` with shapes (N,) and (N, 3)
     is N spheres. They broadcast with the leading axes of points. Parameters and points are NumPy arrays or torch
-    tensors; results follow the library and dtype of the points.
+    tensors; results follow the library and dtype of the points. NumPy parameters are read-only copies.
 
     Example:
         >>> import numpy as np
@@ -128,7 +128,7 @@ class Shape(abc.ABC):
         except ValueError as error:
             raise self._error(str(error)) from None
         for name, value in values.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, frozen(value.copy()) if xp is np else value)
         self._check()
 
     def __eq__(self, other: object) -> bool:
@@ -321,13 +321,24 @@ class Shape(abc.ABC):
 
     def _error(self, message: str) -> ValueError:
         """Return an error that names the shape."""
-        return ValueError(f"{self.kind}{f' {self.name!r}' if self.name else ''}: {message}")
+        return self._refusal(self.name, message)
+
+    @classmethod
+    def _refusal(cls, name: str, message: str) -> ValueError:
+        """Return an error that names a shape before it exists."""
+        return ValueError(f"{cls.kind}{f' {name!r}' if name else ''}: {message}")
 
     def _matched(self, *points: Array) -> tuple[Self, list[Array]]:
         """Return the shape and points in one array library, dtype and device."""
-        if all(type(p) is np.ndarray and p.dtype == np.float64 for p in (*points, self.position)):
+        if all(
+            type(p) is np.ndarray and p.dtype == np.float64 and p.shape[-1:] == (3,)
+            for p in (*points, self.position)
+        ):
             return self, list(points)
         _, arrays = as_floats(**{f"points {i}": p for i, p in enumerate(points)})
+        for array in arrays:
+            if tuple(array.shape[-1:]) != (3,):
+                raise self._error(f"points must have shape (..., 3), got shape {tuple(array.shape)}")
         own = self
         if type(arrays[0]) is np.ndarray and type(self.position) is not np.ndarray:
             arrays = [like(namespace_of(self.position), a, self.position) for a in arrays]
@@ -338,7 +349,10 @@ class Shape(abc.ABC):
             xp = namespace_of(arrays[0])
             for name in (*self.sizes, "position", "quaternion"):
                 value = getattr(self, name)
-                value = like(xp, value, arrays[0]) if type(value) is np.ndarray else value.to(arrays[0])
+                # a copy, because torch warns of arrays that are read-only
+                value = (
+                    like(xp, value.copy(), arrays[0]) if type(value) is np.ndarray else value.to(arrays[0])
+                )
                 object.__setattr__(own, name, value)
         return own, arrays
 
@@ -398,20 +412,6 @@ def quaternion_to(direction: Any) -> Float:
     quaternion = np.empty(4)
     mujoco.mju_quatZ2Vec(quaternion, np.asarray(direction, dtype=np.float64))
     return quaternion
-
-
-def spread(*arrays: Array) -> list[Array]:
-    """Return arrays, broadcast to one shape of at least one axis."""
-    xp = namespace_of(arrays[0])
-    shape = np.broadcast_shapes(*(tuple(a.shape) for a in arrays))
-    return [xp.broadcast_to(a, shape) for a in arrays]
-
-
-def safe_ratio(numerator: Array, denominator: Array) -> Array:
-    """Return a quotient, or 0 where the denominator is 0."""
-    xp = namespace_of(denominator)
-    zero = denominator == 0.0
-    return xp.where(zero, 0.0, numerator / xp.where(zero, 1.0, denominator))
 
 
 def length(vector: Components) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -19,7 +20,7 @@ from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.shape import Shape
-from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -125,12 +126,15 @@ def obstacles_from_json(text: str) -> list[Shape]:
 
 
 def signed_distances(
-    obstacles: Sequence[Shape], first: Array, second: Array | None = None, radius: Array = 0.0
+    obstacles: Sequence[Shape | Mapping[str, Any]],
+    first: Array,
+    second: Array | None = None,
+    radius: Array = 0.0,
 ) -> Array:
     """Return the signed distance of spheres or capsules from each of n obstacles, shape (..., n), [m].
 
     Args:
-        obstacles: n shapes.
+        obstacles: n shapes or dictionaries.
         first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
         second: The other end; None for spheres.
         radius: Radius, [m].
@@ -146,25 +150,26 @@ def signed_distances(
         return namespace_of(first).zeros_like(first[..., :0])
     each = [
         o.distance(first, radius) if second is None else o.segment_distance(first, second, radius)
-        for o in obstacles
+        for o in as_obstacles(obstacles)
     ]
     return namespace_of(each[0]).stack(each, -1)
 
 
 def nearest_distance(
-    obstacles: Sequence[Shape],
-    first: Float,
-    second: Float | None = None,
+    obstacles: Sequence[Shape | Mapping[str, Any]],
+    first: Array,
+    second: Array | None = None,
     radius: Any = 0.0,
     most: float = np.inf,
-) -> Float:
+) -> Array:
     """Return the least signed distance of spheres or capsules from all obstacles, shape (...,), at most `most`, [m].
 
     Broad phase: bounding spheres bound every distance from below. Narrow phase: obstacles in the order of their bounds;
-    distances are only computed where the bound is below the least distance so far.
+    distances are only computed where the bound is below the least distance so far. With torch tensors, all distances
+    are computed, and the result is a tensor with their gradient.
 
     Args:
-        obstacles: Shapes.
+        obstacles: Shapes or dictionaries.
         first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
         second: The other end; None for spheres.
         radius: Radius, which broadcasts with the leading axes, [m].
@@ -175,8 +180,19 @@ def nearest_distance(
         >>> nearest_distance([HalfSpace(), Sphere(0.1, position=(0.5, 0.0, 0.3))], [0.5, 0.0, 0.6], most=1.0).round(3)
         np.float64(0.2)
     """
-    first = np.asarray(first, dtype=np.float64)
-    ends = [first] if second is None else [first, np.asarray(second, dtype=np.float64)]
+    obstacles = as_obstacles(obstacles)
+    given = (first, second, radius, *(o.position for o in obstacles))
+    if tensors := [each for each in given if hasattr(each, "requires_grad")]:
+        xp = namespace_of(tensors[0])
+        if first is not tensors[0]:
+            first = like(xp, np.asarray(first, dtype=np.float64), tensors[0])
+        each = signed_distances(obstacles, first, second, radius)
+        nearest = xp.full(each.shape[:-1], most, dtype=each.dtype, device=each.device)
+        return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
+    ends = [np.asarray(end, dtype=np.float64) for end in (first, second) if end is not None]
+    for end in ends:
+        if end.shape[-1:] != (3,):
+            raise ValueError(f"points must have shape (..., 3), got shape {end.shape}")
     shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
@@ -198,13 +214,13 @@ def nearest_distance(
 
 
 def add_to_model(
-    spec: mujoco.MjSpec, obstacles: Sequence[Shape], body: Any = None, **attributes: Any
+    spec: mujoco.MjSpec, obstacles: Sequence[Shape | Mapping[str, Any]], body: Any = None, **attributes: Any
 ) -> list[list[str]]:
     """Add the geoms of obstacles to a MuJoCo model, and return their names, one list for each obstacle.
 
     Args:
         spec: Model.
-        obstacles: Shapes.
+        obstacles: Shapes or dictionaries, with different names.
         body: Body of the geoms; the world by default.
         **attributes: Attributes of all geoms, such as `contype` or `rgba`.
 
@@ -218,11 +234,16 @@ def add_to_model(
         2
     """
     body = spec.worldbody if body is None else body
+    obstacles = as_obstacles(obstacles)
+    named = [each.name or f"obstacle_{i}" for i, each in enumerate(obstacles)]
+    for i, name in enumerate(named):
+        if named.index(name) < i:
+            raise ValueError(f"obstacle {i}: obstacle {named.index(name)} has the name {name!r}, too")
     names: list[list[str]] = []
     for i, each in enumerate(obstacles):
         names.append([])
         for j, geom in enumerate(each.geoms()):
-            name = f"{each.name or f'obstacle_{i}'}_{j}"
+            name = f"{named[i]}_{j}"
             mesh = {}
             if geom.vertices is not None:
                 mesh = {"meshname": name}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,7 +10,16 @@ import numpy as np
 
 from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.rows import CAPSULES, obstacle_rows, row_size, widened
+from viapoint.envs.geometry.rows import (
+    CAPSULES,
+    is_shape_list,
+    obstacle_names,
+    obstacle_rows,
+    refuse_single,
+    row_size,
+    widened,
+)
+from viapoint.envs.geometry.shapes import as_obstacle, as_obstacles
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
@@ -18,6 +28,8 @@ GIVEN = ("start", "goal", "obstacles")
 """Options that give a scene, or a part of one."""
 CHANGES = ("jumps", "courses")
 """Options that give the changes of a scene."""
+FORMAT = "viapoint-scene"
+"""Value of the key `format` of a scene file."""
 ATTEMPTS = 50
 """Attempts to draw start and goal such that given obstacles leave room for them."""
 
@@ -35,7 +47,8 @@ def draw_given(
     """
     collision_model, arm, number = sampler.collision_model, sampler.collision_model.arm, len(generators)
     shapes = sampler.distribution.shapes
-    options = _with_rows(options, arm.dimension, shapes)
+    asked, options = options, _with_rows(options, arm.dimension, shapes)
+    names = obstacle_names(asked.get("obstacles", []))
     nothing = Scenes(
         np.full((number, arm.dimension), np.nan),
         np.full((number, arm.dimension), np.nan),
@@ -43,9 +56,8 @@ def draw_given(
     )
     given = given_scenes(options, nothing, arm, shapes)
     with np.errstate(invalid="ignore"):
-        check_scenes(
-            given, collision_model
-        )  # parts that are not given are NaN: comparisons with them are false
+        # Parts that are not given are NaN: comparisons with them are false.
+        check_scenes(given, collision_model, names)
     if set(options) >= set(GIVEN):
         return given
     scenes = _sample(options, sampler, generators, given)
@@ -58,7 +70,7 @@ def draw_given(
         again = np.flatnonzero(wrong)
         some = {name: _rows(options[name], again, number, 2 + (name == "obstacles")) for name in options}
         scenes.put(again, _sample(some, sampler, [generators[int(i)] for i in again], given.take(again)))
-    check_scenes(scenes, collision_model)
+    check_scenes(scenes, collision_model, names)
     return scenes
 
 
@@ -116,6 +128,84 @@ def _with_rows(options: Mapping[str, Any], dimension: int, shapes: Sequence[str]
     if tuple(shapes) != CAPSULES and np.shape(rows)[-1:] == (row_size(dimension),):
         rows = widened(_numbers("obstacles", rows))
     return {**options, "obstacles": rows}
+
+
+def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
+    """Return the options of `reset` that set up one scene as JSON, with all digits and the names of obstacles.
+
+    Args:
+        options: Some of `start`, `goal`, `obstacles`, `jumps` and `courses`, also of a batch of one scene.
+        env_id: Environment of the scene, for readers of the file.
+
+    Raises:
+        ValueError: An option is unknown, or does not hold what `reset` takes for one scene.
+
+    Example:
+        >>> from viapoint.envs import Sphere, scene_from_json, scene_to_json
+        >>> ball = Sphere(0.03, position=(0.5, 0.0, 0.4), name="ball")
+        >>> text = scene_to_json({"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4), "obstacles": [ball]})
+        >>> scene_from_json(text)["obstacles"] == [ball]
+        True
+    """
+    refuse_unknown_options(options, (*GIVEN, *CHANGES))
+    record: dict[str, Any] = {"format": FORMAT, **({"env": env_id} if env_id else {})}
+    for name, value in options.items():
+        if name == "obstacles":
+            refuse_single(value)
+        if name == "obstacles" and is_shape_list(value):
+            record[name] = [each.to_dict() for each in as_obstacles(value)]
+        else:
+            array = _numbers(name, value)
+            batched = array.ndim == (2 if name in ("start", "goal") else 3)
+            if batched and len(array) != 1:
+                raise ValueError(f"options[{name!r}] must be those of one scene, got {len(array)} scenes")
+            record[name] = (array[0] if batched else array).tolist()
+    return json.dumps(record, indent=1) + "\n"
+
+
+def scene_from_json(text: str | bytes) -> dict[str, Any]:
+    """Return the options of `reset` from the JSON of :func:`scene_to_json` or a file of the live page.
+
+    Obstacles are shapes, or rows of numbers if they were written as such. Numbers are checked by `reset`.
+
+    Raises:
+        ValueError: The text is no scene file, or an obstacle is not allowed.
+
+    Example:
+        >>> from viapoint.envs import scene_from_json
+        >>> scene_from_json('{"format": "viapoint-scene", "goal": [0.1, 0.4]}')
+        {'goal': [0.1, 0.4]}
+    """
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the scene file is not JSON: {error}") from None
+    if not isinstance(record, Mapping) or record.get("format") != FORMAT:
+        raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
+    options = {name: record[name] for name in (*GIVEN, *CHANGES) if name in record}
+    obstacles = options.get("obstacles", [])
+    if not isinstance(obstacles, list):
+        raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
+    if obstacles and not all(isinstance(each, list) for each in obstacles):
+        options |= _obstacles_of_file(obstacles)
+    return options
+
+
+def _obstacles_of_file(records: Sequence[Any]) -> dict[str, Any]:
+    """Return the obstacles of a file, and their courses if it has them beside the shapes, as older files do."""
+    found, courses = [], []
+    for i, each in enumerate(records):
+        one = dict(each) if isinstance(each, Mapping) else each
+        courses.append(one.pop("course", None) if isinstance(one, dict) else None)
+        try:
+            found.append(as_obstacle(one))
+        except ValueError as error:
+            raise ValueError(f"obstacle {i} of the scene file: {error}") from None
+    given = [each for each in courses if each is not None]
+    if not given:
+        return {"obstacles": found}
+    rest = np.zeros(np.shape(given[0])).tolist()
+    return {"obstacles": found, "courses": [rest if each is None else each for each in courses]}
 
 
 def refuse_unknown_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
@@ -182,17 +272,20 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
     result, size = np.zeros(shape), shape[-1]
     if len(shape) == 3 and array.size == 0:
         array = array.reshape((0, size))
+    rows = len(shape) == 3 and array.ndim in (2, 3) and array.shape[-1] == size
+    if rows and array.shape[-2] > shape[1]:
+        raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {array.shape[-2]}")
     try:
         if len(shape) == 2:
             result[:] = array
-        elif array.ndim in (2, 3) and array.shape[-1] == size and array.shape[-2] <= shape[1]:
+        elif rows:
             result[:, : array.shape[-2]] = array
         else:
             raise ValueError
     except ValueError:
         number, *most = shape[:-1]
-        rows = f"(n, {size}) or ({number}, n, {size}) with n at most {most[0]}" if most else ""
-        allowed = rows or f"{shape} or {shape[1:]}"
+        many = f"(n, {size}) or ({number}, n, {size}) with n at most {most[0]}" if most else ""
+        allowed = many or f"{shape} or {shape[1:]}"
         raise ValueError(f"options[{name!r}] must have shape {allowed}, got {array.shape}") from None
     if not np.isfinite(array).all():
         raise ValueError(f"options[{name!r}] must be finite, got {array[~np.isfinite(array)][0]}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,8 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
-from viapoint.envs.geometry.rows import has_shapes, shape_columns, shape_rows
+from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
+from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns, shape_number, shape_rows
 from viapoint.envs.geometry.shape import UNIT_TOLERANCE
 from viapoint.envs.geometry.shapes import SHAPES
 
@@ -28,6 +29,10 @@ FARTHEST_CENTRE = 1.0
 """Greatest coordinate of an obstacle's centre, [m]."""
 LARGEST_HALF_LENGTH, FARTHEST_SHAPE = 1.0, 2.0
 """Greatest half length and coordinate of the box of an obstacle where obstacles may have any shape, [m]."""
+FARTHEST_SURFACE = FARTHEST_SHAPE - EXTENT
+"""Greatest distance of a half-space's surface from the origin, [m]; its observed cube is then not too far."""
+ROUNDING = 1e-9
+"""Rounding error of distances, [m]."""
 
 TARGETS = {
     "T1": (-0.32, 0.42),
@@ -103,15 +108,22 @@ def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tu
 
 Problem = tuple[Bool, Callable[[int], str]]
 """Mask of the scenes that have a fault, shape (N,), and a function that describes it in one of them."""
+Names = Sequence[Sequence[str]]
+"""Names of obstacles, empty where there is none: one list for all scenes, or one for each."""
 
 
-def check_scenes(scenes: Scenes, collision_model: CollisionModel) -> None:
+def check_scenes(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> None:
     """Check that a movement can start and end in each scene.
+
+    Args:
+        scenes: N scenes.
+        collision_model: Arm and the parts of it that obstacles may not touch.
+        names: Names of the obstacles, for the message.
 
     Raises:
         ValueError: A scene is impossible; the message names the scene, the fault and the allowed values.
     """
-    refuse(problems(scenes, collision_model))
+    refuse(problems(scenes, collision_model, names))
 
 
 def refuse(faults: Iterator[Problem]) -> None:
@@ -122,17 +134,17 @@ def refuse(faults: Iterator[Problem]) -> None:
             raise ValueError(f"scene {first}: {reason(first)}")
 
 
-def problems(scenes: Scenes, collision_model: CollisionModel) -> Iterator[Problem]:
-    """Yield the faults that N scenes can have."""
+def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> Iterator[Problem]:
+    """Yield the faults that N scenes can have; see :func:`check_scenes`."""
     yield from _problems_of_ends(scenes, collision_model.arm)
-    yield from _problems_of_sizes(scenes)
+    yield from _problems_of_sizes(scenes, names)
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
         clearance = rest_clearance(scenes, point, collision_model)
         touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
         yield (
             least <= 0.0,
             lambda i, n=name, t=touched, c=least: (  # type: ignore[misc]
-                f"obstacle {t[i]} {_described(scenes.obstacles[i, t[i]])} touches the arm at the {n} "
+                f"{_obstacle(scenes, names, i, t[i])} touches the arm at the {n} "
                 f"(clearance {c[i]:.4f} m; more than 0 is needed)"
             ),
         )
@@ -155,15 +167,13 @@ def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
         )
 
 
-def _problems_of_sizes(scenes: Scenes) -> Iterator[Problem]:
+def _problems_of_sizes(scenes: Scenes, names: Names) -> Iterator[Problem]:
     """Yield the faults of single obstacles."""
     faults = _problems_of_shapes(scenes) if has_shapes(scenes.obstacles) else _problems_of_capsules(scenes)
     for wrong, what in faults:
         yield (
             wrong.any(axis=-1),
-            lambda i, w=wrong, x=what: (  # type: ignore[misc]
-                f"obstacle {w[i].argmax()} {_described(scenes.obstacles[i, w[i].argmax()])} {x}"
-            ),
+            lambda i, w=wrong, x=what: f"{_obstacle(scenes, names, i, w[i].argmax())} {x}",  # type: ignore[misc]
         )
 
 
@@ -192,7 +202,10 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
     strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
     yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"
     yield (half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"
-    far = np.abs(centre) > FARTHEST_SHAPE
+    apart = np.abs((centre * rotation_axes(quaternion)[2]).sum(axis=-1) + EXTENT)
+    away = (kind == shape_number(HalfSpace.kind)) & (apart > FARTHEST_SURFACE + ROUNDING)
+    yield away, f"has its surface over {FARTHEST_SURFACE:g} m from the origin"
+    far = np.abs(centre) > FARTHEST_SHAPE + ROUNDING
     yield far.any(axis=-1), f"has its centre over {FARTHEST_SHAPE:g} m from the origin"
 
 
@@ -208,16 +221,26 @@ def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel
     )
 
 
+def _obstacle(scenes: Scenes, names: Names, scene: int, number: int) -> str:
+    """Return an obstacle of a scene as text: its number, its name if it has one, and its shape."""
+    known = names[scene if len(names) > 1 else 0]
+    name = f" {known[number]!r}" if number < len(known) and known[number] else ""
+    return f"obstacle {number}{name} {_described(scenes.obstacles[scene, number])}"
+
+
 def _described(row: Float) -> str:
-    """Return an obstacle as text."""
+    """Return the shape of an obstacle as text."""
     if not has_shapes(row):
         return f"{_shown(row)} m"
-    kind, centre, _, half = shape_columns(row)
+    kind, centre, quaternion, half = shape_columns(row)
     names = list(SHAPES)
     name = names[int(kind)] if 0 <= kind < len(names) else "?"
+    if name == HalfSpace.kind:
+        normal = rotation_axes(quaternion)[2]
+        return f"({name} through {_shown(centre + EXTENT * normal)} m with normal {_shown(normal)})"
     return f"({name} at {_shown(centre)} m, half lengths {_shown(half)} m)"
 
 
 def _shown(values: Float) -> str:
-    """Return numbers as text."""
-    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+    """Return numbers as text, without rounding errors and negative zeros."""
+    return "(" + ", ".join(f"{round(float(v), 6) + 0.0:.4g}" for v in values) + ")"

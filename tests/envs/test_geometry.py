@@ -3,9 +3,12 @@
 import json
 import re
 import sys
+import tracemalloc
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -20,6 +23,7 @@ from viapoint.envs import (
     PointCloud,
     Shape,
     Sphere,
+    add_to_model,
     as_obstacle,
     as_obstacles,
     nearest_distance,
@@ -37,10 +41,16 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from geometry import Probes, agreement, random_shape
 
 ALL = pytest.mark.parametrize("kind", SHAPES)
-CLOSED = ("sphere", "capsule", "cylinder", "box")
+CLOSED = [kind for kind, shape in SHAPES.items() if shape.in_scenes and shape.sizes]
 """Shapes whose parameters may be a batch of sizes."""
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
 POSE = {"position": (0.1, -0.2, 0.3), "quaternion": (0.5, -0.5, 0.1, 0.7)}
+
+
+def searched(kind):
+    """True for a shape whose distances of segments come from the search of Shape."""
+    shape = SHAPES[kind]
+    return (shape._nearest, shape.segment_distance) == (Shape._nearest, Shape.segment_distance)
 
 
 @pytest.fixture
@@ -58,7 +68,8 @@ def segments(generator):
 @pytest.mark.parametrize("long", [False, True])
 def test_distances_and_contacts_agree_with_coal_and_mujoco(kind, long):
     found = agreement(kind, 500, 1, long=long)
-    assert max(found.coal, found.mujoco, found.depth) < 1e-6
+    assert max(found.coal, found.mujoco) < 1e-6
+    assert found.depth < (1e-4 if searched(kind) else 1e-6)
     assert 100 < found.contacts < 400
     assert found.wrong == 0
 
@@ -92,15 +103,10 @@ def test_capsules_along_faces_edges_and_axes(kind):
     shape = as_obstacle(
         {
             "shape": kind,
+            **{name: np.full(shape, 0.1) for name, shape in SHAPES[kind].sizes.items()},
             **{
-                "sphere": {"radius": 0.1},
-                "capsule": {"radius": 0.1, "half_length": 0.1},
-                "half_space": {},
-            }.get(kind, {}),
-            **({"radius": 0.1, "half_length": 0.1} if kind == "cylinder" else {}),
-            **({"size": (0.1, 0.1, 0.1)} if kind == "box" else {}),
-            **({"vertices": 2.0 * CUBE - 0.1} if kind == "convex_mesh" else {}),
-            **({"points": 2.0 * CUBE - 0.1, "radius": 0.05} if kind == "point_cloud" else {}),
+                name: 2.0 * CUBE - 0.1 for name in ("vertices", "points") if name in SHAPES[kind].parameters()
+            },
         }
     )
     places = 0.1 * np.array(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij")).reshape(3, -1).T
@@ -201,7 +207,7 @@ def test_gradients_are_those_of_finite_differences(kind, generator, segments):
                 there[half] = shift
                 each[half, i] = (distance(places + there) - distance(places - there)) / (2.0 * step)
             error = np.abs(each[:, i] - tensor.grad.numpy()[:, i])
-            assert (error < 1e-5).mean() > 0.97  # not at kinks
+            assert (error < (1e-4 if searched(kind) else 1e-5)).mean() > 0.97  # not at kinks
     wall = torch.as_tensor(np.asarray(shape.position) + 0.0 * points).requires_grad_()
     shape.distance(wall).sum().backward()
     assert torch.isfinite(wall.grad).all()
@@ -313,6 +319,58 @@ def test_a_mesh_of_a_box_is_the_box(generator, segments):
 POSE_UNIT = {**POSE, "quaternion": np.array(POSE["quaternion"]) / np.linalg.norm(POSE["quaternion"])}
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("parts", [2, 5, 7])
+def test_a_mesh_of_a_subdivided_box_is_the_box(parts, dtype, generator, segments):
+    """Corners in lines give triangles of no area, and rounding tilts the others."""
+    half, axis = np.array([0.05, 0.05, 0.08]), np.linspace(-1.0, 1.0, parts + 1)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    box = Box(half, position=(0.6, 0.3, 0.5), quaternion=HalfSpace.facing((1.0, 2.0, 3.0)).quaternion)
+
+    def placed(points):
+        return (points * half @ box.rotation.T + box.position).astype(dtype)
+
+    surface = placed(grid[np.abs(grid).max(axis=1) == 1.0])
+    mesh, atol = ConvexMesh(surface), 1e-7 if dtype is np.float32 else 1e-9
+    ends = segments + box.position
+    near = placed(generator.uniform(-1.1, 1.1, (500, 3))).astype(float)
+    for points in (*ends, near):
+        np.testing.assert_allclose(mesh.distance(points), box.distance(points), atol=atol)
+    np.testing.assert_allclose(mesh.segment_distance(*ends), box.segment_distance(*ends), atol=atol)
+    if dtype is np.float64:
+        assert len(mesh.polytope.offsets) == 6
+    for inside in (0.9 * axis[:1], np.array([0.99, 0.1, -0.3])):
+        with pytest.raises(ValueError, match="not those of a convex mesh"):
+            ConvexMesh(np.concatenate((surface, placed(inside * np.ones((1, 3))))))
+
+
+def test_the_memory_of_a_mesh_grows_with_its_faces(generator):
+    points = generator.normal(size=(1500, 3))
+    tracemalloc.start()
+    mesh = ConvexMesh(points / np.linalg.norm(points, axis=1)[:, None])
+    assert (len(mesh.polytope.offsets), len(mesh.polytope.edges)) == (2996, 4494)
+    assert tracemalloc.get_traced_memory()[1] < 3e7  # a table of all pairs of faces has 2e8 bytes
+    tracemalloc.stop()
+
+
+@ALL
+def test_the_arrays_of_a_shape_are_its_own(kind, generator):
+    given = random_shape(kind, generator)
+    values = {n: np.array(v) for n in given.parameters() if hasattr(v := getattr(given, n), "shape")}
+    shape = SHAPES[kind](**values)
+    for name, value in values.items():
+        value[...] = 9.0
+        assert not getattr(shape, name).flags.writeable
+    assert shape == given
+    tensor = torch.zeros(3, dtype=torch.float64)
+    assert HalfSpace(position=tensor).position is tensor
+    torch.set_warn_always(True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # torch warns of tensors that share read-only arrays
+        shape.distance(tensor)
+    torch.set_warn_always(False)
+
+
 def test_a_capsule_between_two_points_has_them_as_ends():
     bar = Capsule.between((0.1, 0.2, 0.3), (0.4, 0.1, 0.2), 0.02)
     np.testing.assert_allclose(bar.position + bar.half_axis, (0.4, 0.1, 0.2), atol=1e-12)
@@ -407,6 +465,90 @@ def test_what_is_no_obstacle_is_refused_with_its_index_and_what_is_allowed(value
     with pytest.raises(ValueError, match=r"^obstacle 1: ") as caught:
         as_obstacles([Sphere(0.1), value])
     assert reason in str(caught.value)
+
+
+FOLLOWED = torch.zeros(4, 3, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda: HalfSpace.facing((0, 0, 0), name="it"), "normal must be finite and not zero"),
+        (lambda: HalfSpace.facing((0, np.nan, 1), name="it"), "normal must be finite and not zero"),
+        (lambda: HalfSpace.facing((0, 1), name="it"), "normal must have shape (3,), got shape (2,)"),
+        (
+            lambda: Capsule.between((0, 1), np.zeros((2, 3)), 0.1, "it"),
+            "ends must have shape (3,) or (2,), got",
+        ),
+        (lambda: Capsule.between((0, 1), (0, 1), 0.1, "it"), "a capsule without a length is a Sphere"),
+        (lambda: Capsule.between((0, 1), (0, np.inf), 0.1, "it"), "ends must be finite and different"),
+        (lambda: ConvexMesh.hull(CUBE[:4], name="it"), "vertices must span a volume"),
+        (lambda: ConvexMesh.hull(CUBE[:3], name="it"), "vertices must have shape (V, 3)"),
+        (lambda: ConvexMesh(1e200 * CUBE, name="it"), "vertices must have a hull with finite planes"),
+        (lambda: ConvexMesh(FOLLOWED, name="it"), "must not require a gradient, use vertices.detach()"),
+        (lambda: ConvexMesh.hull(FOLLOWED, name="it"), "vertices must not require a gradient"),
+        (lambda: PointCloud(FOLLOWED, name="it"), "points must not require a gradient, use points.detach()"),
+    ],
+)
+def test_errors_of_all_constructors_have_the_name_of_the_obstacle(make, reason):
+    with pytest.raises(ValueError, match=r"^\w+ 'it': ") as caught:
+        make()
+    assert reason in str(caught.value)
+
+
+def test_a_half_space_faces_normals_of_any_length():
+    np.testing.assert_allclose(
+        HalfSpace.facing((1e-30, 0.0, 0.0)).rotation[:, 2], (1.0, 0.0, 0.0), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "points", [0.1, (0.1,), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4), np.zeros((3, 4)), torch.zeros(2)]
+)
+@ALL
+def test_points_have_three_coordinates(kind, points, generator):
+    shape = random_shape(kind, generator)
+    for distance in (
+        shape.distance,
+        lambda at: shape.segment_distance((0.0, 0.0, 0.0), at),
+        lambda at: nearest_distance([shape], at),
+        lambda at: signed_distances([shape], (0.0, 0.0, 0.0), at),
+    ):
+        with pytest.raises(ValueError, match=r"points must have shape \(\.\.\., 3\), got shape"):
+            distance(points)
+
+
+def test_functions_of_lists_take_dictionaries(segments):
+    shapes = [Sphere(0.1), HalfSpace(name="floor")]
+    values, (first, second) = [each.to_dict() for each in shapes], segments
+    for distance in (signed_distances, nearest_distance):
+        np.testing.assert_array_equal(distance(values, first, second), distance(shapes, first, second))
+    assert add_to_model(mujoco.MjSpec(), values) == [["obstacle_0_0"], ["floor_0"]]
+    with pytest.raises(ValueError, match="obstacle 1: box: missing size"):
+        nearest_distance([shapes[0], {"shape": "box"}], first)
+
+
+def test_obstacles_of_one_name_are_refused_before_the_model_changes():
+    spec = mujoco.MjSpec()
+    with pytest.raises(ValueError, match="obstacle 1: obstacle 0 has the name 'obstacle_1', too"):
+        add_to_model(spec, [Sphere(0.1, name="obstacle_1"), Sphere(0.1)])
+    assert not spec.geoms
+
+
+def test_the_nearest_of_tensors_is_a_tensor_with_its_gradient(generator, segments):
+    obstacles = [random_shape(kind, generator) for kind in SHAPES]
+    first, second = (torch.as_tensor(end).requires_grad_() for end in segments)
+    for most in (np.inf, 0.05):
+        found = nearest_distance(obstacles, first, second, 0.01, most)
+        wanted = nearest_distance(obstacles, *segments, 0.01, most)
+        np.testing.assert_allclose(found.detach(), wanted, atol=1e-12)
+    found.sum().backward()
+    moved = (first.grad + second.grad).numpy()
+    np.testing.assert_array_equal(moved.any(axis=1), wanted < 0.05)
+    radius = torch.tensor(0.1, requires_grad=True)
+    nearest_distance([Sphere(0.1), Sphere(radius, position=(1.0, 0.0, 0.0))], [1.5, 0.0, 0.0]).backward()
+    assert radius.grad == -1.0
+    assert nearest_distance([], first, most=1.0).tolist() == 200 * [1.0]
 
 
 def test_text_that_is_no_list_of_obstacles_is_refused():

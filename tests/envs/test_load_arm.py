@@ -1,6 +1,8 @@
 """Laws of arms that are loaded from MJCF files."""
 
+import inspect
 import itertools
+import json
 import pickle
 import re
 from importlib.util import find_spec
@@ -394,6 +396,22 @@ def test_the_page_runs_and_its_numbers_are_measured(monkeypatch, capsys):
     np.testing.assert_allclose(names["points"], [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]], atol=1e-6)
     for env in (names["env"], names["envs"]):
         env.close()
+
+
+def test_by_default_capsules_reach_25_mm_beyond_geoms_at_most_and_the_page_has_the_measured_ones(arm):
+    page = (DOCS / "bring-your-arm.md").read_text(encoding="utf-8")
+    default = inspect.signature(load_arm).parameters["tolerance"].default
+    rows = {row["arm"]: row for row in json.loads((DOCS / "arm-contacts.json").read_text(encoding="utf-8"))}
+    assert default == 0.025
+    assert f"(default {default} m)" in page
+    for name, link in (("ur5e", "`docs/ur5e.xml`"), ("fetch", "Fetch")):
+        capsules, excess = rows[name]["capsules"], rows[name]["excess"]
+        assert excess <= 1e3 * default
+        assert f"| {link} | {capsules} | {excess} mm |" in page
+    assert len(arm.shape) == rows["ur5e"]["capsules"]
+    assert 1e3 * max(each.excess for each in arm.shape) == pytest.approx(rows["ur5e"]["excess"], abs=0.05)
+    assert {row["wrong"] for row in rows.values()} == {0}
+    assert f"{rows['ur5e']['poses']:,} random configurations" in page
 
 
 def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):

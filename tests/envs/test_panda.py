@@ -265,6 +265,13 @@ def test_measured_bounds_of_the_capsules():
         (Path(__file__).parents[2] / "docs" / "panda-collision.json").read_text(encoding="utf-8")
     )
     joints = [capsule.joint for capsule in (*PANDA.shape, *PANDA.base)]
+    listed = [tuple(pair.split("-")) for pairs in found["not_compared"].values() for pair in pairs]
+    assert set(listed) == set(itertools.combinations(LINKS, 2)) - {
+        BODIES_OF[pair] for pair in PANDA.self_pairs
+    } - {
+        ("link7", "gripper")  # one rigid body
+    }
+    assert len(listed) == len(set(listed))
     apart, found = found["forearm_and_flange"], found["links"]
     assert [row["capsules"] for row in found] == [joints.count(joint) for joint in range(-1, 7)]
     assert PANDA.link_joints == (0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 6, 6, 6, 6)

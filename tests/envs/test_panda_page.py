@@ -110,6 +110,8 @@ def test_numbers_of_the_description(env):
     both = apart["forearm_and_flange"]
     assert f"overlap in {both['touching']} % of the positions" in text
     assert f"are at least {both['geometry']} mm apart" in text
+    for reason, pairs in apart["not_compared"].items():
+        assert f"| {', '.join(pairs)} | {reason}" in text
     assert f"and {WORDS[len(PANDA.base)]} for the base" in text
     assert f"({PANDA.hand_stiffness / 1000:g} kN/m, {PANDA.hand_damping:g} N s/m)" in text
     assert "({:g} and {:g} rad/s)".format(*sorted(set(PANDA.velocity_limit))) in text

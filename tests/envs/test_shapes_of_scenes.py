@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 from viapoint.envs import (
     SHAPES,
@@ -29,10 +30,10 @@ from viapoint.envs.geometry.rows import (
     quaternion_of_axes,
     rotation_axes,
     shape_columns,
-    shape_rows,
     widened,
 )
 from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, reshaped
+from viapoint.primitives.array_api import namespace_of
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from contacts import KINDS, contacts, random_obstacles
@@ -194,10 +195,49 @@ def test_what_replaces_a_capsule_is_inside_it(generator):
         np.testing.assert_array_equal(other[:, :d], rows[:, :d])
 
 
-def test_an_ellipsoid_of_ones_own_can_be_in_scenes():
-    rows = shape_rows("box", np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]), np.full((1, 3), 0.1))
-    assert rows.shape == (1, 15)
-    assert as_obstacle({"shape": "box", "size": (0.1, 0.1, 0.1)}) == obstacles_from_rows(rows)[0]
+def ellipsoid(for_torch):
+    """The class of CONTRIBUTING.md; as it is, or changed for torch as the page says."""
+    page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (code,) = [
+        each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Ellipsoid" in each
+    ]
+    head, signed, tail = re.split(r"(?=def _signed|def support)", code.partition("SHAPES[Ellipsoid.kind]")[0])
+    names = {"namespace_of": namespace_of}
+    exec(head + (signed.replace("np.", "namespace_of(points[0]).") if for_torch else signed) + tail, names)
+    return names["Ellipsoid"]
+
+
+def test_an_ellipsoid_of_ones_own_can_be_in_scenes(monkeypatch, generator):
+    monkeypatch.setitem(SHAPES, "ellipsoid", ellipsoid(for_torch=False))
+    values = {"size": (0.03, 0.04, 0.06), "position": (0.45, 0.0, 0.4), "quaternion": (0.6, 0.8, 0.0, 0.0)}
+    egg, points = as_obstacle({"shape": "ellipsoid", **values}), generator.uniform(-0.2, 0.8, (200, 3))
+    env = gym.make(PANDA, shapes=("capsule", "ellipsoid")).unwrapped
+    observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": [egg]})
+    np.testing.assert_allclose(observation["obstacles"][0, -4:-1], egg.size, atol=1e-6)
+    (again,) = obstacles_from_rows(env.batch.scenes.obstacles[0])
+    assert again.kind == "ellipsoid"
+    np.testing.assert_allclose(again.distance(points), egg.distance(points), atol=1e-9)
+    *_, info = env.step(np.zeros(4))  # straight through it
+    assert info["collision"]
+    assert info["min_clearance"] < 0.0
+    env.close()
+
+
+def test_an_ellipsoid_for_torch_has_the_gradients_of_finite_differences(generator):
+    size, points = (
+        torch.tensor((0.1, 0.15, 0.2)).double(),
+        torch.as_tensor(generator.uniform(-0.2, 0.2, (200, 3))),
+    )
+
+    def distance(size, points):
+        return ellipsoid(for_torch=True)(size, quaternion=(0.6, 0.8, 0.0, 0.0)).distance(points)
+
+    found = distance(size, points)
+    points = points[(found > -0.05).numpy()]  # away from the medial axis
+    assert (found < -0.01).sum() > 10
+    assert torch.autograd.gradcheck(distance, (size.requires_grad_(), points.requires_grad_()), atol=1e-6)
+    (gradient,) = torch.autograd.grad(distance(size, points).sum(), points)
+    np.testing.assert_allclose(np.linalg.norm(gradient.numpy(), axis=-1), 1.0, atol=1e-9)
 
 
 CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
@@ -227,7 +267,7 @@ def test_impossible_obstacles_are_refused_with_their_name(env, obstacle, reason)
 @pytest.mark.parametrize(
     ("shapes", "reason"),
     [
-        ((), "shapes must be some of sphere, capsule, cylinder, box, half_space, without repetition"),
+        ((), f"shapes must be some of {', '.join(KINDS)}, without repetition"),
         (("box", "box"), "without repetition"),
         (("pyramid",), "got ('pyramid',)"),
         (("convex_mesh",), "got ('convex_mesh',)"),

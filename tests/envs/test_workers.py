@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs import ENV_IDS, ReachVectorEnv
+from viapoint.envs import ENV_IDS, SHAPES, Box, ReachVectorEnv
 from viapoint.envs.arms import ARMS
 from viapoint.envs.registration import OWN_ARM_TASKS
 from viapoint.envs.worker_env import WorkerVectorEnv
@@ -215,6 +215,23 @@ def test_arms_of_ones_own_are_known_in_the_processes(monkeypatch):
     env = gym.make_vec("viapoint/Reach-v0", num_envs=2, workers=1, arm="mine")
     assert env.reset(seed=0)[0]["goal"].shape == (2, 3)
     env.close()
+
+
+def test_shapes_of_ones_own_are_known_in_the_processes(monkeypatch):
+    @dataclasses.dataclass(frozen=True, eq=False)
+    class Crate(Box):
+        kind = "crate"
+
+    monkeypatch.setitem(SHAPES, "crate", Crate)
+    crate = Crate((0.05, 0.04, 0.03), position=(0.5, 0.0, 0.3))
+    arguments = {"num_envs": 2, "shapes": ("capsule", "crate"), "vectorization_mode": "vector_entry_point"}
+    seen = []
+    for workers in (0, 2):
+        env = gym.make_vec("viapoint/PandaObstacles-v0", workers=workers, **arguments)
+        env.reset(seed=0, options={"obstacles": [[crate], [crate]]})
+        seen.append(env.step(np.zeros((2, 4)))[0]["obstacles"])
+        env.close()
+    np.testing.assert_array_equal(*seen)
 
 
 @pytest.mark.parametrize(

@@ -320,7 +320,8 @@ def test_python_code_sets_the_scene_up(env_id, shared):
         ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
         ({"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 0]]}]}, "distances only"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane, with z = 0"),
-        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "obstacle 0: course"),
+        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "courses of the scene file"),
+        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": 1}]}, "courses of the scene file"),
         ({"jumps": [[1.0]]}, "jumps"),
     ],
 )
@@ -328,6 +329,37 @@ def test_bad_scene_files_are_named(change, reason):
     record = {"format": "viapoint-scene", "start": [0.1, 0.2], "goal": [0.2, 0.3], "obstacles": []}
     with pytest.raises(ValueError, match=reason):
         from_json(json.dumps({**record, **change}), dimension=2)
+
+
+def test_scene_files_are_exact_and_keep_names_and_courses():
+    """The page writes what `scene_from_json` reads, and reads the files of earlier versions."""
+    ball = {"shape": "sphere", "radius": 0.1 / 3.0, "position": [-0.05, 0.35, 0.0], "name": "ball"}
+    rest = {"shape": "sphere", "radius": 0.02, "position": [0.05, 0.45, 0.0]}
+    course = [0.1, 0.0, 0.5, 0.0, 1.0 / 3.0]
+    old = {"format": "viapoint-scene", "env": MOVING, "start": [-1.0 / 3.0, 0.3], "goal": [0.1, 0.4]}
+    scene = from_json(json.dumps({**old, "obstacles": [rest, ball | {"course": course}]}), dimension=2)
+    again = from_json(to_json(scene, MOVING), dimension=2)
+    for mine, theirs in zip(again, scene, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    np.testing.assert_array_equal(again.courses, [[0.0] * 5, course])
+    assert again.names == ("", "ball")
+    more = again.with_obstacle(again.obstacles[0]).without(0)
+    options = ve.scene_from_json(to_json(more, MOVING))
+    assert [each.name for each in options["obstacles"]] == ["ball", ""]
+    assert options["start"] == old["start"]
+    as_rows = {**old, "obstacles": [[-0.05, 0.35, 0.0, 0.1, 0.02]]}
+    np.testing.assert_allclose(
+        from_json(json.dumps(as_rows), 2).obstacles[0, :4], as_rows["obstacles"][0][:4]
+    )
+    env = gym.make(MOVING).unwrapped
+    env.reset(seed=0)
+    of_env = LiveScene.of(env.batch.scenes)
+    for mine, theirs in zip(
+        from_json(ve.scene_to_json(env.batch.scenes.as_options()), 2), of_env, strict=True
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+    with pytest.raises(ValueError, match="obstacles of the scene file must be numbers"):
+        from_json(json.dumps({**old, "obstacles": [[0.1, 0.2]]}), dimension=2)
 
 
 def test_text_that_is_no_json_is_named():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.rows import (
     CAPSULES,
     has_shapes,
+    obstacle_names,
     obstacle_rows,
     obstacles_from_rows,
     row_size,
@@ -19,18 +20,17 @@ from viapoint.envs.geometry.rows import (
     shape_number,
     widened,
 )
-from viapoint.envs.geometry.shapes import SHAPES, as_obstacle
+from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
+from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.envs.scenes.scene import Scenes
 
-FORMAT = "viapoint-scene"
-"""Value of the key `format` of a scene file."""
 SCENE_SHAPES = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 """Shapes that obstacles of a scene may have."""
 LARGEST_FILE = 1 << 20
 """Greatest size of a scene file, [bytes]."""
 DIGITS = 6
-"""Decimal places of coordinates in files and in code, [m]."""
+"""Decimal places of coordinates in code, [m]."""
 
 
 class LiveScene(NamedTuple):
@@ -46,6 +46,8 @@ class LiveScene(NamedTuple):
     """Rows (velocity D, time, velocity D), shape (n, 2 D + 1), [m/s] and [s]; zero for obstacles at rest."""
     jumps: Float
     """Rows (time, target D), shape (j, D + 1), [s] and [m]."""
+    names: tuple[str, ...] = ()
+    """Names of the obstacles; those behind the last one given have none."""
 
     @classmethod
     def of(cls, scenes: Scenes | ChangingScenes, row: int = 0) -> LiveScene:
@@ -57,7 +59,7 @@ class LiveScene(NamedTuple):
             jumps = jumps[(jumps != 0.0).any(axis=-1)]
         obstacles = widened(scenes.obstacles[row, present])
         parts = (scenes.start[row], scenes.goal[row], obstacles, courses, jumps)
-        return cls(*(np.array(part, dtype=np.float64) for part in parts))
+        return cls._make([*(np.array(part, dtype=np.float64) for part in parts), ()])
 
     @property
     def shapes(self) -> list[str]:
@@ -77,7 +79,7 @@ class LiveScene(NamedTuple):
 
     def options(self, *, changing: bool) -> dict[str, Float]:
         """Return the options of `reset`; `changing` environments get courses and jumps, too."""
-        names = self._fields if changing else ("start", "goal", "obstacles")
+        names = ("start", "goal", "obstacles", *(("courses", "jumps") if changing else ()))
         return {name: getattr(self, name) for name in names}
 
     def batch(self) -> ChangingScenes:
@@ -91,7 +93,8 @@ class LiveScene(NamedTuple):
     def without(self, row: int) -> LiveScene:
         """Return the scene without an obstacle."""
         rows = [i for i in range(len(self.obstacles)) if i != row]
-        return self._replace(obstacles=self.obstacles[rows], courses=self.courses[rows])
+        names = (*self.names[:row], *self.names[row + 1 :])
+        return self._replace(obstacles=self.obstacles[rows], courses=self.courses[rows], names=names)
 
     def with_obstacle(self, numbers: Float) -> LiveScene:
         """Return the scene with one more obstacle at rest."""
@@ -121,17 +124,13 @@ def to_json(scene: LiveScene, env_id: str) -> str:
         >>> from_json(to_json(scene, "viapoint/PlanarObstacles-v0"), dimension=2).goal.tolist()
         [0.1, 0.4]
     """
-    record: dict[str, Any] = {"format": FORMAT, "env": env_id}
-    record |= {"start": _rounded(scene.start), "goal": _rounded(scene.goal), "obstacles": []}
-    for row, course in zip(scene.obstacles, scene.courses, strict=True):
-        (shape,) = obstacles_from_rows(row[None])
-        one = shape.to_dict()
-        if course.any():
-            one["course"] = _rounded(course)
-        record["obstacles"].append(one)
-    if scene.jumps.size:
-        record["jumps"] = _rounded(scene.jumps)
-    return json.dumps(record, indent=1) + "\n"
+    shapes = obstacles_from_rows(scene.obstacles)
+    names = (*scene.names, *[""] * len(shapes))
+    shapes = [replace(each, name=name) for each, name in zip(shapes, names, strict=False)]
+    options: dict[str, Any] = {"start": scene.start, "goal": scene.goal, "obstacles": shapes}
+    changes = {"courses": scene.courses, "jumps": scene.jumps}
+    options |= {name: value for name, value in changes.items() if value.any()}
+    return scene_to_json(options, env_id)
 
 
 def from_json(text: str | bytes, dimension: int) -> LiveScene:
@@ -146,22 +145,18 @@ def from_json(text: str | bytes, dimension: int) -> LiveScene:
     """
     if len(text) > LARGEST_FILE:
         raise ValueError(f"a scene file has at most {LARGEST_FILE} bytes, got {len(text)}")
-    try:
-        record = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"the scene file is not JSON: {error}") from None
-    if not isinstance(record, Mapping) or record.get("format") != FORMAT:
-        raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
-    obstacles = record.get("obstacles", [])
-    if not isinstance(obstacles, list):
-        raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
-    rows = np.zeros((len(obstacles), row_size(dimension, SCENE_SHAPES)))
-    courses = np.zeros((len(obstacles), 2 * dimension + 1))
-    for i, each in enumerate(obstacles):
-        rows[i], courses[i] = _obstacle(i, each, dimension)
-    jumps = _numbers("jumps", record.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
-    start, goal = (_numbers(name, record.get(name), (dimension,)) for name in ("start", "goal"))
-    return LiveScene(start, goal, rows, courses, jumps)
+    options = scene_from_json(text)
+    shapes, size = options.get("obstacles", []), 2 * dimension + 1
+    rows = obstacle_rows(shapes or np.zeros((0, size)), dimension, SCENE_SHAPES)
+    if np.shape(rows)[-1] != row_size(dimension, SCENE_SHAPES):
+        rows = widened(_numbers("obstacles", rows, (None, size)))
+    rows = _numbers("obstacles", rows, (None, row_size(dimension, SCENE_SHAPES)))
+    names = tuple(obstacle_names(shapes)[0])
+    courses = _numbers("courses", options.get("courses", np.zeros((len(rows), size))), (len(rows), size))
+    jumps = _numbers("jumps", options.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
+    start, goal = (_numbers(name, options.get(name), (dimension,)) for name in ("start", "goal"))
+    present, jumps = rows.any(axis=-1), jumps[jumps.any(axis=-1)]
+    return LiveScene(start, goal, rows[present], courses[present], jumps, names if any(names) else ())
 
 
 def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, changing: bool) -> str:
@@ -181,20 +176,6 @@ def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, c
             lines += [f'    "{name}": [', *(f"        {_rounded(row)}," for row in value), "    ],"]
     lines += ["}", "observation, info = env.reset(options=options)"]
     return "\n".join(lines) + "\n"
-
-
-def _obstacle(i: int, record: Any, dimension: int) -> tuple[Float, Float]:
-    """Return row and course of an obstacle of a file."""
-    course, rest = None, record
-    if isinstance(record, Mapping):
-        course, rest = record.get("course"), {name: v for name, v in record.items() if name != "course"}
-    try:
-        (row,) = obstacle_rows([as_obstacle(rest)], dimension, SCENE_SHAPES)
-    except ValueError as error:
-        reason = str(error).removeprefix("obstacle 0: ")
-        raise ValueError(f"obstacle {i} of the scene file: {reason}") from None
-    size = 2 * dimension + 1
-    return row, _numbers(f"obstacle {i}: course", np.zeros(size) if course is None else course, (size,))
 
 
 def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Float:

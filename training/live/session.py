@@ -230,8 +230,13 @@ class Session:
             self._set_scene(self._scene.with_row(int(number), row), changed=True)
         else:
             self._by_hand = None
-            jumps = self._scene.jumps[:0] if kind == "goal" else self._scene.jumps
-            self._set_scene(self._scene._replace(**{kind: point}, jumps=jumps), changed=True)
+            scene = self._scene
+            moved = (
+                scene._replace(goal=point, jumps=scene.jumps[:0])
+                if kind == "goal"
+                else scene._replace(start=point)
+            )
+            self._set_scene(moved, changed=True)
 
     def _move_goal(self, point: Float) -> None:
         """Move the goal while the arm moves; an impossible one is refused."""

@@ -84,10 +84,11 @@ def figure_name(environment: str) -> str:
 
 
 def has_figure(numbers: Numbers) -> bool:
-    """Return whether an environment has learning curves, or success by band of an agent."""
+    """Return whether an environment has success by band of an agent, or learning curves that are not 1 throughout."""
     agents = [each for each in numbers["rows"] if each["kind"] == "agent"]
     bands = any(found["by_band"] for each in agents for found in each["sets"].values())
-    return bands or any(each.get("curve") for each in agents)
+    curves = [each["curve"]["success"] for each in agents if each.get("curve")]
+    return bands or any(rate < 1.0 for curve in curves for point in curve for rate in point)
 
 
 def caption(numbers: Numbers) -> str:

@@ -1,0 +1,147 @@
+"""Errors of given obstacles name them, and the options of a scene survive JSON."""
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs import (
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    HalfSpace,
+    observation_rows,
+    obstacles_to_json,
+    scene_from_json,
+    scene_to_json,
+)
+
+PANDA = "viapoint/PandaObstacles-v0"
+SHAPES = ("capsule", "box", "half_space")
+ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
+HOUSE = Box((0.3, 0.3, 0.3), position=(0.2, 0.0, 0.4), name="house")
+CRATE = Box((0.03, 0.03, 0.03), position=(0.2, 0.6, 0.4))
+LISTS = "obstacles must be a list of shapes, dictionaries or rows of numbers"
+
+
+@pytest.fixture(scope="module")
+def env():
+    made = gym.make(PANDA, shapes=SHAPES).unwrapped
+    yield made
+    made.close()
+
+
+def reset(env, obstacles, reason, ends):
+    with pytest.raises(ValueError, match=re.escape(reason)) as caught:
+        env.reset(seed=0, options={**ends, "obstacles": obstacles})
+    assert "-0," not in str(caught.value)
+    assert "-0)" not in str(caught.value)
+
+
+@pytest.mark.parametrize("ends", [ENDS, {}], ids=["ends given", "ends drawn"])
+@pytest.mark.parametrize(
+    ("obstacles", "reason"),
+    [
+        ([HOUSE], "obstacle 0 'house' (box at (0.2, 0, 0.4) m, half lengths (0.3, 0.3, 0.3) m) touches"),
+        ([[CRATE, HOUSE.to_dict()]], "obstacle 1 'house' (box at"),
+        ([CRATE, Box((1.5, 0.1, 0.1), name="long")], "obstacle 1 'long' (box at"),
+        ([Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0), name="far")], "obstacle 0 'far' (box at (3, 0, 0) m"),
+        ([Cylinder(0.1, 0.1, name="can")], "obstacle 0 'can': the scenes of this environment have the shapes"),
+        ([ConvexMesh([*np.eye(3), (0, 0, 0)], name="mesh")], "obstacle 0 'mesh': the scenes of this"),
+        (
+            [HalfSpace(position=(0.3, 0.0, -1.5))],
+            "obstacle 0 (half_space through (0, 0, -1.5) m with normal (0, 0, 1)) has its surface over 1 m from",
+        ),
+        (
+            [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0), name="wall")],
+            "obstacle 0 'wall' (half_space through (3.5, 0, 0) m with normal (-1, 0, 0)) has its surface over 1 m",
+        ),
+        ([HalfSpace(position=(0.0, 0.0, 0.9))], "half_space through (0, 0, 0.9) m with normal (0, 0, 1)) touches"),
+    ],
+)  # fmt: skip
+def test_errors_name_the_obstacle_as_the_user_gave_it(env, obstacles, reason, ends):
+    reset(env, obstacles, reason, ends)
+
+
+def test_each_scene_of_a_batch_has_its_own_names():
+    envs = gym.make_vec(PANDA, num_envs=2, shapes=SHAPES).unwrapped
+    reset(envs, [[CRATE], [CRATE, HOUSE]], "scene 1: obstacle 1 'house' (box at", ENDS)
+    reset(envs, [HOUSE], "scene 0: obstacle 0 'house' (box at", ENDS)
+    envs.close()
+
+
+@pytest.mark.parametrize("normal", np.vstack((np.eye(3), -np.eye(3), (0.6, 0.0, -0.8))))
+def test_half_spaces_up_to_the_limit_are_in_the_observation_space(env, normal):
+    surface = HalfSpace.facing(normal, position=-normal)
+    observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": [surface]})
+    assert env.observation_space.contains(observation)
+    reset(env, [HalfSpace.facing(normal, position=-1.01 * normal)], "has its surface over 1 m", ENDS)
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "reason"),
+    [
+        ([CRATE] * 9, "at most 8 obstacles, got 9"),
+        (np.zeros((1, 9, 15)), "at most 8 obstacles, got 9"),
+        (CRATE, f"{LISTS}; put a single obstacle in a list, got Box("),
+        (CRATE.to_dict(), f"{LISTS}; put a single obstacle in a list, got {{"),
+        (None, f"{LISTS}, got None"),
+        (obstacles_to_json([CRATE]), f"{LISTS}, got '["),
+        (np.array([CRATE]), f"{LISTS}, got array"),
+        ((each for each in [CRATE]), f"{LISTS}, got <generator"),
+        ([[0.1, 0.2], [0.3]], f"{LISTS}, got [["),
+    ],
+)
+def test_what_is_no_list_of_obstacles_is_refused_with_what_is(env, obstacles, reason):
+    reset(env, obstacles, reason, ENDS)
+
+
+def test_observation_rows_take_dictionaries_and_name_shapes_that_they_lack():
+    np.testing.assert_array_equal(observation_rows([HOUSE.to_dict()], 2), observation_rows([HOUSE], 2))
+    with pytest.raises(ValueError, match="obstacle 0 'house': the shapes are capsule, not box"):
+        observation_rows([HOUSE], 1, ("capsule",))
+    with pytest.raises(ValueError, match="put a single obstacle in a list"):
+        observation_rows(HOUSE, 1)
+
+
+def test_options_of_a_scene_survive_json(env):
+    """Shapes keep their names, and numbers all their digits."""
+    third = Capsule(0.1 / 3.0, 0.2 / 3.0, position=(1.0 / 3.0, 0.6, 0.1), name="post")
+    options = {**ENDS, "start": (0.45, -1.0 / 3.0, 0.4), "obstacles": [third, CRATE.to_dict()]}
+    again = scene_from_json(scene_to_json(options, PANDA))
+    assert again == {**{name: list(options[name]) for name in ENDS}, "obstacles": [third, CRATE]}
+    env.reset(options=options)
+    scenes = env.batch.scenes
+    for given in (again, scene_from_json(scene_to_json(scenes.as_options()))):
+        env.reset(options=given)
+        for now, then in zip(env.batch.scenes, scenes, strict=True):
+            np.testing.assert_array_equal(now, then)
+
+
+def test_changes_of_a_scene_survive_json():
+    env = gym.make("viapoint/PlanarMovingObstacles-v0").unwrapped
+    env.reset(seed=3)
+    options = env.batch.scenes.as_options()
+    again = scene_from_json(scene_to_json(options))
+    assert list(again) == list(options)
+    for name, (value,) in options.items():
+        np.testing.assert_array_equal(again[name], value)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"begin": (0.1, 0.2)}, "not 'begin'"),
+        ({"obstacles": HOUSE}, "put a single obstacle in a list"),
+        ({"obstacles": [[HOUSE], [CRATE]]}, "options['obstacles'] must be real numbers"),
+        ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
+        ({"goal": np.zeros((2, 3))}, "options['goal'] must be those of one scene, got 2 scenes"),
+        ({"start": "here"}, "options['start'] must be real numbers"),
+    ],
+)
+def test_what_is_no_scene_is_not_written(options, reason):
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        scene_to_json(options)
