@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs import Sphere
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import REPLANNING_TASKS, TASKS
 from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS, make_method
@@ -379,6 +380,10 @@ def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
         ({"obstacles": [(0.0, np.inf, 0.0, 0.0, 0.1)]}, "obstacles must be finite"),
         ({"obstacles": [(0.0, 0.3, 0.0, 0.0, 0.5)]}, "has a radius over 0.1 m"),
         ({"obstacles": [(-0.2, 0.3, 0.0, 0.0, 0.02)]}, "obstacle 0 .* touches the arm at the start"),
+        (
+            {"obstacles": [Sphere(0.02, position=(-0.2, 0.3, 0.0), name="can")]},
+            "obstacle 0 'can' .* touches the arm",
+        ),
     ],
 )
 def test_what_cannot_be_planned_is_refused(given, message):

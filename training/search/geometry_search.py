@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Numbers, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.rows import CAPSULES, obstacle_rows, row_size, widened
+from viapoint.envs.geometry.rows import CAPSULES, obstacle_names, obstacle_rows, row_size, widened
 from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.registration import check_registered
@@ -213,12 +213,13 @@ def scene_from_rest(
     d = task.arm.dimension
     first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
     shapes = task.scenes.shapes
-    given = obstacle_rows([] if obstacles is None else obstacles, d, shapes)
+    obstacles = [] if obstacles is None else obstacles
+    given = obstacle_rows(obstacles, d, shapes)
     capsules = np.shape(given)[-1:] == (row_size(d),)
     size = row_size(d) if capsules else row_size(d, shapes)
     rows = _numbers("obstacles", given if np.size(given) else np.zeros((0, size)), (None, size))
     scene = Scenes(first, last, (rows if shapes == CAPSULES else widened(rows))[None])
-    for wrong, reason in problems(scene, task.collision_model):
+    for wrong, reason in problems(scene, task.collision_model, obstacle_names(obstacles)):
         if wrong.any():
             raise ValueError(reason(0))
     return scene
