@@ -31,7 +31,7 @@ FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
 TOGETHER = 1280
 """Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
-MOST_AHEAD = 800
+MOST_AHEAD = 320
 """Greatest number of attempts, over all scenes, for which several groups are drawn at once."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
