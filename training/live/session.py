@@ -230,13 +230,10 @@ class Session:
             self._set_scene(self._scene.with_row(int(number), row), changed=True)
         else:
             self._by_hand = None
-            scene = self._scene
-            moved = (
-                scene._replace(goal=point, jumps=scene.jumps[:0])
-                if kind == "goal"
-                else scene._replace(start=point)
-            )
-            self._set_scene(moved, changed=True)
+            scene = self._scene._replace(start=point)
+            if kind == "goal":
+                scene = self._scene._replace(goal=point, jumps=self._scene.jumps[:0])
+            self._set_scene(scene, changed=True)
 
     def _move_goal(self, point: Float) -> None:
         """Move the goal while the arm moves; an impossible one is refused."""
