@@ -52,7 +52,7 @@ def config(folder, algo="viaq", **changes):
 
 
 def curve(run):
-    measured = ("seconds", "decision_time")
+    measured = ("seconds", "wall_seconds", "decision_time")
     return [{name: value for name, value in record.items() if name not in measured} for record in run.curve]
 
 
@@ -117,6 +117,7 @@ def test_what_a_run_leaves(tmp_path):
     for before, after in zip(run.curve, run.curve[1:], strict=False):
         assert after["physics_steps"] > before["physics_steps"]
         assert after["seconds"] >= before["seconds"]
+        assert after["wall_seconds"] - before["wall_seconds"] > after["seconds"] - before["seconds"]
     for record in run.curve:
         assert record["success"]["low"] <= record["success"]["rate"] <= record["success"]["high"]
     assert list((run.folder / "tensorboard").glob("events.*"))

@@ -79,6 +79,7 @@ class RunCallback(BaseCallback):
         """Learning curve: one record for each evaluation so far."""
         self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
+        self._validating = 0.0
         checkpoint, evaluation = self.config.checkpoint_interval, self.config.evaluation_interval
         self._every = {"log": LOG_EVERY, "checkpoint": checkpoint, "evaluation": evaluation}
         self._next = {**self._every, "evaluation": 0}
@@ -89,11 +90,13 @@ class RunCallback(BaseCallback):
     def state(self) -> dict[str, Any]:
         """Return the state as plain values for :meth:`restore`."""
         best, following = list(self._best), dict(self._next)
-        return {"curve": self.curve, "best": best, "seconds": self.seconds, "next": following}
+        times = {"seconds": self.seconds, "validating": self._validating}
+        return {"curve": self.curve, "best": best, **times, "next": following}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a state that :meth:`state` returned."""
         self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
+        self._validating = float(state.get("validating", 0.0))
         self._best = (float(state["best"][0]), float(state["best"][1]))
         self._next = {name: int(state["next"][name]) for name in self._next}
 
@@ -216,7 +219,9 @@ class RunCallback(BaseCallback):
             ).results[0]
         if result.partial:
             return
-        self.curve.append(self._record(result, seconds))
+        record = self._record(result, seconds)
+        record["wall_seconds"] = round(seconds + self._validating + time.monotonic() - began, 3)
+        self.curve.append(record)
         self.run.write_curve(self.curve)
         summary = result.summary()
         ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
@@ -225,7 +230,8 @@ class RunCallback(BaseCallback):
             with self._progress_title("saving the best model"):
                 self.run.save("best", self.model)
         self._show_progress()
-        self._began += time.monotonic() - began
+        took = time.monotonic() - began
+        self._began, self._validating = self._began + took, self._validating + took
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
         env, summary = self.training_env, result.summary()

@@ -199,13 +199,17 @@ def _baseline_records(
 
 
 def _training(run: Run) -> Numbers:
-    """Return decisions, simulated time and wall time of a training, its cores, and why it stopped."""
+    """Return decisions and times of a training, its cores, and why it stopped.
+
+    `wall_seconds` is with validation, `seconds` without.
+    """
     if not run.curve:
         return {}
     cores = run.folder / "cores.json"
     last = {name: run.curve[-1][name] for name in CLOCKS}
     return {
         **last,
+        "wall_seconds": run.curve[-1].get("wall_seconds"),
         "cores": read_json(cores)["cores"] if cores.is_file() else None,
         "stopped": run.stopped,
     }
@@ -278,7 +282,7 @@ def _measured(env: Environment, row: Row, runs: Runs) -> Numbers:
 
 
 def _efforts(trainings: Sequence[Numbers]) -> Numbers:
-    """Return decisions and times of the trainings of a row: medians over seeds, and the wall time of each."""
+    """Return decisions and times of the trainings of a row: medians over seeds, and the wall times of each."""
     some = [each for each in trainings if each]
     if not some:
         return {}
@@ -286,6 +290,7 @@ def _efforts(trainings: Sequence[Numbers]) -> Numbers:
         "decisions": int(np.median([each["decisions"] for each in some])),
         "simulated_seconds": float(np.median([each["simulated_seconds"] for each in some])),
         "seconds": [each["seconds"] for each in some],
+        "wall_seconds": [each["wall_seconds"] for each in some if each.get("wall_seconds") is not None],
         "cores": sorted({each["cores"] for each in some if each["cores"] is not None}),
         "stopped": sorted({each["stopped"] for each in some if each["stopped"] is not None}),
     }
