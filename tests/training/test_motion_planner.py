@@ -64,23 +64,27 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     assert not done.success.any()
 
 
-def test_lines_are_near_capsules_when_their_closest_points_are():
-    """Against a dense search over both segments."""
-    generator = np.random.default_rng(0)
-    share = np.linspace(0.0, 1.0, 201)
-    for dimension in (2, 3):
-        for _ in range(100):
-            p, q, centre, half = generator.uniform(-1.0, 1.0, (4, dimension))
-            half = half * generator.integers(2)  # every other one a post
-            one = p + share[:, None] * (q - p)
-            other = centre + (2.0 * share[:, None] - 1.0) * half
-            distance = np.sqrt(((one[:, None] - other) ** 2).sum(axis=-1)).min()
-            near, far = (
-                ompl_planner._nearer(tuple(p), tuple(q), tuple(centre), tuple(half), max(distance + d, 0.0))
-                for d in (1e-3, -0.02)
-            )
-            assert near
-            assert not far
+@pytest.mark.parametrize("env_id", [WHOLE, "viapoint/PandaObstacles-v0"])
+def test_a_line_is_clear_where_the_arm_keeps_the_margin_along_it(env_id):
+    """Against the clearance at many places along random lines."""
+    pytest.importorskip("ompl")
+    planner, scenes = (
+        ompl_planner.MotionPlanner(SceneSimulation(env_id, 1)),
+        load("validation", env_id).scenes,
+    )
+    model, margin, share = planner._task.collision_model, 0.004, np.linspace(0.0, 1.0, 401)[:, None]
+    generator, answers = np.random.default_rng(0), []
+    for row in range(100):
+        scene = scenes.take([row])
+        first, second = scene.start[0] + generator.uniform(-0.1, 0.1, (2, scene.start.shape[1]))
+        line = first + share * (second - first)
+        least = float(model.least_clearance(line[None], scene.obstacles, scene.present)[0])
+        within = float(np.asarray(model.arm.reach_margin(line)).min())
+        if abs(least - margin) < 0.001 or abs(within) < 0.001:  # the planner looks at fewer places
+            continue
+        answers.append(least > margin and within > 0.0)
+        assert planner._clear(scene, margin)(first, second) == answers[-1]
+    assert 20 < sum(answers) < len(answers) - 20
 
 
 def test_points_lie_on_the_path_and_keep_its_corners():

@@ -19,7 +19,8 @@ from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.geometry.rows import has_shapes, pair_distance
+from viapoint.envs.geometry.distance import pair_clearance
+from viapoint.envs.geometry.rows import has_shapes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 
@@ -111,19 +112,13 @@ class MotionPlanner:
         model = self._task.collision_model
         arm, whole_arm = model.arm, model.whole_arm
         rows = scene.obstacles[0][scene.present[0]]
-        shaped = has_shapes(rows)
-        capsules = [
-            (*_split(row), float(row[-1]) + arm.hand_radius + margin) for row in (() if shaped else rows)
-        ]
+        radii = np.full(len(rows), arm.hand_radius)
 
         def clear(first: Float, second: Float) -> bool:
-            p, q = tuple(map(float, first)), tuple(map(float, second))
-            if any(_nearer(p, q, centre, half, least) for centre, half, least in capsules):
+            places = (in_space(end) if has_shapes(rows) else end for end in (first, second))
+            ends = (np.tile(place, (len(rows), 1, 1)) for place in places)
+            if (pair_clearance(*ends, rows, radii) < margin).any():
                 return False
-            if shaped and len(rows):
-                ends = (np.tile(in_space(end), (len(rows), 1)) for end in (first, second))
-                if pair_distance(rows, *ends).min() < arm.hand_radius + margin:
-                    return False
             count = max(2, int(np.ceil(norm(second - first) / CHECK_SPACING)) + 1) if whole_arm else 4
             points = first + np.linspace(0.0, 1.0, count)[:, None] * (second - first)
             if (np.asarray(arm.reach_margin(points)) < 0.0).any():
@@ -212,39 +207,3 @@ def _search(ompl: Any, ends: Float, clear: Clear, seconds: float) -> Float | Non
     path = problem.getSolutionPath()
     geometric.PathSimplifier(information).simplify(path, seconds)
     return np.stack([place(path.getState(i)) for i in range(path.getStateCount())])
-
-
-def _split(row: Float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    d = (len(row) - 1) // 2
-    return tuple(map(float, row[:d])), tuple(map(float, row[d : 2 * d]))
-
-
-def _nearer(
-    p: tuple[float, ...],
-    q: tuple[float, ...],
-    centre: tuple[float, ...],
-    half: tuple[float, ...],
-    least: float,
-) -> bool:
-    """Return whether the segments from p to q and from centre - half to centre + half are nearer than `least`.
-
-    The closest points of two segments are those of C. Ericson, Real-Time Collision Detection, 2005, 5.1.9:
-
-        minimise |p + s a - centre - t h|^2 over s in [0, 1], t in [-1, 1],  a = q - p, h = half
-
-    This is a second copy of :mod:`viapoint.envs.geometry.distance` in plain numbers: OMPL asks for one line at a time,
-    and for a few numbers NumPy takes ten times as long.
-    """
-    along = [b - a for a, b in zip(p, q, strict=True)]
-    apart = [a - c for a, c in zip(p, centre, strict=True)]
-    aa, hh = sum(a * a for a in along), sum(h * h for h in half)
-    ah = sum(a * h for a, h in zip(along, half, strict=True))
-    ar = sum(a * r for a, r in zip(along, apart, strict=True))
-    hr = sum(h * r for h, r in zip(half, apart, strict=True))
-    scale = aa * hh - ah * ah
-    s = min(max((ah * hr - ar * hh) / scale, 0.0), 1.0) if scale > 1e-15 else 0.0
-    t = (ah * s + hr) / hh if hh > 1e-12 else 0.0
-    t = min(max(t, -1.0), 1.0)
-    s = min(max((ah * t - ar) / aa, 0.0), 1.0) if aa > 1e-15 else 0.0
-    squared = sum((r + s * a - t * h) ** 2 for r, a, h in zip(apart, along, half, strict=True))
-    return squared < least * least

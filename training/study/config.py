@@ -326,17 +326,17 @@ def _environments(given: Any, scenes: Any, folder: Path) -> Iterator[Environment
 
 def _sets(where: str, given: Any, env_id: str, folder: Path) -> tuple[str, ...]:
     """Return the measured sets of an environment: by default those that are shipped for it."""
-    shipped = [name for name in MEASURED if shipped_path(name, env_id).is_file()]
+    shipped = [name for name in SETS if shipped_path(name, env_id).is_file()] or list(SETS[:2])
     if given is None:
-        return tuple(shipped or ["test"])
+        return tuple(name for name in shipped if name in MEASURED)
     found = []
     for name in listed(where, given):
-        if name in MEASURED:
-            found += [name] if name in (shipped or ["test"]) else []
+        if name in SETS:
+            found += [name] if name in shipped else []
         elif (folder / str(name)).is_file():
             found.append(str(folder / str(name)))
         else:
-            raise ValueError(unknown(where, name, MEASURED) + " (or the path of a file of scenes)")
+            raise ValueError(unknown(where, name, SETS) + " (or the path of a file of scenes)")
     return tuple(found)
 
 
@@ -421,7 +421,7 @@ def _baseline(
 def _exists(method: str, env: Environment) -> bool:
     """Return whether a baseline exists in an environment."""
     if method in ("stored", "random_order"):
-        shipped = all(shipped_path(each, env.id).is_file() for each in env.scenes if each in MEASURED)
+        shipped = all(shipped_path(each, env.id).is_file() for each in env.scenes if each in SETS)
         return env.id not in REPLANNING_TASKS and (method == "random_order" or shipped)
     return method in OWN_METHODS or method in (REPLANNING_METHODS if env.id in REPLANNING_TASKS else METHODS)
 
