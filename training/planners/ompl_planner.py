@@ -115,9 +115,10 @@ class MotionPlanner:
         radii = np.full(len(rows), arm.hand_radius)
 
         def clear(first: Float, second: Float) -> bool:
-            places = (in_space(end) if has_shapes(rows) else end for end in (first, second))
-            ends = (np.tile(place, (len(rows), 1, 1)) for place in places)
-            if (pair_clearance(*ends, rows, radii) < margin).any():
+            line = np.stack((first, second))
+            line = in_space(line) if has_shapes(rows) else line
+            p, q = (np.tile(end, (len(rows), 1, 1)) for end in line)
+            if (pair_clearance(p, q, rows, radii) < margin).any():
                 return False
             count = max(2, int(np.ceil(norm(second - first) / CHECK_SPACING)) + 1) if whole_arm else 4
             points = first + np.linspace(0.0, 1.0, count)[:, None] * (second - first)
