@@ -25,6 +25,7 @@ from viapoint.envs.common.validation import (
     seeds_of,
     whole_number,
 )
+from viapoint.envs.geometry.rows import is_shape_list, obstacle_names
 from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.worker_process import WorkerDiedError, WorkerProcess
@@ -157,14 +158,16 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         seeds = seeds_of(seed, self.num_envs)
         if not self._running:  # known here, so that lost workers can be made anew
             seeds = [int(np.random.SeedSequence().entropy) if each is None else each for each in seeds]  # type: ignore[arg-type]
-        given = self._prototype.parse_options(options, len(rows))
+        given: dict[str, Any] = self._prototype.parse_options(options, len(rows))
+        if any(map(any, obstacle_names(options.get("obstacles", ())))):  # for errors, which name them
+            shapes = options["obstacles"]
+            given["obstacles"] = [shapes] * len(rows) if is_shape_list(shapes) else list(shapes)
         asked, first = [], []
         for part in self.parts:
-            mine = (rows >= part.start) & (rows < part.stop)
-            first.append(int(np.searchsorted(rows, part.start)))
-            asked.append(
-                (seeds[part], rows[mine] - part.start, {name: each[mine] for name, each in given.items()})
-            )
+            begin, end = (int(np.searchsorted(rows, env)) for env in (part.start, part.stop))
+            first.append(begin)
+            mine = {name: each[begin:end] for name, each in given.items()}
+            asked.append((seeds[part], rows[begin:end] - part.start, mine))
         self._call("draw", asked, first)
         observation: Observation = merge(self._call("begin"))
         self._running = True

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs import ENV_IDS, SHAPES, Box, ReachVectorEnv
+from viapoint.envs import ENV_IDS, SHAPES, Box, ReachVectorEnv, Sphere
 from viapoint.envs.arms import ARMS
 from viapoint.envs.registration import OWN_ARM_TASKS
 from viapoint.envs.worker_env import WorkerVectorEnv
@@ -137,7 +137,11 @@ def test_given_scenes_and_their_errors_are_those_of_one_process(env_id):
     before = several.observe()
     far = options["goal"].copy()
     far[4] = 9.0
+    ends = {name: options[name] for name in ("start", "goal")}
+    ball = Sphere(0.02, position=(*options["start"][4], 0.0), name="ball")
     for wrong in (
+        {**ends, "obstacles": [ball]},
+        {**ends, "obstacles": [[ball] if i == 4 else [] for i in range(N)]},
         {"goal": far},
         {"goal": options["goal"][:3]},
         {"goal": [np.nan, 0.0]},
@@ -152,6 +156,7 @@ def test_given_scenes_and_their_errors_are_those_of_one_process(env_id):
                 each.reset(options=wrong)
             messages.append(str(caught.value))
         assert messages[0] == messages[1]
+        assert ("ball" in str(wrong)) == ("ball" in messages[0])
     assert_same(several.observe(), before)
     assert_same(several.step(actions(alone)), alone.step(actions(alone)))
     for wrong in (np.full(alone.action_space.shape, np.nan), np.zeros((N, 9)), "north"):
