@@ -93,9 +93,7 @@ def has_figure(numbers: Numbers) -> bool:
 
 def caption(numbers: Numbers) -> str:
     """Return the caption of an environment's figure: axes and number of scenes."""
-    above = (
-        "success without checks in validation scenes against decisions, simulated time and time of training"
-    )
+    above = "success without checks in validation scenes against decisions, simulated time and time of training without validation"
     sets = [f"{about['scenes']:,} `{name}`" for name, about in numbers["sets"].items() if about["bands"]]
     if not sets:
         return f"*{above.capitalize()}. The table has the number of seeds.*"
