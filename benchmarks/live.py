@@ -1,7 +1,9 @@
-"""Time from a change on the live page to the message with the new plan: `python benchmarks/live.py`."""
+"""Time from a change on the live page to the message with the new plan: `python benchmarks/live.py [--json FILE]`."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -24,7 +26,10 @@ DISTANCE = 0.03
 
 
 def main() -> None:
-    """Drag the goal to and fro in a headless Chromium, and print the latencies of the server."""
+    """Drag the goal to and fro in a headless Chromium, and print the latencies of the server, or write them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    file, found = parser.parse_args().json, {}
     sys.path.append(str(Path(__file__).parents[1] / "tests" / "training"))
     import browser
     from test_live_page import drag, steady
@@ -46,9 +51,13 @@ def main() -> None:
                 time.sleep(0.3)
                 browser.wait_for(lambda s=session: s.idle)
             taken = 1e3 * np.array(session.latencies)
-            print(f"{env_id}, {len(taken)}, {np.median(taken):.0f}, {np.quantile(taken, 0.95):.0f}")
+            median, most = float(np.median(taken)), float(np.quantile(taken, 0.95))
+            print(f"{env_id}, {len(taken)}, {median:.0f}, {most:.0f}")
+            found[env_id] = {"changes": len(taken), "median_ms": round(median, 1), "most_ms": round(most, 1)}
             tab.close()
     window.close()
+    if file is not None:
+        file.write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

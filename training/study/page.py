@@ -93,7 +93,8 @@ def has_figure(numbers: Numbers) -> bool:
 
 def caption(numbers: Numbers) -> str:
     """Return the caption of an environment's figure: axes and number of scenes."""
-    above = "success without checks in validation scenes against decisions, simulated time and time of training without validation"
+    clocks = "decisions, simulated time and time of training without validation"
+    above = f"success without checks in validation scenes against {clocks}"
     sets = [f"{about['scenes']:,} `{name}`" for name, about in numbers["sets"].items() if about["bands"]]
     if not sets:
         return f"*{above.capitalize()}. The table has the number of seeds.*"
