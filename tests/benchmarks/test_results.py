@@ -42,8 +42,11 @@ def test_tables_are_those_of_the_measurements(study, record):
         assert fill_tables(record, study.page, text, path) == text, f"{path}: {AGAIN}"
 
 
-def test_every_table_of_the_study_is_on_a_page_that_it_fills(study):
-    pages = [ROOT / path for path in study.page.into]
+def test_every_table_of_a_study_is_on_a_page_that_it_fills(study):
+    setups = Study.from_yaml(ROOT / "benchmarks" / "setups.yaml").page
+    text, record = (ROOT / setups.into[0]).read_text(), json.loads((ROOT / setups.record).read_text())
+    assert fill_tables(record, setups, text, setups.into[0]) == text, "viapoint study benchmarks/setups.yaml"
+    pages = [ROOT / path for path in (*study.page.into, *setups.into)]
     for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         there = re.search(r"^<!-- table:", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
         assert path in pages or not there, path
