@@ -206,9 +206,10 @@ def write(ids: Sequence[str]) -> None:
     FILE.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def check(ids: Sequence[str], episodes: int) -> bool:
-    """Run every mode and return whether all hashes are equal."""
+def check(ids: Sequence[str], episodes: int, file: Path | None = None) -> bool:
+    """Run every mode and return whether all hashes are equal; `file` gets the number of those that differ as JSON."""
     stored, good = json.loads(FILE.read_text()), True
+    found: dict[str, dict[str, Any]] = {}
     comparable = stored["made_with"] == fingerprint()
     for env_id in ids:
         digests = reference(env_id, episodes)
@@ -219,11 +220,15 @@ def check(ids: Sequence[str], episodes: int) -> bool:
                 flush=True,
             )
             good &= same
+        found[env_id] = {"episodes": episodes, "differ": {}}
         for name, way in WAYS.items():
             other = way(env_id, range(episodes))
             wrong = sum(a != b for a, b in zip(digests, other, strict=True))
+            found[env_id]["differ"][name] = wrong
             print(f"{env_id}: {name}: {wrong} of {episodes} episodes differ", flush=True)
             good &= wrong == 0
+        if file is not None:
+            file.write_text(json.dumps(found, indent=1) + "\n")
     if not comparable:
         print(f"stored hashes were made with {stored['made_with']}, this is {fingerprint()}: not compared")
     return good
@@ -234,11 +239,12 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--ids", nargs="+", default=IDS, choices=IDS)
     parser.add_argument("--episodes", type=int, default=EPISODES)
+    parser.add_argument("--json", type=Path, help="file for the numbers of episodes that differ")
     arguments = parser.parse_args()
     if arguments.write:
         write(arguments.ids)
         return
-    raise SystemExit(not check(arguments.ids, arguments.episodes))
+    raise SystemExit(not check(arguments.ids, arguments.episodes, arguments.json))
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ Clear = Callable[[Float, Float], bool]
 
 MARGINS = (0.010, 0.004, 0.001, 0.001)
 """Required clearances of a path in each attempt, until one can be made smooth, [m]."""
-PATIENCE = 0.25
+PATIENCE = 1.0
 """Time limit for each path, [s]."""
 BOX_MARGIN = 0.30
 """Margin of the planning box around start and goal, [m]."""
