@@ -15,7 +15,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
 import argparse
-import ctypes
 import json
 import time
 from collections import Counter
@@ -25,6 +24,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from reliability_long import memory
 
 import viapoint.envs
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS, TASKS
@@ -205,12 +205,6 @@ def fuzz_calls(env_id: str, number: int, seed: int = 0) -> Counter[str]:
             assert env.observation_space.contains(result[0])
     env.close()
     return found
-
-
-def memory() -> float:
-    """Return the resident memory of this process without free blocks of its allocator, [MB]."""
-    getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)(0)
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
 def run_in_parts(fuzz: Callable[..., Counter[str]], env_id: str, number: int) -> dict[str, Any]:
