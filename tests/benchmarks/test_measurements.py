@@ -1,7 +1,9 @@
-"""The numbers of docs/live.md are those of its JSON file."""
+"""Numbers that pages state are those of the JSON files of their measurements."""
 
 import json
 from pathlib import Path
+
+import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -23,3 +25,56 @@ def test_the_stated_times_of_the_live_page_are_the_measured_ones():
     )
     most = [f"{each['most_ms']}" for each in (plane, arm, panda)]
     assert f"95 % of the changes below {most[0]}, {most[1]} and {most[2]} ms" in page
+
+
+def total(results, part, name):
+    return sum(each[part].get(name, 0) for each in results.values())
+
+
+def test_the_stated_numbers_of_killed_trainings_are_the_measured_ones():
+    runs = read("reliability/kill.json").values()
+    kills, writing, number = (sum(each[name] for each in runs) for name in ("kills", "amid a write", "runs"))
+    assert not any(each["differing"] or each["checkpoints passed over"] for each in runs)
+    stated = (
+        f"killed {kills} times by SIGKILL at random moments, {writing} times amid a write: none of {number} "
+    )
+    assert stated + "results differs" in text("reliability.md")
+
+
+def test_the_stated_numbers_of_episodes_from_equal_seeds_are_the_measured_ones():
+    results = read("reliability/determinism.json")
+    assert not any(number for each in results.values() for number in each["differ"].values())
+    assert {len(each["differ"]) for each in results.values()} == {6}
+    steps = {name: each["episodes"] for name, each in results.items() if "Step-" in name}
+    others = {name: each["episodes"] for name, each in results.items() if name not in steps}
+    assert (len(others), set(others.values())) == (8, {1000})
+    assert (len(steps), set(steps.values())) == (3, {100})
+    assert "0 of 1,000 episodes of each of the eight ids" in text("reliability.md")
+    assert "0 of 100 of each of the three step-wise ids" in text("reliability.md")
+
+
+def test_the_stated_numbers_of_fuzzing_are_the_measured_ones():
+    results, page = read("reliability/fuzz.json"), text("reliability.md")
+    actions, refused, unstable = (
+        total(results, "actions", name) for name in ("actions", "refused", "unstable")
+    )
+    assert not unstable
+    assert f"in each of {len(results)} ids: {actions:,} steps, {refused} refusals, none unstable" in page
+    played, refused = (total(results, "scenes", name) for name in ("played", "refused"))
+    assert f"10,000 in each of {len(results)} ids: {played:,} played, {refused:,} refused" in page
+    done, refused = (total(results, "calls", name) for name in ("done", "refused"))
+    assert f"5,000 in each of {len(results)} ids: {done:,} done, {refused:,} refused" in page
+    assert not total(results, "calls", "refused without a reason")
+    most = max(part["memory_growth"] for each in results.values() for part in each.values())
+    assert f"at most {most} MB above" in page
+
+
+@pytest.mark.parametrize("part", ["decisions", "cycles"])
+def test_the_stated_memory_is_the_measured_one(part):
+    result, page = read(f"reliability/{part}.json"), text("reliability.md")
+    end = result["curve"][-1]
+    assert (result["files_growth"], result["threads_growth"]) == (0, 0)
+    assert f"{result['memory_growth']:+.1f} MB of {end['memory']:.0f} MB after the first tenth" in page
+    if part == "decisions":
+        first, last = result["first_speed"], result["last_speed"]
+        assert f"{first:.0f} a second of processor time at first and {last:.0f} at last" in page
