@@ -1,4 +1,4 @@
-"""Contact in MuJoCo and negative clearance agree: random poses of arms among obstacles of every shape of scenes.
+"""Contact in MuJoCo and negative clearance agree: random poses among obstacles of every shape, and random movements.
 
 OMP_NUM_THREADS=1 python benchmarks/contacts.py --out docs/contacts.json
 """
@@ -8,9 +8,10 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
-from viapoint.envs import SHAPES
+from viapoint.envs import SHAPES, ConvexMesh, register_mesh
 from viapoint.envs.arms import ADULT, PANDA
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.rows import shape_rows
@@ -22,17 +23,22 @@ TOLERANCE = 1e-4
 BATCH = 2000
 """Poses that are simulated together."""
 KINDS = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
+MESH = "hull_of_20_points"
 MODELS = {
     "panda": CollisionModel(PANDA, whole_arm=True),
     "planar": CollisionModel(ADULT, whole_arm=True),
     "planar hand": CollisionModel(ADULT, whole_arm=False),
 }
 
+MOVEMENTS = {"viapoint/PlanarWholeArm-v0": ("box",), "viapoint/PandaObstacles-v0": ("capsule", "box")}
+"""Environments of random movements, with the shapes of their obstacles."""
+
 
 class Contacts(NamedTuple):
     """Comparison of contacts with clearances."""
 
     poses: int
+    """Poses or movements."""
     contacts: int
     wrong: int
     """Poses whose clearance is farther from 0 than TOLERANCE and has the wrong sign."""
@@ -59,8 +65,8 @@ def random_obstacles(kind, places, generator):
     if shape.round:
         half[:, 1] = half[:, 0]
     half[:, 2] = {"sphere": half[:, 0], "capsule": half[:, 0] + half[:, 2]}.get(kind, half[:, 2])
-    if kind == "half_space":
-        half[:] = 1.0
+    if shape.only_half is not None:
+        half[:] = shape.only_half
     # The reach of a shape along a random direction, so that about half of the obstacles touch the arm.
     away = generator.normal(size=(number, d))
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
@@ -70,6 +76,13 @@ def random_obstacles(kind, places, generator):
         away = -np.stack(unit._axes[2], axis=-1)[:, :d]
         apart = 1.0 + generator.uniform(-0.05, 0.15, (number, 1))
     return shape_rows(kind, places + apart * away, quaternion, half)
+
+
+def register_example(name=MESH):
+    """Register the hull of 20 points, whose frame is neither in its middle nor along its axes of inertia."""
+    points = np.random.default_rng(1).normal(size=(20, 3)) * (0.05, 0.03, 0.08) + (0.02, 0.01, 0.03)
+    register_mesh(name, ConvexMesh.hull(points))
+    return name
 
 
 def contacts(name, kind, number, seed=0):
@@ -87,7 +100,8 @@ def contacts(name, kind, number, seed=0):
     rows = random_obstacles(kind, places, generator)[:, None]
     scenes = Scenes(hand, hand, rows)
     clearance = rest_clearance(scenes, hand, model)[:, 0]
-    simulator = Simulator(model, n_obstacles=1, num_envs=min(BATCH, number), threads=1, shapes=KINDS)
+    shapes = KINDS if kind in KINDS else (*KINDS, kind)
+    simulator = Simulator(model, n_obstacles=1, num_envs=min(BATCH, number), threads=1, shapes=shapes)
     touched = []
     for first in range(0, len(hand), BATCH):
         some = slice(first, first + BATCH)
@@ -96,9 +110,26 @@ def contacts(name, kind, number, seed=0):
         still = np.zeros((len(sims), 1, simulator.model.nu))
         touched.append(simulator.rollout(sims, still).contact[:, 0])
     contact = np.concatenate(touched)
+    return _compared(contact, clearance)
+
+
+def contacts_of_movements(env_id, shapes, number, seed=0):
+    """Compare contacts in random movements, which start clear of the obstacles, with their least clearance."""
+    envs = gym.make_vec(env_id, num_envs=min(BATCH, number), shapes=shapes)
+    envs.reset(seed=seed)
+    envs.action_space.seed(seed)
+    found = [envs.step(envs.action_space.sample())[-1] for _ in range(-(-number // envs.num_envs))]
+    contact, clearance = (
+        np.concatenate([info[name] for info in found]) for name in ("collision", "min_clearance")
+    )
+    return _compared(contact, clearance)
+
+
+def _compared(contact, clearance):
+    """Return the comparison of contacts with clearances, shape (N,) each."""
     wrong = (contact != (clearance < 0.0)) & (np.abs(clearance) > TOLERANCE)
     shallowest = float((-clearance[wrong]).min()) if wrong.any() else None
-    return Contacts(len(hand), int(contact.sum()), int(wrong.sum()), shallowest)
+    return Contacts(len(contact), int(contact.sum()), int(wrong.sum()), shallowest)
 
 
 def main():
@@ -108,8 +139,13 @@ def main():
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     found = {}
-    for name in MODELS:
-        for kind in KINDS:
+    found["movements"] = {}
+    for env_id, shapes in MOVEMENTS.items():
+        each = contacts_of_movements(env_id, shapes, arguments.poses)
+        found["movements"][env_id] = each._asdict()
+        print(f"{env_id}: {each.poses} movements, {each.contacts} with contact, {each.wrong} wrong")
+    for name, model in MODELS.items():
+        for kind in (*KINDS, *([register_example()] if model.arm.dimension == 3 else [])):
             each = contacts(name, kind, arguments.poses)
             found.setdefault(name, {})[kind] = each._asdict()
             depth = "" if each.shallowest is None else f", the shallowest {each.shallowest:.3f} m deep"

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         nearest_distance,
         obstacles_from_json,
         obstacles_to_json,
+        register_mesh,
         signed_distances,
     )
     from viapoint.envs.mdp.task import family_sampler
@@ -57,7 +58,7 @@ else:
         "geometry.shape": ("Shape",),
         "geometry.shapes": (
             "SHAPES", "add_to_model", "as_obstacle", "as_obstacles", "nearest_distance", "obstacles_from_json",
-            "obstacles_to_json", "signed_distances",
+            "obstacles_to_json", "register_mesh", "signed_distances",
         ),
         "mdp.task": ("family_sampler",),
         "record_video": ("RecordMovements",),
@@ -116,6 +117,7 @@ __all__ = [
     "obstacles_from_rows",
     "obstacles_to_json",
     "register_arm",
+    "register_mesh",
     "register_scene_family",
     "rows_of_lights",
     "scene_from_json",

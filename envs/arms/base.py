@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -86,12 +87,13 @@ class Arm(Protocol):
         Without names, positions are computed from the joints; for few links that is faster.
         """
 
-    def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
+    def compile(self, n_obstacles: int, whole_arm: bool, meshes: Sequence[str] = ()) -> mujoco.MjModel:
         """Return the MuJoCo model of the arm with movable obstacles.
 
         Args:
             n_obstacles: Number of movable capsules.
             whole_arm: True if every link collides with the obstacles, False for the hand alone.
+            meshes: Names of registered meshes that obstacles may be.
         """
 
     def hand_position(self, joints: Array) -> Array:

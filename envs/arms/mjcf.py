@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Constants, Hinge
 from viapoint.envs.common.types import Box, Float
+from viapoint.envs.geometry.shapes import SHAPES, add_to_model
 
 Pose = tuple[Float, Float]
 """Axes, as the columns of a rotation matrix, and origin of a frame in the world, [m]."""
@@ -19,6 +21,8 @@ MIN_INERTIA = 1e-12
 """Least principal moment of inertia of a link, [kg m^2]."""
 INERTIA_MARGIN = 2e-5
 """Relative margin of the triangle inequality of principal moments; model files keep six digits."""
+HIDDEN_GROUP = 5
+"""Group of geoms that MuJoCo does not draw."""
 DIGITS = 12
 """Decimal places of constants, so that entries that should be 0 are 0, and cost nothing."""
 
@@ -105,8 +109,16 @@ def principal_inertia(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
     return moments, quaternion_of(axes)
 
 
-def add_obstacles(spec: mujoco.MjSpec, number: int) -> None:
-    """Add movable capsules `obstacle_0`, `obstacle_1`, ... that collide with geoms of contact type 1."""
+def add_obstacles(spec: mujoco.MjSpec, number: int, meshes: Sequence[str] = ()) -> None:
+    """Add movable capsules `obstacle_0`, `obstacle_1`, ... that collide with geoms of contact type 1.
+
+    Each mesh, a name of :data:`~viapoint.envs.geometry.shapes.SHAPES`, is added as the geom `NAME_0` that collides with
+    nothing, so that the model holds what obstacles of this shape need.
+    """
+    if meshes:
+        store = spec.worldbody.add_body(name="meshes", pos=(0.0, 0.0, -10.0))
+        shapes = [SHAPES[name](name=name) for name in meshes]
+        add_to_model(spec, shapes, store, contype=0, conaffinity=0, group=HIDDEN_GROUP)
     for row in range(number):
         name = f"obstacle_{row}"
         body = spec.worldbody.add_body(name=name, mocap=True, pos=(0.0, 0.0, -10.0))

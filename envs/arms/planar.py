@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,7 +109,7 @@ class PlanarArm:
         near, far = (upper**2 + fore**2 + 2 * upper * fore * np.cos([high, low])) ** 0.5
         return float(near), float(far)
 
-    def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
+    def compile(self, n_obstacles: int, whole_arm: bool, meshes: Sequence[str] = ()) -> mujoco.MjModel:
         """Return the MuJoCo model; see :meth:`viapoint.envs.arms.base.Arm.compile`."""
         spec = read_spec(self.model_file)
         if whole_arm:
@@ -117,7 +118,7 @@ class PlanarArm:
             actuator.biasprm[1:3] = -stiffness, -damping
         for geom in (spec.geom("upper_arm"), spec.geom("forearm")):
             geom.contype = int(whole_arm)
-        add_obstacles(spec, n_obstacles)
+        add_obstacles(spec, n_obstacles, meshes)
         return spec.compile()
 
     def hand_position(self, joints: Array) -> Array:

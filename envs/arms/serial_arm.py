@@ -145,12 +145,12 @@ class SerialArm:
         """Names of the sites of the hand and of both ends of each capsule."""
         return (self.hand_site, *(f"{capsule.name}_{end}" for capsule in self.shape for end in (0, 1)))
 
-    def compile(self, n_obstacles: int, whole_arm: bool) -> mujoco.MjModel:
+    def compile(self, n_obstacles: int, whole_arm: bool, meshes: Sequence[str] = ()) -> mujoco.MjModel:
         """Return the MuJoCo model; see :meth:`viapoint.envs.arms.base.Arm.compile`."""
         spec = read_spec(self.model_file)
         self._add_links(spec, whole_arm)
         self._add_actuators(spec)
-        add_obstacles(spec, n_obstacles)
+        add_obstacles(spec, n_obstacles, meshes)
         return spec.compile()
 
     def hand_position(self, joints: Array) -> Array:

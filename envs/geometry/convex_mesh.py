@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Self
 
 import mujoco
@@ -102,6 +102,10 @@ class ConvexMesh(Shape):
         """Return the parameters as plain lists; the faces follow from the vertices."""
         return {name: value for name, value in super().to_dict().items() if name != "faces"}
 
+    def in_plane(self) -> tuple[Float, Float]:
+        """Raise ValueError: meshes are no obstacles of arms in the plane."""
+        raise ValueError(f"{self.kind} is for arms in space; in the plane, use boxes, cylinders and capsules")
+
     def _check(self) -> None:
         try:
             object.__setattr__(self, "vertices", frozen(_checked_vertices(self.vertices)))
@@ -186,6 +190,53 @@ class ConvexMesh(Shape):
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
         return np.asarray(self.vertices[(directions @ self.vertices.T).argmax(axis=1)])
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMesh(ConvexMesh):
+    """Convex mesh of a registered name at some pose, see :func:`~viapoint.envs.geometry.shapes.register_mesh`.
+
+    Each registered mesh is a subclass, a shape of one size, so its kind and pose in a row of numbers determine it.
+    """
+
+    in_scenes: ClassVar[bool] = True
+    mesh: ClassVar[ConvexMesh]
+    """Mesh in its own frame."""
+    middle: ClassVar[Float]
+    """Centre of the bounding box in the mesh's frame, shape (3,), [m]."""
+
+    vertices: Array = field(init=False, default=None)
+    """Shape (V, 3), [m]."""
+    faces: Any = field(init=False, default=None)
+    """None: the mesh is known to be convex."""
+
+    @classmethod
+    def named(cls, name: str, mesh: ConvexMesh) -> type[NamedMesh]:
+        """Return the class of a mesh with a name; the pose of the mesh does not matter."""
+        own = ConvexMesh(mesh.vertices)
+        middle, half = own.box()
+        values = {"kind": name, "mesh": own, "middle": middle, "only_half": tuple(half.tolist())}
+        return type(name, (cls,), {**values, "__doc__": f"Convex mesh {name!r}."})
+
+    @classmethod
+    def from_box(cls, centre: Array, quaternion: Array, half: Array) -> Self:
+        """Return meshes from their bounding boxes; see :meth:`Shape.from_box`."""
+        own = super().from_box(centre, quaternion, half)
+        offset = [
+            sum(float(m) * axis[i] for m, axis in zip(cls.middle, own._axes, strict=True)) for i in range(3)
+        ]
+        position = namespace_of(centre).stack([centre[..., i] - o for i, o in enumerate(offset)], -1)
+        object.__setattr__(own, "position", position)
+        own._check()
+        return own
+
+    @classmethod
+    def _of_half(cls, half: Array) -> dict[str, Array]:
+        del half
+        return {}
+
+    def _check(self) -> None:
+        self.__dict__.update(vertices=self.mesh.vertices, polytope=self.mesh.polytope)
 
 
 def hull_triangles(vertices: Float) -> Index:

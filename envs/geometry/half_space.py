@@ -33,6 +33,7 @@ class HalfSpace(Shape):
     """
 
     kind: ClassVar[str] = "half_space"
+    only_half: ClassVar[tuple[float, float, float]] = (EXTENT, EXTENT, EXTENT)
     round: ClassVar[bool] = True
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
@@ -35,6 +35,8 @@ class PointCloud(Shape):
         >>> cloud = PointCloud([(0.4, 0.0, 0.2), (0.4, 0.02, 0.2), (0.42, 0.0, 0.21)], radius=0.01)
         >>> cloud.distance([0.4, 0.0, 0.3]).round(4).item()
         0.0822
+        >>> len(PointCloud.covering(cloud.points, spacing=0.05).points)  # fewer and larger spheres
+        1
     """
 
     kind: ClassVar[str] = "point_cloud"
@@ -45,6 +47,24 @@ class PointCloud(Shape):
     """Shape (K, 3), [m]."""
     radius: Array = 0.01
     """Radius of the spheres, [m]."""
+
+    @classmethod
+    def covering(cls, points: Any, spacing: float, radius: float = 0.0, **pose: Any) -> Self:
+        """Return a cloud of fewer points whose spheres contain those around the given points.
+
+        The space is divided into cubes; one sphere encloses each cube that holds a point.
+
+        Args:
+            points: Shape (K, 3), [m].
+            spacing: Edge of the cubes, [m].
+            radius: Radius of the spheres around the given points, [m].
+            **pose: `position`, `quaternion` and `name`.
+        """
+        if not spacing > 0.0:
+            raise cls._refusal(pose.get("name", ""), f"spacing must be greater than 0, got {spacing!r}")
+        given = cls(points, **pose).points
+        cubes = np.unique(np.floor(given / spacing), axis=0)
+        return cls((cubes + 0.5) * spacing, radius=0.5 * np.sqrt(3.0) * spacing + radius, **pose)
 
     @property
     def bounding_sphere(self) -> tuple[Array, Array]:

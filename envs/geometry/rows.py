@@ -18,6 +18,8 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
+from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
+from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.envs.geometry.shape import Shape, frame_axes
@@ -181,7 +183,8 @@ def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSUL
     """
     refuse_single(obstacles)
     if is_shape_list(obstacles):
-        return np.array([_row(i, o, dimension, tuple(shapes)) for i, o in enumerate(as_obstacles(obstacles))])
+        parts = _parts_of_scenes(obstacles)
+        return np.array([_row(i, part, dimension, tuple(shapes)) for i, part in enumerate(parts)])
     if not _has_lists(obstacles):
         return _checked_numbers(obstacles)
     rows = np.zeros((len(obstacles), max(map(len, obstacles)), row_size(dimension, shapes)))
@@ -201,7 +204,7 @@ def obstacle_names(obstacles: Any) -> list[list[str]]:
         One list for all scenes, or one for each of N scenes; rows of numbers have no names.
     """
     if is_shape_list(obstacles):
-        return [[each.name for each in as_obstacles(obstacles)]]
+        return [[each.name for each in _parts_of_scenes(obstacles)]]
     return [obstacle_names(scene)[0] for scene in obstacles] if _has_lists(obstacles) else [[]]
 
 
@@ -363,6 +366,40 @@ def check_shapes(shapes: Any) -> tuple[str, ...]:
     return names
 
 
+def _parts_of_scenes(obstacles: Any) -> list[Shape]:
+    """Return a list of shapes and dictionaries as single shapes that scenes hold; a point cloud becomes its spheres."""
+    found = list[Shape]()
+    for i, each in enumerate(as_obstacles(obstacles)):
+        _check_single(i, each)
+        if isinstance(each, PointCloud):
+            name = each.name or each.kind
+            found += [
+                Sphere(geom.size[0], position=geom.position, name=f"{name} point {j}")
+                for j, geom in enumerate(each.geoms())
+            ]
+        else:
+            found.append(each)
+    return found
+
+
+def _check_single(index: int, obstacle: Shape) -> None:
+    """Check that an obstacle is one shape, not a batch."""
+    wanted = {**obstacle.sizes, "position": (3,), "quaternion": (4,)}
+    for name, shape in wanted.items():
+        if (got := tuple(getattr(obstacle, name).shape)) != shape:
+            batch = got[: len(got) - len(shape)]
+            reason = f"{obstacle.kind} must be one shape, got a batch of {batch}"
+            raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
+
+
+def _with_name(mesh: ConvexMesh, shapes: tuple[str, ...]) -> ConvexMesh:
+    """Return a mesh as the registered one with the same vertices, if it is among the shapes."""
+    for shape in (SHAPES[name] for name in shapes):
+        if issubclass(shape, NamedMesh) and np.array_equal(shape.mesh.vertices, mesh.vertices):
+            return shape(position=mesh.position, quaternion=mesh.quaternion, name=mesh.name)
+    return mesh
+
+
 def _numbered(index: int, obstacle: Shape) -> str:
     """Return number and name of an obstacle, for error messages."""
     return f"obstacle {index}{f' {obstacle.name!r}' if obstacle.name else ''}"
@@ -370,6 +407,8 @@ def _numbered(index: int, obstacle: Shape) -> str:
 
 def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -> Float:
     """Return an obstacle as a row of a scene."""
+    if isinstance(obstacle, ConvexMesh):
+        obstacle = _with_name(obstacle, shapes)
     kind = obstacle.kind
     if kind == "sphere" and kind not in shapes and "capsule" in shapes:
         kind = "capsule"
@@ -379,14 +418,10 @@ def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -
         if type(obstacle).in_scenes:
             reason += f"; make it with shapes={(*shapes, kind)!r}"
         else:
-            reason += ", which is for distances only"
+            reason += (
+                "; give the mesh a name with register_mesh, and make the environment with that name in shapes"
+            )
         raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
-    wanted = {**obstacle.sizes, "position": (3,), "quaternion": (4,)}
-    for name, shape in wanted.items():
-        if (got := tuple(getattr(obstacle, name).shape)) != shape:
-            batch = got[: len(got) - len(shape)]
-            reason = f"{obstacle.kind} must be one shape, got a batch of {batch}"
-            raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
     try:
         centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()
     except ValueError as error:

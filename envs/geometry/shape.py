@@ -101,6 +101,8 @@ class Shape(abc.ABC):
     """Names of the parameters that must be positive, with the shape of one value, in the order of MuJoCo's sizes."""
     in_scenes: ClassVar[bool] = True
     """Flag: the bounding box determines the shape, so that scenes can hold it as a row of numbers."""
+    only_half: ClassVar[tuple[float, float, float] | None] = None
+    """Half lengths of the bounding box of a shape of one size, [m]; None if the parameters determine them."""
     round: ClassVar[bool] = False
     """Flag: the shape is symmetric under rotations about the z axis of its frame."""
 
@@ -143,7 +145,7 @@ class Shape(abc.ABC):
     @classmethod
     def parameters(cls) -> list[str]:
         """Return the names of the parameters, those of the pose last."""
-        return [f.name for f in sorted(fields(cls), key=lambda f: bool(f.kw_only))]
+        return [f.name for f in sorted(fields(cls), key=lambda f: bool(f.kw_only)) if f.init]
 
     # Distances
 

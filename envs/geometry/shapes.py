@@ -14,7 +14,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.box import Box
-from viapoint.envs.geometry.convex_mesh import ConvexMesh
+from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.cylinder import Cylinder
 from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
@@ -26,6 +26,37 @@ SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 }
 """Shapes by their names in dictionaries."""
+
+
+def register_mesh(name: str, mesh: ConvexMesh) -> None:
+    """Register a convex mesh under a name, so that scenes of arms in space may contain it.
+
+    The name is then a shape: environments take it in `shapes`, dictionaries as `shape`, and `reset` also takes a
+    `ConvexMesh` with the same vertices. Random scenes do not contain it. Files and specs store the name only: register
+    the mesh before you load one of them. Registering the same mesh again changes nothing.
+
+    Raises:
+        TypeError: The mesh is no `ConvexMesh`.
+        ValueError: The name is taken by another shape, or is no identifier.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> import numpy as np
+        >>> from viapoint.envs import ConvexMesh, register_mesh
+        >>> wedge = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 1), (0, 1, 1)]) / 10
+        >>> register_mesh("wedge", ConvexMesh(wedge))
+        >>> env = gym.make("viapoint/PandaObstacles-v0", shapes=("capsule", "wedge"))
+        >>> _ = env.reset(options={"obstacles": [{"shape": "wedge", "position": (0.4, 0.0, 0.2)}]})
+    """
+    if not isinstance(mesh, ConvexMesh):
+        raise TypeError(
+            f"mesh must be a ConvexMesh, such as ConvexMesh.hull(points), got {type(mesh).__name__}"
+        )
+    if not (isinstance(name, str) and name.isidentifier()):
+        raise ValueError(f"the name of a mesh must be an identifier such as 'rock', got {name!r}")
+    found = SHAPES.setdefault(name, NamedMesh.named(name, mesh))
+    if not (issubclass(found, NamedMesh) and np.array_equal(found.mesh.vertices, mesh.vertices)):
+        raise ValueError(f"another shape is registered as {name!r}; give this mesh another name")
 
 
 def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:

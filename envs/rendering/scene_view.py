@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from viapoint.envs.arms.mjcf import HIDDEN_GROUP
 from viapoint.envs.common.arrays import in_space
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
@@ -20,8 +21,6 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.simulator import Simulator
 
 CAMERA = "view"
-HIDDEN = 5
-"""Group of geoms that MuJoCo does not draw."""
 OVERHEAD, AMONG = 0.5, 0.7
 """Opacity of links that pass above the obstacles, and of links that collide with them."""
 LOW, TALL = 0.030, 0.060
@@ -43,7 +42,7 @@ class SceneView:
 
     def __init__(self, simulator: Simulator, width: int, height: int) -> None:
         """Copy the simulator's model, so that changes of appearance do not affect the simulation."""
-        self.arm = simulator.arm
+        self.arm, self._meshes = simulator.arm, simulator.meshes
         self.model = copy.copy(simulator.model)
         self._data = mujoco.MjData(self.model)
         self._option = mujoco.MjvOption()
@@ -97,7 +96,7 @@ class SceneView:
         for geom in range(self.model.ngeom):
             body = self.model.geom_bodyid[geom]
             if self.model.body_mocapid[body] >= 0:
-                self.model.geom_group[geom] = HIDDEN
+                self.model.geom_group[geom] = HIDDEN_GROUP
             elif self.model.body_weldid[body] > 0 and geom != self._hand:
                 links.append(geom)
         return links
@@ -182,8 +181,12 @@ class SceneView:
             centre = np.array([*centre[:2], 0.5 * (self._floor + top)])
             half = np.array([*half[:2], 0.5 * (top - self._floor)])
         for geom in shape.from_box(centre, quaternion, half).geoms():
-            turn = np.stack(rotation_axes(geom.quaternion), axis=-1)
-            shapes.geom(geom.type, geom.size, geom.position, colour, turn=turn)
+            position, turned, mesh = geom.position, geom.quaternion, self._meshes.get(shape.kind)
+            if mesh is not None:
+                (offset,), (turned,) = mesh.place(turned[None])
+                position = position + offset
+            turn = np.stack(rotation_axes(turned), axis=-1)
+            shapes.geom(geom.type, geom.size, position, colour, turn=turn, mesh=mesh.mesh if mesh else -1)
 
     def _draw_movement(self, shapes: ShapeWriter, movement: Movement, step: int) -> None:
         """Draw the planned path, its via-points, and the executed path up to `step`, red after the first contact."""

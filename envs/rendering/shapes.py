@@ -86,14 +86,19 @@ class ShapeWriter:
         colour: Colour,
         glow: float = MATT,
         turn: Float | None = None,
+        mesh: int = -1,
     ) -> Geom | None:
-        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; the columns of `turn` (3, 3) are its axes."""
+        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; the columns of `turn` (3, 3) are its axes.
+
+        A mesh has its index in the model.
+        """
         if self._scene.ngeom >= self._scene.maxgeom:
             return None
         geom = self._scene.geoms[self._scene.ngeom]
         turn = np.eye(3) if turn is None else turn
         lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
         mujoco.mjv_initGeom(geom, kind, np.array(size), centre, turn.flatten(), lit)
+        geom.dataid = 2 * mesh if mesh >= 0 else -1  # odd numbers are hulls
         geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
         self._scene.ngeom += 1
         return geom

@@ -201,9 +201,9 @@ def reshaped(rows: Float, u: Float, shapes: Sequence[str]) -> Float:
     Args:
         rows: Rows of either kind, shape (..., .), [m].
         u: Uniform numbers, shape (..., RESHAPE_NUMBERS).
-        shapes: Names of the shapes of scenes; half-spaces fit into no capsule.
+        shapes: Names of the shapes of scenes; those of one size do not fit into every capsule.
     """
-    names, d = [name for name in shapes if name != "half_space"], dimension_of(rows)
+    names, d = [name for name in shapes if SHAPES[name].only_half is None], dimension_of(rows)
     if not names or tuple(shapes) == CAPSULES:
         return rows if tuple(shapes) == CAPSULES else widened(rows)
     found = widened(rows).copy()

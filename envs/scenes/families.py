@@ -33,7 +33,7 @@ from viapoint.envs.scenes.spatial_families import (
     window,
 )
 
-MOST_OBSTACLES = 24
+MOST_OBSTACLES = 256
 """Greatest number of obstacles in a scene that is given."""
 MOST_DRAWN = 8
 """Greatest number of obstacles in a scene that is drawn."""

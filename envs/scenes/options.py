@@ -274,7 +274,9 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
         array = array.reshape((0, size))
     rows = len(shape) == 3 and array.ndim in (2, 3) and array.shape[-1] == size
     if rows and array.shape[-2] > shape[1]:
-        raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {array.shape[-2]}")
+        number = array.shape[-2]
+        hint = f"; make the environment with n_obstacles=(0, {number})" if name == "obstacles" else ""
+        raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {number}{hint}")
     try:
         if len(shape) == 2:
             result[:] = array

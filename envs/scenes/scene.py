@@ -198,7 +198,10 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
     for number in np.unique(kind[scenes.present & ~strange]):
         some = scenes.present & (kind == number)
         place = centre[some][:, : scenes.start.shape[-1]]
-        again[some] = shape_rows(known[int(number)], place, quaternion[some], half[some])
+        name = known[int(number)]
+        again[some] = shape_rows(name, place, quaternion[some], half[some])
+        if (only := SHAPES[name].only_half) is not None:
+            strange[some] |= (np.abs(half[some] - only) > 1e-6).any(axis=-1)
     strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
     yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"
     yield (half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.convex_mesh import NamedMesh
 from viapoint.envs.geometry.narrow_phase import LinkPositions
-from viapoint.envs.geometry.rows import CAPSULES, ShapeColumns, dimension_of, shape_columns
+from viapoint.envs.geometry.rows import CAPSULES, ShapeColumns, dimension_of, rotation_axes, shape_columns
 from viapoint.envs.geometry.shapes import SHAPES
 
 OUT_OF_THE_WAY, UPRIGHT = np.array([0.0, 0.0, -10.0]), np.array([1.0, 0.0, 0.0, 0.0])
@@ -37,6 +38,44 @@ class SimulationLog(NamedTuple):
     """Positions of the arm's traced sites before each step; None without such sites."""
 
 
+class MeshGeom(NamedTuple):
+    """Geom of a mesh as MuJoCo compiled it: in a frame of its own, along the axes of inertia of the mesh."""
+
+    mesh: int
+    """Index of the mesh in the model."""
+    position: Float
+    """Origin of the frame in that of the shape, shape (3,), [m]."""
+    quaternion: Float
+    """Orientation of the frame in that of the shape, shape (4,)."""
+    size: Float
+    """Shape (3,), [m]."""
+    bound: float
+    """Radius of the bounding sphere, [m]."""
+    box: Float
+    """Centre and half lengths of the bounding box, shape (6,), [m]."""
+
+    @classmethod
+    def of_model(cls, model: mujoco.MjModel, name: str) -> MeshGeom:
+        """Return the geom of a name."""
+        geom, i = model.geom(name), model.geom(name).id
+        return cls(
+            int(geom.dataid[0]), geom.pos.copy(), geom.quat.copy(), geom.size.copy(), float(geom.rbound[0]),
+            model.geom_aabb[i].copy(),
+        )  # fmt: skip
+
+    def place(self, quaternion: Float) -> tuple[Float, Float]:
+        """Return how far the origin of the frame is from the shape's, shape (n, 3), [m], and the frame's orientation.
+
+        Args:
+            quaternion: Orientations of the shape, shape (n, 4).
+        """
+        offset = np.stack(rotation_axes(quaternion), axis=-1) @ self.position
+        turned = np.empty_like(quaternion)
+        for each, own in zip(turned, quaternion, strict=True):
+            mujoco.mju_mulQuat(each, own, self.quaternion)
+        return offset, turned
+
+
 class Simulator:
     """MuJoCo's batch engine with one arm and obstacles of any place, size and shape in each simulation."""
 
@@ -51,7 +90,8 @@ class Simulator:
     ) -> None:
         """Compile one model and allocate `num_envs` simulations on `threads` threads (0: one for each core)."""
         self.collision_model, self.arm = collision_model, collision_model.arm
-        self.model = self.arm.compile(n_obstacles, collision_model.whole_arm)
+        meshes = [name for name in shapes if issubclass(SHAPES[name], NamedMesh)]
+        self.model = self.arm.compile(n_obstacles, collision_model.whole_arm, meshes)
         self.timestep = float(self.model.opt.timestep)
         """Length of a physics step, [s]."""
         self.physics_steps = 0
@@ -72,6 +112,10 @@ class Simulator:
         self._types = None
         if n_obstacles and tuple(shapes) != CAPSULES:
             self._types = self.batch.expand("geom_type")
+        self.meshes = {name: MeshGeom.of_model(self.model, f"{name}_0") for name in meshes}
+        """Geoms of registered meshes by name."""
+        if n_obstacles and meshes:
+            self._mesh_ids = self.batch.expand("geom_dataid")
 
     def place(
         self, sims: NDArray[np.int64], joints: Float, obstacles: Float, present: NDArray[np.bool_]
@@ -161,11 +205,29 @@ class Simulator:
             sim, row = np.nonzero(present & (shape.kind == number))
             kind, half, centre = list(SHAPES.values())[number], shape.half[sim, row], shape.centre[sim, row]
             own = kind.from_box(centre, shape.quaternion[sim, row], half)
-            sim, geom = sims[sim], geoms[row]
+            placed, sim, geom = sim, sims[sim], geoms[row]
             self._offsets[sim, row] = own.position - centre
+            if kind.kind in self.meshes:
+                self._put_mesh(self.meshes[kind.kind], sim, row, shape.quaternion[placed, row])
+                continue
             unit = kind.from_box(np.zeros(3), UPRIGHT, np.ones(3))
             self._types[sim, geom] = unit.geoms()[0].type
             self._sizes[sim, geom] = kind.geom_size(half)
             axis, radius = kind.bound(half)
             self._bounds[sim, geom] = norm(axis) + radius if kind.sizes else 0.0
             self._boxes[sim, geom] = np.concatenate((np.zeros_like(half), half), axis=-1)
+
+    def _put_mesh(
+        self, mesh: MeshGeom, sims: NDArray[np.int64], rows: NDArray[np.intp], quaternion: Float
+    ) -> None:
+        """Make geoms those of a mesh, whose frame is another one than that of the shape."""
+        geoms = np.array(self._geoms)[rows]
+        offset, turned = mesh.place(quaternion)
+        self._offsets[sims, rows] += offset
+        self.batch.bind("mocap_quat")[sims, rows] = turned
+        assert self._types is not None
+        self._types[sims, geoms] = mujoco.mjtGeom.mjGEOM_MESH
+        self._mesh_ids[sims, geoms] = mesh.mesh
+        self._sizes[sims, geoms] = mesh.size
+        self._bounds[sims, geoms] = mesh.bound
+        self._boxes[sims, geoms] = mesh.box

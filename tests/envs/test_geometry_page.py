@@ -32,6 +32,10 @@ def test_the_stated_misses_of_contact_are_all_of_them():
     assert {row["poses"] for row in FOUND["agreement"]} == {10_000}
     assert f"pass right through a box ({number} of 10,000)" in TEXT
     wrong = {(arm, shape): row["wrong"] for arm, rows in CONTACTS.items() for shape, row in rows.items()}
+    for env in ("viapoint/PlanarWholeArm-v0", "viapoint/PandaObstacles-v0"):
+        assert CONTACTS["movements"][env]["poses"] == 10_000
+    contacts = CONTACTS["movements"]["viapoint/PlanarWholeArm-v0"]["contacts"]
+    assert f"among boxes, {contacts:,} of them with contact" in TEXT
     number, depth = wrong.pop(("planar", "box")), CONTACTS["planar"]["box"]["shallowest"]
     assert not any(wrong.values())
     assert f"they differ in {number} of {CONTACTS['planar']['box']['poses']:,} poses" in TEXT

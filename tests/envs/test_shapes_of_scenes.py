@@ -16,6 +16,7 @@ from viapoint.envs import (
     ConvexMesh,
     Cylinder,
     HalfSpace,
+    Plan,
     PointCloud,
     Sphere,
     as_obstacle,
@@ -23,6 +24,7 @@ from viapoint.envs import (
     obstacles_from_json,
     obstacles_from_rows,
     obstacles_to_json,
+    register_mesh,
 )
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 from viapoint.envs.geometry.rows import (
@@ -34,13 +36,15 @@ from viapoint.envs.geometry.rows import (
 )
 from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, reshaped
 from viapoint.primitives.array_api import namespace_of
+from viapoint.training import GeometrySearch
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-from contacts import KINDS, contacts, random_obstacles
+from contacts import KINDS, contacts, random_obstacles, register_example
 
 EVERY = pytest.mark.parametrize("kind", KINDS)
 PANDA = "viapoint/PandaObstacles-v0"
 ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
+CRATE = Box((0.03, 0.03, 0.03), position=(0.2, 0.6, 0.4))
 SCENE = [
     Box((0.1, 0.02, 0.03), position=(0.5, 0.0, 0.4), quaternion=(0.96, 0.0, 0.0, 0.28)),
     Cylinder(0.03, 0.1, position=(0.6, 0.25, 0.1)),
@@ -249,8 +253,11 @@ CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
         (Box((0.3, 0.3, 0.3), position=(0.45, -0.3, 0.4)), "obstacle 0 (box at (0.45, -0.3, 0.4) m, half lengths"),
         (Box((0.05, 0.05, 2.0), position=(0.5, 0.0, 0.3)), "has a half length over 1 m"),
         (Sphere(0.05, position=(3.0, 0.0, 0.3)), "has its centre over 2 m from the origin"),
-        (ConvexMesh(CUBE), "obstacle 0: the scenes of this environment have the shapes"),
-        (PointCloud(CUBE), "not point_cloud, which is for distances only"),
+        (ConvexMesh(CUBE, name="die"), "obstacle 0 'die': the scenes of this environment have the shapes"),
+        (ConvexMesh(CUBE), "not convex_mesh; give the mesh a name with register_mesh"),
+        (PointCloud([CUBE[0], (0.45, -0.33, 0.4)]), "obstacle 1 'point_cloud point 1' (sphere at (0.45, -0.33, 0.4) m"),
+        (PointCloud([*CUBE, *CUBE]), "at most 8 obstacles, got 16; make the environment with n_obstacles=(0, 16)"),
+        ({"shape": "point_cloud", "points": [(np.nan, 0.0, 0.0)]}, "obstacle 0: point_cloud: points must be finite"),
         ({"shape": "convex_mesh", "vertices": [*CUBE, (0.05, 0.05, 0.05)]}, "ConvexMesh.hull(vertices) is the hull"),
         ({"shape": "box", "size": (0.1, 0.0, 0.1)}, "obstacle 0: box: size must be greater than 0"),
         ({"shape": "box", "size": (0.1, 0.1, 0.1), "quaternion": (1, 1, 0, 0)}, "quaternion must have length 1"),
@@ -262,6 +269,120 @@ def test_impossible_obstacles_are_refused_with_their_name(env, obstacle, reason)
     obstacles = obstacle if isinstance(obstacle, np.ndarray) else [obstacle]
     with pytest.raises(ValueError, match=re.escape(reason)):
         env.reset(options={**ENDS, "obstacles": obstacles})
+
+
+@pytest.fixture
+def mesh():
+    name = register_example("lump")
+    yield SHAPES[name]
+    del SHAPES[name]
+
+
+def test_contact_with_a_mesh_in_mujoco_is_negative_clearance(mesh):
+    found = contacts("panda", "lump", 1000)
+    assert 200 < found.contacts < 900
+    assert found.wrong == 0
+
+
+def test_a_registered_mesh_is_an_obstacle_of_scenes(mesh, generator):
+    shape = ConvexMesh(
+        mesh.mesh.vertices, position=(0.45, 0.0, 0.4), quaternion=(0.6, 0.0, 0.8, 0.0), name="a"
+    )
+    named = {"shape": "lump", "position": (0.45, 0.0, 0.4), "quaternion": (0.6, 0.0, 0.8, 0.0)}
+    envs, points = (
+        gym.make_vec(PANDA, num_envs=2, shapes=("box", "lump")),
+        generator.uniform(-0.2, 0.8, (200, 3)),
+    )
+    observation, _ = envs.reset(options={**ENDS, "obstacles": [[shape], [CRATE, as_obstacle(named)]]})
+    centre, half = shape.box()
+    np.testing.assert_allclose(observation["obstacles"][0, 0, :5], (0, 1, *centre), atol=1e-6)
+    np.testing.assert_allclose(observation["obstacles"][0, 0, -4:-1], half, atol=1e-6)
+    (first,), (_, second) = (obstacles_from_rows(rows) for rows in envs.unwrapped.scenes.obstacles)
+    for again in (first, second, *obstacles_from_json(obstacles_to_json([first]))):
+        assert again.kind == "lump"
+        np.testing.assert_allclose(again.distance(points), shape.distance(points), atol=1e-9)
+    *_, info = envs.step(np.zeros((2, 4)))  # straight through it
+    assert info["collision"].all()
+    assert (info["min_clearance"] < 0.0).all()
+    plan = GeometrySearch(PANDA, n_checks=256, shapes=("lump",)).plan(**ENDS, obstacles=[named])
+    both = Plan(*(np.stack((part, part)) for part in plan))
+    envs.reset(options={**ENDS, "obstacles": [[shape], [named]]})
+    _, _, info = envs.unwrapped.execute_plan(both)
+    assert info["is_success"].all()
+    envs.close()
+
+
+def test_random_scenes_have_no_registered_meshes(mesh):
+    envs = gym.make_vec(PANDA, num_envs=32, shapes=("box", "lump"))
+    envs.reset(seed=0)
+    rows = envs.unwrapped.scenes.obstacles
+    assert set(np.unique(shape_columns(rows).kind[rows[..., -1] > 0.0])) == {list(SHAPES).index("box")}
+    envs.close()
+
+
+def test_workers_know_registered_meshes(mesh):
+    named = {"shape": "lump", "position": (0.45, 0.0, 0.4)}
+    found = []
+    for workers in ({}, {"workers": 2}):
+        envs = gym.make_vec(PANDA, num_envs=2, shapes=("box", "lump"), **workers)
+        envs.reset(seed=0, options={**ENDS, "obstacles": [named]})
+        found.append(envs.step(np.zeros((2, 4)))[4]["min_clearance"])
+        envs.close()
+    np.testing.assert_array_equal(*found)
+
+
+def test_rows_of_a_mesh_have_its_size(mesh):
+    env = gym.make(PANDA, shapes=("box", "lump")).unwrapped
+    rows = obstacle_rows([mesh(position=(0.45, 0.0, 0.4))], 3, ("box", "lump"))
+    rows[0, -2] *= 2.0  # half of the height
+    with pytest.raises(ValueError, match="is no row of a shape"):
+        env.reset(options={**ENDS, "obstacles": rows})
+    env.close()
+
+
+def test_a_name_belongs_to_one_mesh(mesh):
+    register_mesh("lump", ConvexMesh(mesh.mesh.vertices, position=(1.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match="another shape is registered as 'lump'"):
+        register_mesh("lump", ConvexMesh(CUBE))
+    with pytest.raises(ValueError, match="another shape is registered as 'box'"):
+        register_mesh("box", ConvexMesh(CUBE))
+    with pytest.raises(ValueError, match="must be an identifier"):
+        register_mesh("two words", ConvexMesh(CUBE))
+    with pytest.raises(TypeError, match=re.escape("such as ConvexMesh.hull(points), got list")):
+        register_mesh("die", CUBE)
+    with pytest.raises(ValueError, match="lump is for arms in space"):
+        gym.make("viapoint/PlanarObstacles-v0", shapes=("box", "lump")).reset(
+            options={"obstacles": [mesh(position=(0.0, 0.4, 0.0))]}
+        )
+
+
+@pytest.mark.parametrize("shapes", [("capsule",), ("sphere", "box")])
+def test_a_point_cloud_is_its_spheres(shapes, generator):
+    points = generator.uniform((-0.1, -0.02, -0.1), (0.1, 0.02, 0.1), (40, 3))
+    cloud = PointCloud(
+        points, radius=0.02, position=(0.5, 0.0, 0.4), quaternion=(0.6, 0.0, 0.0, 0.8), name="scan"
+    )
+    env = gym.make(PANDA, n_obstacles=(0, 40), shapes=shapes).unwrapped
+    env.reset(seed=0, options={**ENDS, "obstacles": [cloud]})
+    seen = obstacles_from_rows(env.batch.scenes.obstacles[0])
+    assert len(seen) == 40
+    where = generator.uniform(-0.2, 0.8, (200, 3))
+    least = np.min([each.distance(where) for each in seen], axis=0)
+    np.testing.assert_allclose(least, cloud.distance(where), atol=1e-12)
+    *_, info = env.step(np.zeros(4))
+    assert info["collision"]
+    env.close()
+
+
+def test_a_coarse_cloud_contains_the_fine_one(generator):
+    points = generator.uniform(-0.1, 0.1, (500, 3))
+    fine = PointCloud(points, radius=0.005, position=(0.1, 0.2, 0.3), quaternion=(0.6, 0.8, 0.0, 0.0))
+    coarse = PointCloud.covering(points, 0.05, 0.005, position=fine.position, quaternion=fine.quaternion)
+    assert len(coarse.points) <= 4**3
+    where = generator.uniform(-0.3, 0.6, (500, 3))
+    assert (coarse.distance(where) <= fine.distance(where) + 1e-12).all()
+    with pytest.raises(ValueError, match="spacing must be greater than 0"):
+        PointCloud.covering(points, 0.0)
 
 
 @pytest.mark.parametrize(

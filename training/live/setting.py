@@ -14,7 +14,6 @@ import numpy as np
 from viapoint.envs.common.types import Observation
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.envs.scenes.scene import Scenes, check_scenes
 from viapoint.training.algorithms.agent import Agent
 from viapoint.training.live.decisions import DecisionMaker
@@ -29,6 +28,8 @@ from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation, 
 
 BASELINES = {"straight": "straight", "geometry search": "search512", "planner": "planner"}
 """Compared methods by their names in the table."""
+MOST_SHOWN = 24
+"""Greatest number of obstacles of a scene."""
 MOST_VIAS = 4
 """Greatest number of via-points of the slider."""
 
@@ -164,11 +165,11 @@ class Shared:
         """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used."""
         if not self.own.limit(scene):
             return self.own
-        if len(scene.obstacles) > MOST_OBSTACLES:
-            raise ValueError(f"a scene has at most {MOST_OBSTACLES} obstacles, got {len(scene.obstacles)}")
+        if len(scene.obstacles) > MOST_SHOWN:
+            raise ValueError(f"a scene has at most {MOST_SHOWN} obstacles, got {len(scene.obstacles)}")
         with self._making:
             if self._wide is None:
-                room = {"shapes": SCENE_SHAPES, "n_obstacles": (0, MOST_OBSTACLES)}
+                room = {"shapes": SCENE_SHAPES, "n_obstacles": (0, MOST_SHOWN)}
                 self._wide = Setting(self.own.env_id, None, self.own.env_kwargs | room)
         return self._wide
 
