@@ -315,15 +315,18 @@ def test_a_file_is_named_in_its_errors(tmp_path):
 @pytest.mark.parametrize(
     ("stopped", "stalling", "words"),
     [
-        (["stalled"], 0.3, "400,000, until it stalled"),
-        (["budget"], 0.3, "400,000, cut short"),
-        (["budget", "stalled"], 0.3, "400,000, cut short"),
-        (["budget"], None, "400,000"),
+        (["stalled", "stalled"], 0.3, "100-200, until it stalled"),
+        (["budget", "budget"], 0.3, "100-200, cut short"),
+        (["budget", "stalled"], 0.3, "100-200, 1 of 2 cut short"),
+        (["budget", "budget"], None, "100-200"),
     ],
 )
 def test_trainings_that_wait_for_a_stall_say_whether_it_came(stopped, stalling, words):
     made = {"training": {"stop_when_stalled": stalling}}
-    assert effort({"made": made, "training": {"decisions": 400000, "stopped": stopped}}) == words
+    row = {"made": made, "training": {"decisions": 100, "stopped": sorted(set(stopped))}}
+    runs = [{"training": {"decisions": 100 * i, "stopped": each}} for i, each in enumerate(stopped, 1)]
+    assert effort({**row, "runs": runs}) == words
+    assert effort(row) == "100" + words[7:].replace("1 of 2 ", "")  # a record without its runs
 
 
 def test_tables_of_other_pages_are_filled_in(done, tmp_path):

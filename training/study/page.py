@@ -182,14 +182,20 @@ def seeds(each: Numbers) -> str:
 
 
 def effort(each: Numbers) -> str:
-    """Return the decisions of a training in words, and why it ended if that was not its budget."""
+    """Return the decisions of a row's trainings in words, the least and the greatest number, and why they ended.
+
+    Only trainings that end when success stalls may be cut short; all others have the number that they were given.
+    """
     training = each.get("training")
     if not training or each.get("untrained"):
         return "-"
-    ended = ""
-    if each["made"]["training"].get("stop_when_stalled") is not None:
-        ended = ", until it stalled" if training.get("stopped") == ["stalled"] else ", cut short"
-    return f"{training['decisions']:,}{ended}"
+    runs = [run["training"] for run in each.get("runs", [])] or [training]
+    numbers = sorted({run["decisions"] for run in runs})
+    words = "-".join(f"{number:,}" for number in dict.fromkeys((numbers[0], numbers[-1])))
+    if each["made"]["training"].get("stop_when_stalled") is None:
+        return words
+    cut = sum("budget" in run["stopped"] for run in runs)
+    return words + {0: ", until it stalled", len(runs): ", cut short"}.get(cut, f", {cut} of {len(runs)} cut short")
 
 
 def percent(rate: float | None) -> str:
