@@ -86,6 +86,10 @@ class PointCloud(Shape):
         return [geom.position[:2] + circle for geom in self.geoms()]
 
     def _check(self) -> None:
+        if tuple(self.radius.shape):
+            raise self._error(
+                f"radius must be one number for all points, got shape {tuple(self.radius.shape)}"
+            )
         wanted = "(K, 3) with K at least 1"
         try:
             array = as_constants("points", self.points, wanted, lambda *s: s[1:] == (3,) and s[0] > 0)

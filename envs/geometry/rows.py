@@ -23,7 +23,7 @@ from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.envs.geometry.shape import Shape, frame_axes
-from viapoint.envs.geometry.shapes import SHAPES, as_obstacles
+from viapoint.envs.geometry.shapes import LISTS, MESH_HINT, SHAPES, as_obstacles, refuse_single
 from viapoint.primitives.array_api import Array, to_numpy
 
 CAPSULES = ("capsule",)
@@ -32,8 +32,6 @@ SHAPE_SIZE = 8
 """Numbers of the shape in a row."""
 POSE_SIZE = 13
 """Number of values of one obstacle in an observation after those of its kind."""
-LISTS = "a list of shapes, dictionaries or rows of numbers"
-"""Allowed obstacles, for error messages."""
 
 
 class ShapeColumns(NamedTuple):
@@ -208,12 +206,6 @@ def obstacle_names(obstacles: Any) -> list[list[str]]:
     return [obstacle_names(scene)[0] for scene in obstacles] if _has_lists(obstacles) else [[]]
 
 
-def refuse_single(obstacles: Any) -> None:
-    """Raise ValueError for one shape or dictionary that is in no list."""
-    if isinstance(obstacles, Shape | Mapping):
-        raise ValueError(f"obstacles must be {LISTS}; put a single obstacle in a list, got {obstacles!r:.80}")
-
-
 def is_shape_list(obstacles: Any) -> bool:
     """Return True for a list of shapes and dictionaries."""
     return isinstance(obstacles, list | tuple) and any(
@@ -230,14 +222,23 @@ def _checked_numbers(obstacles: Any) -> Any:
     """Return obstacles that are real numbers as they are.
 
     Raises:
-        ValueError: The obstacles are something else.
+        ValueError: The obstacles are something else, or a row that is not zero has no positive radius.
     """
     try:
-        real = np.asarray(obstacles).dtype.kind in "fiub"
-    except (TypeError, ValueError):
+        array = np.asarray(obstacles)
+        real = array.dtype.kind in "fiub"
+    except (TypeError, ValueError, RuntimeError):  # torch: a tensor that follows a gradient
         real = False
     if not real:
         raise ValueError(f"obstacles must be {LISTS}, got {obstacles!r:.80}")
+    if array.ndim > 1 and array.size:
+        wrong = (array != 0.0).any(axis=-1) & ~(array[..., -1] > 0.0)
+        if wrong.any():
+            index = tuple(int(i) for i in np.argwhere(wrong)[0])
+            place = f"scene {index[0]}: " if len(index) > 1 else ""
+            raise ValueError(
+                f"{place}obstacle {index[-1]} has no positive radius (last number): {array[index].tolist()}"
+            )
     return obstacles
 
 
@@ -300,9 +301,10 @@ def observation_rows(
     kinds = list(SHAPES if shapes is None else shapes)
     rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
     for i, (row, each) in enumerate(zip(rows, given, strict=False)):
-        if each.kind not in kinds:
-            raise ValueError(f"{_numbered(i, each)}: the shapes are {', '.join(kinds)}, not {each.kind}")
-        row[kinds.index(each.kind)] = 1.0
+        kind = _kind_among(each, kinds)
+        if kind not in kinds:
+            raise ValueError(f"{_numbered(i, each)}: the shapes are {', '.join(kinds)}, not {kind}")
+        row[kinds.index(kind)] = 1.0
         centre, half = each.box()
         row[len(kinds) :] = (*centre, *each.rotation[:, :2].T.ravel(), *half, 1.0)
     return rows
@@ -353,16 +355,26 @@ def quaternion_of_axes(first: Float, second: Float) -> Float:
     return np.asarray(chosen / norm(chosen)[..., None])
 
 
-def check_shapes(shapes: Any) -> tuple[str, ...]:
+def check_shapes(shapes: Any, dimension: int = 3) -> tuple[str, ...]:
     """Return the names of the shapes that scenes may have.
 
     Raises:
-        ValueError: A name is unknown or repeated, or there is none.
+        ValueError: A name is unknown or repeated, a mesh is in the plane, or no named shape is one of random scenes.
     """
     known = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
     names = (shapes,) if isinstance(shapes, str) else tuple(shapes) if isinstance(shapes, Sequence) else ()
     if not names or len(set(names)) < len(names) or not set(names) <= set(known):
-        raise ValueError(f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}")
+        raise ValueError(
+            f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}; {MESH_HINT}"
+        )
+    meshes = [name for name in names if issubclass(SHAPES[name], ConvexMesh)]
+    if meshes and dimension == 2:
+        raise ValueError(f"shapes of arms in the plane may not be meshes, got {', '.join(meshes)}")
+    drawn = [name for name in known if SHAPES[name].only_half is None]
+    if not set(names) & set(drawn):
+        raise ValueError(
+            f"shapes must have one of {', '.join(drawn)}, as random scenes have no others, got {shapes!r}"
+        )
     return names
 
 
@@ -370,7 +382,10 @@ def _parts_of_scenes(obstacles: Any) -> list[Shape]:
     """Return a list of shapes and dictionaries as single shapes that scenes hold; a point cloud becomes its spheres."""
     found = list[Shape]()
     for i, each in enumerate(as_obstacles(obstacles)):
-        _check_single(i, each)
+        try:
+            each.require_single()
+        except ValueError as error:
+            raise ValueError(f"obstacle {i}: {error}") from None
         if isinstance(each, PointCloud):
             name = each.name or each.kind
             found += [
@@ -382,22 +397,21 @@ def _parts_of_scenes(obstacles: Any) -> list[Shape]:
     return found
 
 
-def _check_single(index: int, obstacle: Shape) -> None:
-    """Check that an obstacle is one shape, not a batch."""
-    wanted = {**obstacle.sizes, "position": (3,), "quaternion": (4,)}
-    for name, shape in wanted.items():
-        if (got := tuple(getattr(obstacle, name).shape)) != shape:
-            batch = got[: len(got) - len(shape)]
-            reason = f"{obstacle.kind} must be one shape, got a batch of {batch}"
-            raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
-
-
 def _with_name(mesh: ConvexMesh, shapes: tuple[str, ...]) -> ConvexMesh:
     """Return a mesh as the registered one with the same vertices, if it is among the shapes."""
     for shape in (SHAPES[name] for name in shapes):
         if issubclass(shape, NamedMesh) and np.array_equal(shape.mesh.vertices, mesh.vertices):
             return shape(position=mesh.position, quaternion=mesh.quaternion, name=mesh.name)
     return mesh
+
+
+def _kind_among(obstacle: Shape, shapes: Sequence[str]) -> str:
+    """Return the kind of an obstacle; a sphere is a capsule where spheres have no name of their own."""
+    return (
+        "capsule"
+        if obstacle.kind == "sphere" and "sphere" not in shapes and "capsule" in shapes
+        else obstacle.kind
+    )
 
 
 def _numbered(index: int, obstacle: Shape) -> str:
@@ -409,18 +423,14 @@ def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -
     """Return an obstacle as a row of a scene."""
     if isinstance(obstacle, ConvexMesh):
         obstacle = _with_name(obstacle, shapes)
-    kind = obstacle.kind
-    if kind == "sphere" and kind not in shapes and "capsule" in shapes:
-        kind = "capsule"
-    if kind not in shapes:
+    kind = _kind_among(obstacle, shapes)
+    if kind not in shapes and not (dimension == 2 and isinstance(obstacle, ConvexMesh)):
         also = ", sphere" if "capsule" in shapes and "sphere" not in shapes else ""
         reason = f"the scenes of this environment have the shapes {', '.join(shapes)}{also}, not {kind}"
         if type(obstacle).in_scenes:
-            reason += f"; make it with shapes={(*shapes, kind)!r}"
+            reason += f"; make it with shapes={(*shapes, kind)!r} (an agent must be trained with them)"
         else:
-            reason += (
-                "; give the mesh a name with register_mesh, and make the environment with that name in shapes"
-            )
+            reason += "; register_mesh names a mesh of these vertices, and shapes must have the name"
         raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
     try:
         centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()

@@ -35,6 +35,7 @@ from viapoint.primitives.array_api import (
     Array,
     Namespace,
     as_floats,
+    broadcast_batch,
     follows_gradient,
     like,
     namespace_of,
@@ -126,6 +127,11 @@ class Shape(abc.ABC):
             for name in self.sizes:
                 if not (values[name] > 0.0).all():
                     raise ValueError(f"{name} must be greater than 0, got {getattr(self, name)!r}")
+            leading = {
+                name: tuple(values[name].shape)[: len(values[name].shape) - len(last)]
+                for name, last in trailing.items()
+            }
+            broadcast_batch(**leading)
             values["quaternion"] = _unit(xp, values["quaternion"])
         except ValueError as error:
             raise self._error(str(error)) from None
@@ -178,7 +184,11 @@ class Shape(abc.ABC):
             way = [(b - a)[None] for a, b in zip(start, end, strict=True)]
             along = own._nearest([a[None] for a in start], way)[0]
         least = at(along)
-        return (_with_gradient(xp, at, along, least) if follows_gradient(least) else least) - radius
+        if not follows_gradient(least):
+            return least - radius
+        if least.dtype == xp.float32:  # the steps of `_with_gradient` would be 0.5 % of the segment
+            return own.segment_distance(first.double(), second.double(), radius).to(xp.float32)
+        return _with_gradient(xp, at, along, least) - radius
 
     @property
     @abc.abstractmethod
@@ -267,6 +277,12 @@ class Shape(abc.ABC):
 
     # Descriptions
 
+    def require_single(self) -> None:
+        """Raise ValueError for a batch of shapes."""
+        for name, last in {**self.sizes, "position": (3,), "quaternion": (4,)}.items():
+            if (got := tuple(getattr(self, name).shape)) != last:
+                raise self._error(f"must be one shape here, got a batch: {name} has shape {got}")
+
     def footprint(self, extent: float = 2.0) -> list[Float]:
         """Return the outlines of the shape seen from above, shape (K, 2) each, [m].
 
@@ -274,6 +290,7 @@ class Shape(abc.ABC):
             extent: Greatest coordinate that is drawn of shapes without an end, [m].
         """
         del extent
+        self.require_single()
         turn = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS, endpoint=False)
         outward = np.stack((np.cos(turn), np.sin(turn), np.zeros_like(turn)), axis=-1)
         matrix = self.rotation
@@ -286,6 +303,7 @@ class Shape(abc.ABC):
 
     def box(self) -> tuple[Float, Float]:
         """Return the bounding box along the frame's axes: its centre in the world and half lengths, shape (3,), [m]."""
+        self.require_single()
         reach = self.support(np.concatenate((np.eye(3), -np.eye(3))))
         high, low = np.diagonal(reach[:3]), np.diagonal(reach[3:])
         return to_numpy(self.position) + self.rotation @ (0.5 * (high + low)), 0.5 * (high - low)
@@ -313,6 +331,7 @@ class Shape(abc.ABC):
 
     def _geom(self, geom: Any, *size: Any) -> list[Geom]:
         """Return one geom at the shape's pose."""
+        self.require_single()
         x, y, z = (*(float(to_numpy(s)) for s in size), 0.0, 0.0, 0.0)[:3]
         return [Geom(geom, (x, y, z), to_numpy(self.position), to_numpy(self.quaternion))]
 

@@ -20,12 +20,18 @@ from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.shape import Shape
-from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
+from viapoint.primitives.array_api import Array, as_floats, like, namespace_of, to_numpy
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 }
 """Shapes by their names in dictionaries."""
+
+
+MESH_HINT = "register_mesh names a convex mesh of your own"
+"""Hint of error messages about unknown shapes."""
+LISTS = "a list of shapes, dictionaries or rows of numbers"
+"""Allowed obstacles, for error messages."""
 
 
 def register_mesh(name: str, mesh: ConvexMesh) -> None:
@@ -37,7 +43,7 @@ def register_mesh(name: str, mesh: ConvexMesh) -> None:
 
     Raises:
         TypeError: The mesh is no `ConvexMesh`.
-        ValueError: The name is taken by another shape, or is no identifier.
+        ValueError: The name is taken by another shape, or is no identifier, or the mesh has a pose.
 
     Example:
         >>> import gymnasium as gym
@@ -51,6 +57,10 @@ def register_mesh(name: str, mesh: ConvexMesh) -> None:
     if not isinstance(mesh, ConvexMesh):
         raise TypeError(
             f"mesh must be a ConvexMesh, such as ConvexMesh.hull(points), got {type(mesh).__name__}"
+        )
+    if mesh != ConvexMesh(mesh.vertices, name=mesh.name):
+        raise ValueError(
+            f"mesh {name!r} must have no position and no quaternion of its own; obstacles have them"
         )
     if not (isinstance(name, str) and name.isidentifier()):
         raise ValueError(f"the name of a mesh must be an identifier such as 'rock', got {name!r}")
@@ -86,7 +96,7 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
     kind = values.pop("shape", None)
     shape = SHAPES.get(kind) if isinstance(kind, str) else None
     if shape is None:
-        known = f"Shapes are {', '.join(SHAPES)}"
+        known = f"Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
         if kind is None:
             raise ValueError(f"the key 'shape' is missing. {known}")
         raise ValueError(f"unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
@@ -112,6 +122,7 @@ def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
         Traceback (most recent call last):
         ValueError: obstacle 1: sphere: radius must be greater than 0, got -1.0
     """
+    refuse_single(values)
     found = []
     for i, value in enumerate(values):
         try:
@@ -156,6 +167,12 @@ def obstacles_from_json(text: str) -> list[Shape]:
     return as_obstacles(values)
 
 
+def refuse_single(obstacles: Any) -> None:
+    """Raise ValueError for one shape or dictionary that is in no list."""
+    if isinstance(obstacles, Shape | Mapping):
+        raise ValueError(f"obstacles must be {LISTS}; put a single obstacle in a list, got {obstacles!r:.80}")
+
+
 def signed_distances(
     obstacles: Sequence[Shape | Mapping[str, Any]],
     first: Array,
@@ -176,6 +193,7 @@ def signed_distances(
         >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
         [0.02, 0.12]
     """
+    refuse_single(obstacles)
     first = first if hasattr(first, "dtype") else np.asarray(first, dtype=np.float64)
     if not obstacles:
         return namespace_of(first).zeros_like(first[..., :0])
@@ -220,10 +238,13 @@ def nearest_distance(
         each = signed_distances(obstacles, first, second, radius)
         nearest = xp.full(each.shape[:-1], most, dtype=each.dtype, device=each.device)
         return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
-    ends = [np.asarray(end, dtype=np.float64) for end in (first, second) if end is not None]
+    _, ends = as_floats(**{f"points {i}": end for i, end in enumerate((first, second)) if end is not None})
+    ends = [end.astype(np.float64, copy=False) for end in ends]
     for end in ends:
         if end.shape[-1:] != (3,):
             raise ValueError(f"points must have shape (..., 3), got shape {end.shape}")
+    for each in obstacles:
+        each.require_single()
     shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)

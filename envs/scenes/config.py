@@ -62,7 +62,7 @@ class SceneDistribution:
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
-        check_shapes(self.shapes)
+        check_shapes(self.shapes, self.dimension)
         check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
@@ -100,7 +100,7 @@ class SpaceDistribution(SpatialSizes):
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
-        check_shapes(self.shapes)
+        check_shapes(self.shapes, self.dimension)
         check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:

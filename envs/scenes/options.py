@@ -15,12 +15,12 @@ from viapoint.envs.geometry.rows import (
     is_shape_list,
     obstacle_names,
     obstacle_rows,
-    refuse_single,
     row_size,
     widened,
 )
-from viapoint.envs.geometry.shapes import as_obstacle, as_obstacles
+from viapoint.envs.geometry.shapes import as_obstacle, as_obstacles, refuse_single
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
+from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
 
@@ -182,6 +182,9 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
         raise ValueError(f"the scene file is not JSON: {error}") from None
     if not isinstance(record, Mapping) or record.get("format") != FORMAT:
         raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
+    refuse_unknown_options(
+        {name: None for name in record if name not in ("format", "env")}, (*GIVEN, *CHANGES)
+    )
     options = {name: record[name] for name in (*GIVEN, *CHANGES) if name in record}
     obstacles = options.get("obstacles", [])
     if not isinstance(obstacles, list):
@@ -276,6 +279,8 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
     if rows and array.shape[-2] > shape[1]:
         number = array.shape[-2]
         hint = f"; make the environment with n_obstacles=(0, {number})" if name == "obstacles" else ""
+        if number > MOST_OBSTACLES and hint:
+            hint = f"; an environment may have at most {MOST_OBSTACLES}, and PointCloud.covering makes fewer spheres"
         raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {number}{hint}")
     try:
         if len(shape) == 2:

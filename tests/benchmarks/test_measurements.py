@@ -1,6 +1,7 @@
 """Numbers that pages state are those of the JSON files of their measurements."""
 
 import json
+import statistics
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,17 @@ def test_the_stated_memory_is_the_measured_one(part):
     if part == "decisions":
         first, last = result["first_speed"], result["last_speed"]
         assert f"{first:.0f} a second of processor time at first and {last:.0f} at last" in page
+
+
+def test_comparisons_of_the_page_of_results_are_those_of_its_rows():
+    for environment in read("results.json")["environments"].values():
+        rows = {each["row"]: each["sets"] for each in environment["rows"]}
+        for pair in environment["compared"]:
+            for name, found in pair["sets"].items():
+                first, second = (rows[pair[side]][name]["each"] for side in ("first", "second"))
+                if "difference" in found:
+                    differences = [each - second[0] for each in first]
+                    stated = [statistics.median(differences), min(differences), max(differences)]
+                    assert found["difference"] == pytest.approx(stated, abs=1e-5)
+                else:
+                    assert found["pairs"] == len(first) * len(second)

@@ -213,6 +213,34 @@ def test_gradients_are_those_of_finite_differences(kind, generator, segments):
     assert torch.isfinite(wall.grad).all()
 
 
+@ALL
+def test_gradients_in_single_precision_are_those_in_double(kind, generator, segments):
+    shape, found = random_shape(kind, generator), []
+    for dtype in (torch.float32, torch.float64):
+        ends = torch.as_tensor(segments).to(torch.float32).to(dtype).requires_grad_()
+        shape.segment_distance(*ends).sum().backward()
+        assert ends.grad.dtype == dtype
+        found.append(ends.grad.double().numpy())
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+
+
+def test_points_that_are_no_numbers_are_refused():
+    for ends in (([np.nan, 0.0, 0.0],), ([0.0, 0.0, 0.0], [0.0, np.inf, 0.0])):
+        with pytest.raises(ValueError, match=rf"points {len(ends) - 1} must be finite"):
+            nearest_distance([Sphere(0.1)], *ends)
+
+
+@pytest.mark.parametrize("distance", [signed_distances, nearest_distance])
+def test_a_single_shape_is_no_list(distance):
+    with pytest.raises(ValueError, match="put a single obstacle in a list"):
+        distance(Sphere(0.1), [0.0, 0.0, 0.0])
+
+
+def test_a_sphere_is_observed_as_a_capsule_where_spheres_have_no_name():
+    ball, capsule = Sphere(0.1), {"shape": "capsule", "radius": 0.1, "half_length": 1e-12}
+    np.testing.assert_allclose(*(observation_rows([each], 1, ("capsule", "box")) for each in (ball, capsule)))
+
+
 @pytest.mark.parametrize("kind", CLOSED)
 def test_gradients_reach_sizes_and_poses(kind, generator, segments):
     shape, step = random_shape(kind, generator), 1e-6
@@ -459,6 +487,14 @@ STAR = ((0, 1, 2), (0, 1, 4), (1, 2, 4), (0, 2, 4))
             "points must have shape (K, 3) with K at least 1",
         ),
         ({"shape": "point_cloud", "points": CUBE, "radius": 0}, "point_cloud: radius must be greater than 0"),
+        (
+            {"shape": "point_cloud", "points": CUBE, "radius": np.ones(8)},
+            "radius must be one number for all points",
+        ),
+        (
+            {"shape": "sphere", "radius": np.ones(4), "position": np.zeros((3, 3))},
+            "leading dimensions do not broadcast: radius (4,), position (3,)",
+        ),
     ],
 )
 def test_what_is_no_obstacle_is_refused_with_its_index_and_what_is_allowed(value, reason):
@@ -488,6 +524,14 @@ FOLLOWED = torch.zeros(4, 3, requires_grad=True)
         (lambda: ConvexMesh(FOLLOWED, name="it"), "must not require a gradient, use vertices.detach()"),
         (lambda: ConvexMesh.hull(FOLLOWED, name="it"), "vertices must not require a gradient"),
         (lambda: PointCloud(FOLLOWED, name="it"), "points must not require a gradient, use points.detach()"),
+        (lambda: PointCloud.covering(CUBE, -1.0, name="it"), "spacing must be greater than 0, got -1.0"),
+        (
+            lambda: nearest_distance([Sphere(np.ones(4), name="it")], np.zeros(3)),
+            "must be one shape here, got a batch",
+        ),
+        (lambda: Box((1, 1, 1), position=np.zeros((3, 3)), name="it").box(), "position has shape (3, 3)"),
+        (lambda: Sphere(np.ones(2), name="it").footprint(), "radius has shape (2,)"),
+        (lambda: add_to_model(mujoco.MjSpec(), [Sphere(np.ones(2), name="it")]), "radius has shape (2,)"),
     ],
 )
 def test_errors_of_all_constructors_have_the_name_of_the_obstacle(make, reason):
@@ -626,7 +670,7 @@ def test_plans_avoid_shapes_as_they_avoid_rows():
         (Capsule(0.02, 0.1, position=(0.1, 0.4, 0.0)), "obstacle 1: capsule must lie in the plane"),
         (
             Sphere(np.full(3, 0.02), position=np.zeros((3, 3))),
-            "obstacle 1: sphere must be one shape, got a batch",
+            "obstacle 1: sphere: must be one shape here, got a batch",
         ),
         ({"shape": "sphere", "radius": 0}, "obstacle 1: sphere: radius must be greater than 0, got 0"),
         ({"shape": "sphere", "radius": 0.5, "position": (0.1, 0.4, 0.0)}, "has a radius over 0.1 m"),

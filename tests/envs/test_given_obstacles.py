@@ -145,3 +145,8 @@ def test_changes_of_a_scene_survive_json():
 def test_what_is_no_scene_is_not_written(options, reason):
     with pytest.raises(ValueError, match=re.escape(reason)):
         scene_to_json(options)
+
+
+def test_misspelled_parts_of_a_scene_file_are_refused():
+    with pytest.raises(ValueError, match="not 'obstacle'"):
+        scene_from_json('{"format": "viapoint-scene", "goal": [0.1, 0.4], "obstacle": []}')

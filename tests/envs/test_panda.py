@@ -6,6 +6,7 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
@@ -373,3 +374,15 @@ def test_info_tells_how_much_slower_a_movement_was_made():
     assert (info["stretch"] > 1.0).all()
     np.testing.assert_allclose(info["duration"], 0.3 * info["stretch"])
     assert info["is_success"].all()
+
+
+def test_straight_movements_of_drawn_scenes_are_not_slowed_down():
+    """The number of scenes is that of docs/environments-panda.md."""
+    envs = gym.make_vec("viapoint/PandaObstacles-v0", num_envs=500)
+    for seed in range(4):
+        envs.reset(seed=1000 * seed)
+        scenes = envs.unwrapped.scenes
+        plan = LAYOUT.decode(np.zeros((500, LAYOUT.size)), scenes.start, scenes.goal)
+        position, velocity, acceleration = looked_at(plan)
+        np.testing.assert_array_equal(PANDA.required_time_scale(position, velocity, acceleration), 1.0)
+    envs.close()

@@ -18,6 +18,7 @@ from viapoint.envs import (
     HalfSpace,
     Plan,
     PointCloud,
+    Shape,
     Sphere,
     as_obstacle,
     obstacle_rows,
@@ -254,7 +255,7 @@ CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
         (Box((0.05, 0.05, 2.0), position=(0.5, 0.0, 0.3)), "has a half length over 1 m"),
         (Sphere(0.05, position=(3.0, 0.0, 0.3)), "has its centre over 2 m from the origin"),
         (ConvexMesh(CUBE, name="die"), "obstacle 0 'die': the scenes of this environment have the shapes"),
-        (ConvexMesh(CUBE), "not convex_mesh; give the mesh a name with register_mesh"),
+        (ConvexMesh(CUBE), "not convex_mesh; register_mesh names a mesh of these vertices"),
         (PointCloud([CUBE[0], (0.45, -0.33, 0.4)]), "obstacle 1 'point_cloud point 1' (sphere at (0.45, -0.33, 0.4) m"),
         (PointCloud([*CUBE, *CUBE]), "at most 8 obstacles, got 16; make the environment with n_obstacles=(0, 16)"),
         ({"shape": "point_cloud", "points": [(np.nan, 0.0, 0.0)]}, "obstacle 0: point_cloud: points must be finite"),
@@ -263,10 +264,14 @@ CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
         ({"shape": "box", "size": (0.1, 0.1, 0.1), "quaternion": (1, 1, 0, 0)}, "quaternion must have length 1"),
         ({"shape": "pyramid"}, "obstacle 0: unknown shape 'pyramid'"),
         (np.full((1, 15), 0.1), "is no row of a shape"),
+        (np.full((1, 7), np.nan), "obstacle 0 has no positive radius (last number): [nan, "),
+        ([[0.5, 0.0, 0.3, 0.0, 0.0, 0.1, -0.03]], "obstacle 0 has no positive radius"),
+        (torch.zeros((1, 7), requires_grad=True), "must be a list of shapes, dictionaries or rows of numbers"),
+        (PointCloud(np.full((300, 3), 0.3)), "at most 256, and PointCloud.covering makes fewer spheres"),
     ],
 )  # fmt: skip
 def test_impossible_obstacles_are_refused_with_their_name(env, obstacle, reason):
-    obstacles = obstacle if isinstance(obstacle, np.ndarray) else [obstacle]
+    obstacles = [obstacle] if isinstance(obstacle, Shape | dict) else obstacle
     with pytest.raises(ValueError, match=re.escape(reason)):
         env.reset(options={**ENDS, "obstacles": obstacles})
 
@@ -304,7 +309,7 @@ def test_a_registered_mesh_is_an_obstacle_of_scenes(mesh, generator):
     *_, info = envs.step(np.zeros((2, 4)))  # straight through it
     assert info["collision"].all()
     assert (info["min_clearance"] < 0.0).all()
-    plan = GeometrySearch(PANDA, n_checks=256, shapes=("lump",)).plan(**ENDS, obstacles=[named])
+    plan = GeometrySearch(PANDA, n_checks=256, shapes=("box", "lump")).plan(**ENDS, obstacles=[named])
     both = Plan(*(np.stack((part, part)) for part in plan))
     envs.reset(options={**ENDS, "obstacles": [[shape], [named]]})
     _, _, info = envs.unwrapped.execute_plan(both)
@@ -341,7 +346,9 @@ def test_rows_of_a_mesh_have_its_size(mesh):
 
 
 def test_a_name_belongs_to_one_mesh(mesh):
-    register_mesh("lump", ConvexMesh(mesh.mesh.vertices, position=(1.0, 0.0, 0.0)))
+    register_mesh("lump", ConvexMesh(mesh.mesh.vertices, name="again"))
+    with pytest.raises(ValueError, match="'other' must have no position"):
+        register_mesh("other", ConvexMesh(CUBE, position=(1.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match="another shape is registered as 'lump'"):
         register_mesh("lump", ConvexMesh(CUBE))
     with pytest.raises(ValueError, match="another shape is registered as 'box'"):
@@ -350,10 +357,10 @@ def test_a_name_belongs_to_one_mesh(mesh):
         register_mesh("two words", ConvexMesh(CUBE))
     with pytest.raises(TypeError, match=re.escape("such as ConvexMesh.hull(points), got list")):
         register_mesh("die", CUBE)
-    with pytest.raises(ValueError, match="lump is for arms in space"):
-        gym.make("viapoint/PlanarObstacles-v0", shapes=("box", "lump")).reset(
-            options={"obstacles": [mesh(position=(0.0, 0.4, 0.0))]}
-        )
+    with pytest.raises(ValueError, match="arms in the plane may not be meshes, got lump"):
+        gym.make("viapoint/PlanarObstacles-v0", shapes=("box", "lump"))
+    with pytest.raises(ValueError, match="convex_mesh is for arms in space"):
+        gym.make("viapoint/PlanarObstacles-v0").reset(options={"obstacles": [ConvexMesh(CUBE)]})
 
 
 @pytest.mark.parametrize("shapes", [("capsule",), ("sphere", "box")])
@@ -391,7 +398,8 @@ def test_a_coarse_cloud_contains_the_fine_one(generator):
         ((), f"shapes must be some of {', '.join(KINDS)}, without repetition"),
         (("box", "box"), "without repetition"),
         (("pyramid",), "got ('pyramid',)"),
-        (("convex_mesh",), "got ('convex_mesh',)"),
+        (("convex_mesh",), "got ('convex_mesh',); register_mesh names a convex mesh of your own"),
+        (("half_space",), "must have one of sphere, capsule, cylinder, box, as random scenes have no others"),
         (3, "got 3"),
     ],
 )

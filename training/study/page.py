@@ -195,7 +195,9 @@ def effort(each: Numbers) -> str:
     if each["made"]["training"].get("stop_when_stalled") is None:
         return words
     cut = sum("budget" in run["stopped"] for run in runs)
-    return words + {0: ", until it stalled", len(runs): ", cut short"}.get(cut, f", {cut} of {len(runs)} cut short")
+    return words + {0: ", until it stalled", len(runs): ", cut short"}.get(
+        cut, f", {cut} of {len(runs)} cut short"
+    )
 
 
 def percent(rate: float | None) -> str:

@@ -144,7 +144,7 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
         if chosen is not None:
             time = times.get(row.id, {}).get("median", (kept or {}).get("decision_time"))
             rows.append({**wanted, **chosen, "decision_time": time})
-    compared = _comparisons(study.compare, rows, known.get("compared", []))
+    compared = _comparisons(study.compare, rows)
     return {"id": env.id, "sets": described, "rows": rows, "compared": compared}
 
 
@@ -398,10 +398,8 @@ def _has_all(new: Numbers, old: Numbers) -> bool:
     )
 
 
-def _comparisons(
-    wanted: Sequence[tuple[str, str]], rows: Sequence[Numbers], old: Sequence[Numbers]
-) -> list[Numbers]:
-    """Compare pairs of rows: agents run by run, an agent and a baseline scene by scene."""
+def _comparisons(wanted: Sequence[tuple[str, str]], rows: Sequence[Numbers]) -> list[Numbers]:
+    """Compare pairs of rows: agents run by run, an agent and a baseline scene by scene if runs are known."""
     by_id = {each["row"]: each for each in rows}
     result = []
     for pair in wanted:
@@ -409,7 +407,6 @@ def _comparisons(
             continue
         first, second = (by_id[row] for row in pair)
         entry: Numbers = {"first": pair[0], "second": pair[1], "sets": {}}
-        kept = next((each for each in old if (each["first"], each["second"]) == pair), None)
         for name in (each for each in first["sets"] if each in second["sets"]):
             if second["kind"] == "agent":
                 entry["sets"][name] = _improvement(first["sets"][name]["each"], second["sets"][name]["each"])
@@ -417,8 +414,6 @@ def _comparisons(
                 entry["sets"][name] = _scene_by_scene(
                     *(_solved(each["runs"], name) for each in (first, second))
                 )
-            elif kept is not None and name in kept["sets"]:
-                entry["sets"][name] = kept["sets"][name]
         result += [entry] if entry["sets"] else []
     return result
 
