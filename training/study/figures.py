@@ -22,8 +22,11 @@ from viapoint.training.study.page import chosen, figure_name, has_figure, short
 
 Numbers = Mapping[str, Any]
 DOTS_PER_INCH, SHADES = 100, 96
-AGENT_COLOURS, BASELINE_COLOURS = colormaps["tab10"], ("0.15", "0.35", "0.5", "0.65")
+AGENT_COLOURS = [colormaps["tab10"](i) for i in (0, 1, 2, 3, 4, 5, 6, 8, 9)]  # grey is that of baselines
+BASELINE_COLOURS = ("0.15", "0.35", "0.5", "0.65")
 MARKERS = "o^sDv<>P"
+FEWEST = 10
+"""Least number of scenes of a band that is drawn, if another band has as many."""
 LEAST_FAILURE = 0.05
 """Failures that stand for none on a logarithmic axis, [%]."""
 
@@ -54,7 +57,7 @@ def _environment(name: str, numbers: Numbers, path: Path, shown: Sequence[str]) 
     figure = Figure(figsize=(9.6, 3.2 * (2 if sets else 1)), layout="constrained")
     parts: Any = figure.subfigures(2, 1, hspace=0.04) if sets else (figure, None)
     above, below = parts
-    colours = _colours(numbers)
+    colours = _colours(rows)
     _learning(above.subplots(1, len(AXES), sharey=True), rows, colours, legend=below is None)
     above.suptitle(f"{short(name)}: learning", fontsize=10)
     if below is not None:
@@ -66,12 +69,12 @@ def _environment(name: str, numbers: Numbers, path: Path, shown: Sequence[str]) 
     return path
 
 
-def _colours(numbers: Numbers) -> dict[str, Any]:
-    """Return the colour of each agent and baseline."""
-    agents = dict.fromkeys(each["name"] for each in numbers["rows"] if each["kind"] == "agent")
-    others = dict.fromkeys(each["name"] for each in numbers["rows"] if each["kind"] == "baseline")
+def _colours(rows: Sequence[Numbers]) -> dict[str, Any]:
+    """Return the colour of each agent and baseline among rows."""
+    agents = dict.fromkeys(each["name"] for each in rows if each["kind"] == "agent")
+    others = dict.fromkeys(each["name"] for each in rows if each["kind"] == "baseline")
     greys = {name: BASELINE_COLOURS[i % len(BASELINE_COLOURS)] for i, name in enumerate(others)}
-    return {name: AGENT_COLOURS(i % 10) for i, name in enumerate(agents)} | greys
+    return {name: AGENT_COLOURS[i % len(AGENT_COLOURS)] for i, name in enumerate(agents)} | greys
 
 
 def _learning(axes: Any, rows: Sequence[Numbers], colours: Mapping[str, Any], *, legend: bool) -> None:
@@ -106,7 +109,9 @@ def _abilities(
     ax: Axes, rows: Sequence[Numbers], name: str, numbers: Numbers, colours: Mapping[str, Any]
 ) -> None:
     """Draw success by band with intervals, on one set."""
-    bands = [band for band in BANDS if band in numbers["sets"][name]["bands"]]
+    count = numbers["sets"][name]["bands"]
+    enough = min(FEWEST, max(count.values()))
+    bands = [band for band in BANDS if count.get(band, 0) >= enough]
     here = [each for each in rows if name in each["sets"] and each["sets"][name]["by_band"]]
     seen: dict[str, int] = {}
     for i, each in enumerate(here):
@@ -160,7 +165,7 @@ def _checks(environments: Mapping[str, Numbers], path: Path) -> Path:
             jerk = [each["sets"][first].get("jerk_ratio") or np.nan for each in here]
             times = [1e3 * (each["decision_time"] or np.nan) for each in here]
             label = series.replace("_", " ").replace("sobol", "Sobol order")
-            style: Any = {"label": label, "color": AGENT_COLOURS(i), "marker": MARKERS[i], "markersize": 4}
+            style: Any = {"label": label, "color": AGENT_COLOURS[i], "marker": MARKERS[i], "markersize": 4}
             axes[0, column].plot(checks, failures, **style)
             axes[1, column].plot(checks, jerk, **style)
             axes[2, column].plot(times, failures, **style)
