@@ -17,6 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import viapoint.envs as ve
 from viapoint import envs, primitives, training
 from viapoint.envs.arms import ARMS
+from viapoint.envs import SHAPES
 from viapoint.envs.scenes import families
 from viapoint.training import GeometrySearch, TrainConfig, ViaQ, ViaVecEnv, evaluate, load_agent, train
 from viapoint.training.io.files import BadFileError
@@ -77,7 +78,17 @@ def test_type_checkers_see_what_is_imported_on_first_use(package):
         assert getattr(package, name) is getattr(importlib.import_module(module), name)
 
 
+@pytest.fixture
+def registered_shapes():
+    """Put the table of shapes back, to which an example may add a mesh."""
+    before = dict(SHAPES)
+    yield
+    SHAPES.clear()
+    SHAPES.update(before)
+
+
 @pytest.mark.parametrize("value", objects(lambda value: True))
+@pytest.mark.usefixtures("registered_shapes")
 def test_examples_run(value, monkeypatch, ray_lock):
     monkeypatch.chdir(Path(__file__).parents[1])
     monkeypatch.setattr(families, "_FAMILIES", {d: dict(each) for d, each in families._FAMILIES.items()})
