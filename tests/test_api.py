@@ -16,8 +16,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import viapoint.envs as ve
 from viapoint import envs, primitives, training
-from viapoint.envs.arms import ARMS
 from viapoint.envs import SHAPES
+from viapoint.envs.arms import ARMS
 from viapoint.envs.scenes import families
 from viapoint.training import GeometrySearch, TrainConfig, ViaQ, ViaVecEnv, evaluate, load_agent, train
 from viapoint.training.io.files import BadFileError
