@@ -7,9 +7,10 @@ import operator
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Numbers
+from viapoint.envs.common.types import Float, Numbers
 from viapoint.primitives.array_api import Array, namespace_of
 
 N = TypeVar("N", bound=Numbers)
@@ -96,3 +97,20 @@ def spread(*arrays: Array) -> list[Array]:
     xp = namespace_of(arrays[0])
     shape = np.broadcast_shapes(*(tuple(a.shape) for a in arrays))
     return [xp.broadcast_to(a, shape) for a in arrays]
+
+
+def frame_axes(quaternion: Array) -> tuple[list[Array], list[Array], list[Array]]:
+    """Return the components of the axes of frames from their quaternions, shape (..., 4)."""
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    return (
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
+        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
+        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
+    )
+
+
+def quaternion_to(direction: Any) -> Float:
+    """Return the quaternion that turns the z axis to a direction, shape (3,)."""
+    quaternion = np.empty(4)
+    mujoco.mju_quatZ2Vec(quaternion, np.asarray(direction, dtype=np.float64))
+    return quaternion

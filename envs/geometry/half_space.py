@@ -8,9 +8,10 @@ from typing import Any, ClassVar, Self
 import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_constants
-from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape, quaternion_to
+from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape
 from viapoint.primitives.array_api import Array, namespace_of, to_numpy
 
 EXTENT = 1.0

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space, norm
+from viapoint.envs.common.arrays import in_space, norm, quaternion_to
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_constants
 from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
@@ -20,7 +20,6 @@ from viapoint.envs.geometry.shape import (
     Shape,
     length,
     nearest_to_origin,
-    quaternion_to,
 )
 from viapoint.primitives.array_api import Array, namespace_of
 

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space, norm
+from viapoint.envs.common.arrays import frame_axes, in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.segments import segment_axis_squared
-from viapoint.envs.geometry.shape import Shape, frame_axes
+from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.geometry.shapes import LISTS, MESH_HINT, SHAPES, as_obstacles, refuse_single
 from viapoint.primitives.array_api import Array, to_numpy
 

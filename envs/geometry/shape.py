@@ -26,10 +26,9 @@ from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Self
 
-import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import TINY, clamp, dot, frozen, norm
+from viapoint.envs.common.arrays import TINY, clamp, dot, frame_axes, frozen, norm
 from viapoint.envs.common.types import Float
 from viapoint.primitives.array_api import (
     Array,
@@ -120,17 +119,16 @@ class Shape(abc.ABC):
         try:
             xp, arrays = as_floats(**{name: getattr(self, name) for name in trailing})
             values = dict(zip(trailing, arrays, strict=True))
+            leading = {}
             for name, last in trailing.items():
-                if tuple(values[name].shape)[len(values[name].shape) - len(last) :] != last:
+                shape = tuple(values[name].shape)
+                leading[name] = shape[: len(shape) - len(last)]
+                if shape != leading[name] + last:
                     wanted = f"have shape (..., {last[0]})" if last else "be a number"
-                    raise ValueError(f"{name} must {wanted}, got shape {tuple(values[name].shape)}")
+                    raise ValueError(f"{name} must {wanted}, got shape {shape}")
             for name in self.sizes:
                 if not (values[name] > 0.0).all():
                     raise ValueError(f"{name} must be greater than 0, got {getattr(self, name)!r}")
-            leading = {
-                name: tuple(values[name].shape)[: len(values[name].shape) - len(last)]
-                for name, last in trailing.items()
-            }
             broadcast_batch(**leading)
             values["quaternion"] = _unit(xp, values["quaternion"])
         except ValueError as error:
@@ -416,23 +414,6 @@ def _with_gradient(xp: Namespace, function: Any, t: Array, least: Array) -> Arra
         weight = (behind - least) / xp.where(kink, slopes, 1.0)
     mean = weight * before + (1.0 - weight) * behind
     return xp.where(kink, least.detach() + mean - mean.detach(), least)
-
-
-def frame_axes(quaternion: Array) -> tuple[Components, Components, Components]:
-    """Return the components of the axes of frames from their quaternions, shape (..., 4)."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
-    return (
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
-        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
-        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
-    )
-
-
-def quaternion_to(direction: Any) -> Float:
-    """Return the quaternion that turns the z axis to a direction, shape (3,)."""
-    quaternion = np.empty(4)
-    mujoco.mju_quatZ2Vec(quaternion, np.asarray(direction, dtype=np.float64))
-    return quaternion
 
 
 def length(vector: Components) -> Array:

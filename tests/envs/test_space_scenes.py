@@ -113,7 +113,7 @@ def test_the_hand_alone_may_be_what_must_clear():
     ("bad", "message"),
     [
         ({"n_obstacles": (3, 2)}, "n_obstacles"),
-        ({"n_obstacles": (0, 25)}, "n_obstacles"),
+        ({"n_obstacles": (0, 257)}, "n_obstacles"),
         ({"n_obstacles": (9, 9)}, "fewest <= 8"),
         ({"families": ("wall",)}, "clutter, pillar, shelf, gate, slot, window, tunnel"),
         ({"families": ("gate",), "n_obstacles": (1, 2)}, "take more than 2 obstacles"),

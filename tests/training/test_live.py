@@ -318,7 +318,10 @@ def test_python_code_sets_the_scene_up(env_id, shared):
         ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
         ({"obstacles": [{"shape": "sphere", "radius": "x"}]}, "obstacle 0 of the scene file"),
         ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
-        ({"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 0]]}]}, "distances only"),
+        (
+            {"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 1]]}]},
+            "obstacle 0 'point_cloud point 0': sphere must lie",
+        ),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane, with z = 0"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "courses of the scene file"),
         ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": 1}]}, "courses of the scene file"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space
+from viapoint.envs.common.arrays import in_space, quaternion_to
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
 from viapoint.envs.geometry.rows import (
@@ -19,7 +19,7 @@ from viapoint.envs.geometry.rows import (
     shape_columns,
     shape_rows,
 )
-from viapoint.envs.geometry.shape import TALL, Shape, quaternion_to
+from viapoint.envs.geometry.shape import TALL, Shape
 from viapoint.envs.geometry.shapes import SHAPES, nearest_distance
 
 if TYPE_CHECKING:
