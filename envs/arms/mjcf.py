@@ -112,12 +112,12 @@ def principal_inertia(inertia: tuple[Constants, ...]) -> tuple[Float, Float]:
 def add_obstacles(spec: mujoco.MjSpec, number: int, meshes: Sequence[str] = ()) -> None:
     """Add movable capsules `obstacle_0`, `obstacle_1`, ... that collide with geoms of contact type 1.
 
-    Each mesh, a name of :data:`~viapoint.envs.geometry.shapes.SHAPES`, is added as the geom `NAME_0` that collides with
-    nothing, so that the model holds what obstacles of this shape need.
+    Each mesh, a name of :data:`~viapoint.envs.geometry.shapes.SHAPES`, is added as the geom `mesh_NAME_0`. It collides
+    with nothing; the model then holds what obstacles of this shape need.
     """
     if meshes:
         store = spec.worldbody.add_body(name="meshes", pos=(0.0, 0.0, -10.0))
-        shapes = [SHAPES[name](name=name) for name in meshes]
+        shapes = [SHAPES[name](name=f"mesh_{name}") for name in meshes]
         add_to_model(spec, shapes, store, contype=0, conaffinity=0, group=HIDDEN_GROUP)
     for row in range(number):
         name = f"obstacle_{row}"

@@ -112,7 +112,7 @@ class Simulator:
         self._types = None
         if n_obstacles and tuple(shapes) != CAPSULES:
             self._types = self.batch.expand("geom_type")
-        self.meshes = {name: MeshGeom.of_model(self.model, f"{name}_0") for name in meshes}
+        self.meshes = {name: MeshGeom.of_model(self.model, f"mesh_{name}_0") for name in meshes}
         """Geoms of registered meshes by name."""
         if n_obstacles and meshes:
             self._mesh_ids = self.batch.expand("geom_dataid")
