@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from arm_contacts import arms
 
 from viapoint.envs import SHAPES, ConvexMesh, register_mesh
-from viapoint.envs.arms import ADULT, PANDA
+from viapoint.envs.arms import ADULT
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.rows import shape_rows
 from viapoint.envs.scenes.scene import Scenes, rest_clearance
@@ -24,11 +25,6 @@ BATCH = 2000
 """Poses that are simulated together."""
 KINDS = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 MESH = "hull_of_20_points"
-MODELS = {
-    "panda": CollisionModel(PANDA, whole_arm=True),
-    "planar": CollisionModel(ADULT, whole_arm=True),
-    "planar hand": CollisionModel(ADULT, whole_arm=False),
-}
 
 MOVEMENTS = {"viapoint/PlanarWholeArm-v0": ("box",), "viapoint/PandaObstacles-v0": ("capsule", "box")}
 """Environments of random movements, with the shapes of their obstacles."""
@@ -78,6 +74,12 @@ def random_obstacles(kind, places, generator):
     return shape_rows(kind, places + apart * away, quaternion, half)
 
 
+def models():
+    """Return the collision models that are compared, by their names: every arm, and the hand of the planar one."""
+    whole = {arm.name: CollisionModel(arm, whole_arm=True) for arm in arms()}
+    return {**whole, "planar hand": CollisionModel(ADULT, whole_arm=False)}
+
+
 def register_example(name=MESH):
     """Register the hull of 20 points, whose frame is neither in its middle nor along its axes of inertia."""
     points = np.random.default_rng(1).normal(size=(20, 3)) * (0.05, 0.03, 0.08) + (0.02, 0.01, 0.03)
@@ -85,10 +87,9 @@ def register_example(name=MESH):
     return name
 
 
-def contacts(name, kind, number, seed=0):
-    """Compare contacts of an arm, by its name in MODELS, with obstacles of a shape."""
-    generator, model = np.random.default_rng(seed), MODELS[name]
-    arm = model.arm
+def contacts(model, kind, number, seed=0):
+    """Compare contacts of an arm with obstacles of a shape."""
+    generator, arm = np.random.default_rng(seed), model.arm
     low, high = (np.array(corner) for corner in arm.workspace)
     hand = low + (high - low) * generator.random((4 * number, arm.dimension))
     hand = hand[np.asarray(arm.reach_margin(hand)) > 0.0][:number]
@@ -144,9 +145,9 @@ def main():
         each = contacts_of_movements(env_id, shapes, arguments.poses)
         found["movements"][env_id] = each._asdict()
         print(f"{env_id}: {each.poses} movements, {each.contacts} with contact, {each.wrong} wrong")
-    for name, model in MODELS.items():
+    for name, model in models().items():
         for kind in (*KINDS, *([register_example()] if model.arm.dimension == 3 else [])):
-            each = contacts(name, kind, arguments.poses)
+            each = contacts(model, kind, arguments.poses)
             found.setdefault(name, {})[kind] = each._asdict()
             depth = "" if each.shallowest is None else f", the shallowest {each.shallowest:.3f} m deep"
             print(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, ClassVar, Self
 
 import mujoco
@@ -60,7 +61,7 @@ class PointCloud(Shape):
             radius: Radius of the spheres around the given points, [m].
             **pose: `position`, `quaternion` and `name`.
         """
-        if not spacing > 0.0:
+        if not (isinstance(spacing, Real) and spacing > 0.0):
             raise cls._refusal(pose.get("name", ""), f"spacing must be greater than 0, got {spacing!r}")
         given = cls(points, **pose).points
         cubes = np.unique(np.floor(given / spacing), axis=0)

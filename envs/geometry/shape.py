@@ -115,6 +115,8 @@ class Shape(abc.ABC):
 
     def __post_init__(self) -> None:
         """Convert and check the parameters."""
+        if not isinstance(self.name, str):
+            raise ValueError(f"{self.kind}: name must be a string, got {self.name!r:.60}")
         trailing = {**self.sizes, "position": (3,), "quaternion": (4,)}
         try:
             xp, arrays = as_floats(**{name: getattr(self, name) for name in trailing})

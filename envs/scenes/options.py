@@ -12,13 +12,16 @@ from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.rows import (
     CAPSULES,
+    dimension_of,
+    has_shapes,
     is_shape_list,
     obstacle_names,
     obstacle_rows,
     row_size,
+    shape_number,
     widened,
 )
-from viapoint.envs.geometry.shapes import as_obstacle, as_obstacles, refuse_single
+from viapoint.envs.geometry.shapes import MESH_HINT, SHAPES, as_obstacle, as_obstacles, refuse_single
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.envs.scenes.sampler import SceneSampler
@@ -159,7 +162,13 @@ def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
             batched = array.ndim == (2 if name in ("start", "goal") else 3)
             if batched and len(array) != 1:
                 raise ValueError(f"options[{name!r}] must be those of one scene, got {len(array)} scenes")
-            record[name] = (array[0] if batched else array).tolist()
+            array = array[0] if batched else array
+            _require_finite(name, array)
+            if name == "obstacles" and array.ndim == 2 and has_shapes(array):
+                record["shapes"] = list(
+                    SHAPES
+                )  # rows hold indices into it, which differ where meshes are registered
+            record[name] = array.tolist()
     return json.dumps(record, indent=1) + "\n"
 
 
@@ -183,7 +192,7 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
     if not isinstance(record, Mapping) or record.get("format") != FORMAT:
         raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
     refuse_unknown_options(
-        {name: None for name in record if name not in ("format", "env")}, (*GIVEN, *CHANGES)
+        {name: None for name in record if name not in ("format", "env", "shapes")}, (*GIVEN, *CHANGES)
     )
     options = {name: record[name] for name in (*GIVEN, *CHANGES) if name in record}
     obstacles = options.get("obstacles", [])
@@ -191,7 +200,31 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
         raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
     if obstacles and not all(isinstance(each, list) for each in obstacles):
         options |= _obstacles_of_file(obstacles)
+    elif "shapes" in record:
+        options["obstacles"] = _rows_of_file(obstacles, record["shapes"])
     return options
+
+
+def _rows_of_file(rows: Sequence[Any], shapes: Any) -> list[list[float]]:
+    """Return rows with shapes, whose numbers of shapes are indices into `shapes`, as rows of this process.
+
+    Raises:
+        ValueError: A shape is unknown here, or the rows are none with shapes.
+    """
+    array = _numbers("obstacles", rows)
+    if not (isinstance(shapes, list) and array.ndim == 2 and has_shapes(array)):
+        raise ValueError(
+            "shapes of the scene file must be a list of names, and its obstacles rows with shapes"
+        )
+    column = array[:, 2 * dimension_of(array)]
+    for i, number in enumerate(column):
+        name = shapes[int(number)] if 0.0 <= number < len(shapes) else number
+        if not isinstance(name, str) or name not in SHAPES:
+            raise ValueError(
+                f"obstacle {i} of the scene file: unknown shape {name!r}. Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
+            )
+        column[i] = shape_number(name)
+    return array.tolist()  # type: ignore[no-any-return]
 
 
 def _obstacles_of_file(records: Sequence[Any]) -> dict[str, Any]:
@@ -294,9 +327,18 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
         many = f"(n, {size}) or ({number}, n, {size}) with n at most {most[0]}" if most else ""
         allowed = many or f"{shape} or {shape[1:]}"
         raise ValueError(f"options[{name!r}] must have shape {allowed}, got {array.shape}") from None
+    _require_finite(name, array)
+    return result
+
+
+def _require_finite(name: str, array: Float) -> None:
+    """Check that the numbers of an option are finite.
+
+    Raises:
+        ValueError: One is not.
+    """
     if not np.isfinite(array).all():
         raise ValueError(f"options[{name!r}] must be finite, got {array[~np.isfinite(array)][0]}")
-    return result
 
 
 def _numbers(name: str, value: Any) -> Float:

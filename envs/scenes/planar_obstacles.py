@@ -443,6 +443,7 @@ def _shortest(segments: Float, rows: Float) -> Float:
 
     In the plane, a shortest vector begins or ends at an end point of the segment or of the axis.
     """
+    # Not nearest_on_segments of the geometry: it differs in the last digit, and scenes of a seed would change.
     d = segments.shape[-1]
     low, high = rows[..., :d] - rows[..., d : 2 * d], rows[..., :d] + rows[..., d : 2 * d]
     first, second = segments[..., 0, :], segments[..., 1, :]

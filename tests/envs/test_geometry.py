@@ -221,7 +221,7 @@ def test_gradients_in_single_precision_are_those_in_double(kind, generator, segm
         shape.segment_distance(*ends).sum().backward()
         assert ends.grad.dtype == dtype
         found.append(ends.grad.double().numpy())
-    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    np.testing.assert_allclose(found[0], found[1], atol=5e-4 if searched(kind) else 1e-5)
 
 
 def test_points_that_are_no_numbers_are_refused():

@@ -13,10 +13,12 @@ from viapoint.envs import (
     Cylinder,
     HalfSpace,
     observation_rows,
+    obstacles_from_rows,
     obstacles_to_json,
     scene_from_json,
     scene_to_json,
 )
+from viapoint.envs.geometry import shapes as geometry_shapes
 
 PANDA = "viapoint/PandaObstacles-v0"
 SHAPES = ("capsule", "box", "half_space")
@@ -120,6 +122,33 @@ def test_options_of_a_scene_survive_json(env):
             np.testing.assert_array_equal(now, then)
 
 
+@pytest.fixture
+def table():
+    """Table of shapes, which a test may change."""
+    kept = dict(geometry_shapes.SHAPES)
+    yield geometry_shapes.SHAPES
+    geometry_shapes.SHAPES.clear()
+    geometry_shapes.SHAPES.update(kept)
+
+
+def test_rows_of_a_scene_file_keep_their_shapes_where_the_table_has_another_order(env, table):
+    env.reset(options={**ENDS, "obstacles": [CRATE]})
+    text, again = scene_to_json(env.batch.scenes.as_options()), dict(reversed(table.items()))
+    table.clear()
+    table.update(again)
+    (found,) = obstacles_from_rows(np.array(scene_from_json(text)["obstacles"]))
+    assert found == CRATE
+    del table["box"]
+    with pytest.raises(ValueError, match=r"obstacle 0 of the scene file: unknown shape 'box'. Shapes are"):
+        scene_from_json(text)
+
+
+def test_builtin_shapes_keep_their_numbers():
+    """Frozen sets of scenes and checkpoints hold them."""
+    kinds = ["sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud"]
+    assert list(geometry_shapes.SHAPES)[: len(kinds)] == kinds
+
+
 def test_changes_of_a_scene_survive_json():
     env = gym.make("viapoint/PlanarMovingObstacles-v0").unwrapped
     env.reset(seed=3)
@@ -140,6 +169,7 @@ def test_changes_of_a_scene_survive_json():
         ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
         ({"goal": np.zeros((2, 3))}, "options['goal'] must be those of one scene, got 2 scenes"),
         ({"start": "here"}, "options['start'] must be real numbers"),
+        ({"start": (np.nan, 0.0, 0.1)}, "options['start'] must be finite, got nan"),
     ],
 )
 def test_what_is_no_scene_is_not_written(options, reason):

@@ -27,6 +27,9 @@ from viapoint.envs import (
     obstacles_to_json,
     register_mesh,
 )
+from viapoint.envs.arms import ADULT
+from viapoint.envs.arms import PANDA as FRANKA
+from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 from viapoint.envs.geometry.rows import (
     pair_distance,
@@ -44,6 +47,7 @@ from contacts import KINDS, contacts, random_obstacles, register_example
 
 EVERY = pytest.mark.parametrize("kind", KINDS)
 PANDA = "viapoint/PandaObstacles-v0"
+WHOLE_PANDA = CollisionModel(FRANKA, whole_arm=True)
 ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
 CRATE = Box((0.03, 0.03, 0.03), position=(0.2, 0.6, 0.4))
 SCENE = [
@@ -68,9 +72,11 @@ def env():
 
 
 @EVERY
-@pytest.mark.parametrize("name", ["panda", "planar hand"])
-def test_contact_in_mujoco_is_negative_clearance(name, kind):
-    found = contacts(name, kind, 400)
+@pytest.mark.parametrize(
+    "model", [WHOLE_PANDA, CollisionModel(ADULT, whole_arm=False)], ids=["panda", "hand"]
+)
+def test_contact_in_mujoco_is_negative_clearance(model, kind):
+    found = contacts(model, kind, 400)
     assert 50 < found.contacts < 390
     assert found.wrong == 0
 
@@ -284,7 +290,7 @@ def mesh():
 
 
 def test_contact_with_a_mesh_in_mujoco_is_negative_clearance(mesh):
-    found = contacts("panda", "lump", 1000)
+    found = contacts(WHOLE_PANDA, "lump", 1000)
     assert 200 < found.contacts < 900
     assert found.wrong == 0
 
