@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import re
 from pathlib import Path
 
@@ -28,7 +29,8 @@ from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, load, shipped_path
 from viapoint.training.search.geometry_search import GeometrySearch
 
-PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "environments.md").read_text(encoding="utf-8")
 ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 
 
@@ -152,6 +154,8 @@ def test_every_band_is_drawn_in_training_about_as_often_as_documented(env_id, re
     found = np.bincount(bands(share), minlength=len(BANDS)) / 300
     (row,) = re.findall(rf"^\| `{env_id}` \|((?: [0-9]+ % \|)+)$", PAGE, flags=re.MULTILINE)
     stated = np.array([float(part) for part in re.findall(r"[0-9]+", row)]) / 100.0
+    recorded = json.loads((DOCS / "scenes.json").read_text())["bands"][env_id]
+    assert (stated == [round(recorded[band], 2) for band in BANDS]).all()
     assert (found > 0.0).all()
     assert (np.abs(found - stated) < 0.09).all(), (found, stated)
 

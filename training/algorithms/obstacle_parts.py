@@ -317,7 +317,7 @@ def _distance_from_axis(apart: list[Tensor], axis: list[Tensor] | None, poses: P
         axis: D components of the unit axes of the bodies; None for a sphere, whose radius is left out.
         poses: Half-lengths and radii of the bodies.
     """
-    # Not point_axis_squared of the geometry: bodies have unit axes here, and the floor of the root keeps gradients finite.
+    # Not point_axis_squared of the geometry: bodies have unit axes, and the floor of the root keeps gradients finite.
     square = _dot(apart, apart)
     if axis is None or poses.half_length is None or poses.radius is None:
         return _root(square)

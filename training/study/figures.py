@@ -17,16 +17,13 @@ from PIL import Image
 from viapoint.training.evaluation.statistics import interquartile_mean
 from viapoint.training.io.files import write_bytes
 from viapoint.training.plotting.plots import AXES, style_axes
-from viapoint.training.scene_sets.scene_set import BANDS
-from viapoint.training.study.page import chosen, figure_name, has_figure, short
+from viapoint.training.study.page import chosen, figure_name, has_figure, short, shown_bands
 
 Numbers = Mapping[str, Any]
 DOTS_PER_INCH, SHADES = 100, 96
 AGENT_COLOURS = [colormaps["tab10"](i) for i in (0, 1, 2, 3, 4, 5, 6, 8, 9)]  # grey is that of baselines
 BASELINE_COLOURS = ("0.15", "0.35", "0.5", "0.65")
 MARKERS = "o^sDv<>P"
-FEWEST = 10
-"""Least number of scenes of a band that is drawn, if another band has as many."""
 LEAST_FAILURE = 0.05
 """Failures that stand for none on a logarithmic axis, [%]."""
 
@@ -109,9 +106,7 @@ def _abilities(
     ax: Axes, rows: Sequence[Numbers], name: str, numbers: Numbers, colours: Mapping[str, Any]
 ) -> None:
     """Draw success by band with intervals, on one set."""
-    count = numbers["sets"][name]["bands"]
-    enough = min(FEWEST, max(count.values()))
-    bands = [band for band in BANDS if count.get(band, 0) >= enough]
+    bands = shown_bands(numbers["sets"][name])
     here = [each for each in rows if name in each["sets"] and each["sets"][name]["by_band"]]
     seen: dict[str, int] = {}
     for i, each in enumerate(here):

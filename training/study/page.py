@@ -24,6 +24,8 @@ Numbers = Mapping[str, Any]
 Cells = Sequence[Sequence[str]]
 EMPTY = ("-", "0.0 %")
 """Cells of columns that a table leaves out if they hold nothing else."""
+FEWEST = 10
+"""Least number of scenes of a band that is shown, if another band has as many."""
 TABLE = re.compile(r"(<!-- table:([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -84,9 +86,10 @@ def figure_name(environment: str) -> str:
 
 
 def has_figure(numbers: Numbers) -> bool:
-    """Return whether an environment has success by band of an agent, or learning curves that are not 1 throughout."""
+    """Return whether success by band of an agent, or learning curves, are not 1 throughout."""
     agents = [each for each in numbers["rows"] if each["kind"] == "agent"]
-    bands = any(found["by_band"] for each in agents for found in each["sets"].values())
+    found = [rate for each in agents for a_set in each["sets"].values() for rate in a_set["by_band"].values()]
+    bands = any(rate < 1.0 for rate, *_ in found)
     curves = [each["curve"]["success"] for each in agents if each.get("curve")]
     return bands or any(rate < 1.0 for curve in curves for point in curve for rate in point)
 
@@ -99,7 +102,16 @@ def caption(numbers: Numbers) -> str:
     if not sets:
         return f"*{above.capitalize()}. The table has the number of seeds.*"
     below = f"success by solution share in {' and '.join(sets)} scenes, with 95 % intervals"
+    if any(set(about["bands"]) - set(shown_bands(about)) for about in numbers["sets"].values()):
+        below += f", without bands of fewer than {FEWEST} scenes"
     return f"*Above: {above}. Below: {below}. The tables have the numbers of seeds.*"
+
+
+def shown_bands(about: Numbers) -> list[str]:
+    """Return the bands of a set that have enough scenes to be shown, from easy to hard."""
+    count = about["bands"]
+    enough = min(FEWEST, max(count.values(), default=0))
+    return [band for band in BANDS if band in count and count[band] >= enough]
 
 
 def short(environment: str) -> str:
@@ -123,8 +135,8 @@ def summary(
     numbers: Numbers, name: str, ids: Sequence[str] | None = None, labels: Mapping[str, str] | None = None
 ) -> list[list[str]]:
     """Return a table of the rows on a set: success by band, jerk, time, decision time and training."""
-    about = numbers["sets"][name]
-    bands = [band for band in BANDS if band in about["bands"]]
+    bands = shown_bands(numbers["sets"][name])
+    bands = bands if len(bands) > 1 else []  # one band is the whole set
     head = ["method", "seeds", "success (95 %)", *bands, "collision", "jerk ratio", "jerk / planner"]
     head += ["movement", "decision", "training"]
     lines = [head]
