@@ -74,6 +74,7 @@ def main() -> None:
         "source": SOURCE,
         "licence": Path(licence).read_text(encoding="utf-8"),
         "units": "m and rad; quaternions are w, x, y, z; sizes are half lengths",
+        "can be shown, of 100": {name: len(shown) for name, shown in sets.items()},
         "problems": [each for shown in sets.values() for each in shown[:OF_EACH_SET]],
     }
     lines = json.dumps(record, indent=1).replace("\n   ", " ")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from viapoint.training.scene_sets.scene_set import load
+
 DOCS = Path(__file__).parents[2] / "docs"
 
 
@@ -26,6 +28,33 @@ def test_the_stated_times_of_the_live_page_are_the_measured_ones():
     )
     most = [f"{each['most_ms']}" for each in (plane, arm, panda)]
     assert f"95 % of the changes below {most[0]}, {most[1]} and {most[2]} ms" in page
+
+
+def test_the_stated_numbers_of_steered_movements_are_the_measured_ones():
+    plane, fine, panda = read("scenes.json")["steered"].values()
+    assert all(each["success"] == 1.0 for each in (plane, fine, panda))
+    page = text("environments-step.md")
+    assert (
+        f"a median jerk ratio of {plane['jerk_ratio']:.1f} (the solutions: {plane['of_solutions']:.1f}; "
+        f"with `control_step=0.02`: {fine['jerk_ratio']:.1f})" in page
+    )
+    assert f"with {panda['jerk_ratio']:.1f} (the solutions: {panda['of_solutions']:.1f};" in page
+
+
+def test_the_stated_numbers_of_uniform_scenes_left_out_are_those_of_the_sets():
+    drawn = {env_id: int(load("uniform", env_id).number.max()) + 1 for env_id in read("scenes.json")["drawn"]}
+    assert drawn == read("scenes.json")["drawn"]
+    stated = [f"{number - 500} of {number}" for number in drawn.values()]
+    assert "{} in `PlanarObstacles`, {} in `PlanarWholeArm` and {} in `PandaObstacles`".format(
+        *stated
+    ) in text("environments.md")
+
+
+def test_the_stated_numbers_of_shown_benchmark_problems_are_those_of_the_file():
+    file = DOCS.parent / "training" / "live" / "motion_bench_maker.json"
+    shown = json.loads(file.read_text(encoding="utf-8"))["can be shown, of 100"]
+    assert f"Of {100 * len(shown)} problems, {sum(shown.values())} can be shown" in text("live.md")
+    assert [name for name, number in shown.items() if not number] == ["box", "table_under_pick"]
 
 
 def total(results, part, name):

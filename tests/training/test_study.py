@@ -15,7 +15,7 @@ from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import read_json
 from viapoint.training.study import jobs, run, timing
 from viapoint.training.study.config import rows_of
-from viapoint.training.study.page import effort, fill_tables, render_page, row, table
+from viapoint.training.study.page import effort, fill_tables, render_page, row, shown_bands, table
 from viapoint.training.study.results import gather, unpacked
 
 ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
@@ -364,3 +364,9 @@ def test_a_search_of_equal_time_takes_nearly_the_whole_time(tmp_path, monkeypatc
         assert checks == timing.FEWEST_CHECKS
     else:
         assert took >= timing.NEARLY * seconds or checks == timing.MOST_CHECKS
+
+
+def test_bands_of_few_scenes_are_left_out_unless_all_have_few():
+    assert shown_bands({"bands": {"> 20 %": 110, "1-5 %": 25, "< 1 %": 6}}) == ["> 20 %", "1-5 %"]
+    assert shown_bands({"bands": {"1-5 %": 4, "< 1 %": 3}}) == ["1-5 %"]
+    assert shown_bands({"bands": {}}) == []
