@@ -11,7 +11,7 @@ Rows are shapes, each against spheres and capsules of random sizes and poses. Co
     contacts   poses with contact in MuJoCo
     wrong      poses whose contact in MuJoCo differs from the sign of the clearance, if that is over 0.1 mm
     through    further such poses in which the axis of the capsule enters the shape: MuJoCo's method for capsules and
-               boxes misses some of them, coal agrees with this package
+               boxes misses some of them
 
 Columns of time, for batches of 10,000 distances, [ns] each:
 
