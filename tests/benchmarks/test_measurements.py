@@ -57,25 +57,6 @@ def test_the_stated_numbers_of_shown_benchmark_problems_are_those_of_the_file():
     assert [name for name, number in shown.items() if not number] == ["box", "table_under_pick"]
 
 
-def test_the_stated_numbers_of_contacts_are_the_measured_ones():
-    poses = read("contacts.json")
-    movements, arms = (
-        poses.pop("movements"),
-        {name: each for name, each in poses.items() if name != "planar hand"},
-    )
-    assert list(arms) == ["planar", "panda", "ur5e", "fetch"]
-    assert {each["poses"] for kinds in poses.values() for each in kinds.values()} == {10_000}
-    wrong = {
-        (name, kind): each for name, kinds in poses.items() for kind, each in kinds.items() if each["wrong"]
-    }
-    assert list(wrong) == [("planar", "box"), ("ur5e", "box")]
-    assert all(each["shallowest"] > 0.038 for each in wrong.values())
-    assert wrong["planar", "box"]["wrong"] == 214
-    assert wrong["ur5e", "box"]["wrong"] == 1
-    assert "214 poses of the planar arm and one of UR5e differ" in text("geometry.md")
-    assert [each["wrong"] for each in movements.values()] == [0, 0]
-
-
 def total(results, part, name):
     return sum(each[part].get(name, 0) for each in results.values())
 
