@@ -357,7 +357,7 @@ def test_a_search_of_equal_time_takes_nearly_the_whole_time(tmp_path, monkeypatc
     study = study_of(tmp_path)
     (baseline,) = (each for each in study.baselines if each.name == "in-time")
     monkeypatch.setattr(timing, "method_of", lambda search, *_, **__: search.checks)
-    monkeypatch.setattr(timing, "median_time", lambda _, checks: 0.001 + 1e-5 * checks**power)
+    monkeypatch.setattr(timing, "median_time", lambda _, checks, kwargs: 0.001 + 1e-5 * checks**power)
     checks, took = timing.checks_within(study.environments[0], baseline, seconds)
     assert took == pytest.approx(0.001 + 1e-5 * checks**power)
     if took > seconds:
@@ -370,3 +370,12 @@ def test_bands_of_few_scenes_are_left_out_unless_all_have_few():
     assert shown_bands({"bands": {"> 20 %": 110, "1-5 %": 25, "< 1 %": 6}}) == ["> 20 %", "1-5 %"]
     assert shown_bands({"bands": {"1-5 %": 4, "< 1 %": 3}}) == ["1-5 %"]
     assert shown_bands({"bands": {}}) == []
+
+
+def test_a_search_of_more_via_points_is_timed_in_a_task_of_replanning(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "N_TIMED", 3)
+    moving = {"viapoint/PlanarMovingObstacles-v0": {"n_scenes": 4}}
+    searches = {"search-k{n_via}": SMALL["baselines"]["search-k{n_via}"]}
+    study = study_of(tmp_path, environments=moving, agents={}, baselines=searches, compare=[])
+    (line,) = timing.time_decisions(study)
+    assert re.search(r"PlanarMovingObstacles-v0 search-k2: \d+\.\d+ ms", line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,9 +75,15 @@ def remove_times(study: Study, env: Environment, row: str) -> bool:
     return True
 
 
-def median_time(env: Environment, method: Method) -> float:
-    """Return the median wall time of single decisions on one thread, without the first one, [s]."""
-    opened = new_simulation(env.id, 2, **{**env.env_kwargs, "threads": 1})
+def median_time(env: Environment, method: Method, env_kwargs: Mapping[str, Any]) -> float:
+    """Return the median wall time of single decisions on one thread, without the first one, [s].
+
+    Args:
+        env: Environment.
+        method: Method that decides.
+        env_kwargs: Arguments of the environment for which the method was made, besides those of `env`.
+    """
+    opened = new_simulation(env.id, 2, **{**env.env_kwargs, **env_kwargs, "threads": 1})
     with one_thread(), contextlib.closing(opened) as simulation:
         scenes = _timed_scenes(env).scenes
         times = list(single_decision_times(method, scenes, simulation, N_TIMED, BUDGET))
@@ -93,7 +99,7 @@ def checks_within(env: Environment, baseline: Baseline, seconds: float) -> tuple
 
     def timed(checks: int) -> float:
         search = dataclasses.replace(baseline, checks=checks)
-        return median_time(env, method_of(search, env, _timed_scenes(env), threads=1))
+        return median_time(env, method_of(search, env, _timed_scenes(env), threads=1), search.env_kwargs)
 
     low, took = FEWEST_CHECKS, timed(FEWEST_CHECKS)
     high, longer = low, took
@@ -124,7 +130,7 @@ def _to_time(study: Study, env: Environment, times: Record) -> Iterator[Timed]:
         yield from _agent_to_time(study, env, agent)
 
     def time(baseline: Baseline) -> Record:
-        return {"median": median_time(env, method_of(baseline, env, frozen, threads=1))}
+        return {"median": median_time(env, method_of(baseline, env, frozen, threads=1), baseline.env_kwargs)}
 
     def search(baseline: Baseline, seconds: float) -> Record:
         checks, median = checks_within(env, baseline, seconds)
@@ -152,7 +158,7 @@ def _agent_to_time(study: Study, env: Environment, agent: Agent) -> Iterator[Tim
     model = functools.cache(lambda: load_model(folder))
 
     def measure(mode: Mode) -> Record:
-        return {"median": median_time(env, method_of_mode(mode, model(), env, kwargs))}
+        return {"median": median_time(env, method_of_mode(mode, model(), env, kwargs), kwargs)}
 
     for mode in agent.modes(env.id):
         source = identity_of(_timed_scenes(env), folder, mode)
