@@ -165,9 +165,8 @@ def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
             array = array[0] if batched else array
             _require_finite(name, array)
             if name == "obstacles" and array.ndim == 2 and has_shapes(array):
-                record["shapes"] = list(
-                    SHAPES
-                )  # rows hold indices into it, which differ where meshes are registered
+                # Rows hold indices into this table, which is another one where other meshes are registered.
+                record["shapes"] = list(SHAPES)
             record[name] = array.tolist()
     return json.dumps(record, indent=1) + "\n"
 
