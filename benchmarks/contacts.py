@@ -115,15 +115,18 @@ def contacts(model, kind, number, seed=0):
 
 
 def contacts_of_movements(env_id, shapes, number, seed=0):
-    """Compare contacts in random movements, which start clear of the obstacles, with their least clearance."""
+    """Compare contacts in random movements, which start clear of the obstacles, with their least clearance.
+
+    Of `number` actions, those that leave the reach count as none, as nothing moves.
+    """
     envs = gym.make_vec(env_id, num_envs=min(BATCH, number), shapes=shapes)
     envs.reset(seed=seed)
     envs.action_space.seed(seed)
     found = [envs.step(envs.action_space.sample())[-1] for _ in range(-(-number // envs.num_envs))]
-    contact, clearance = (
-        np.concatenate([info[name] for info in found]) for name in ("collision", "min_clearance")
+    contact, clearance, moved = (
+        np.concatenate([info[name] for info in found]) for name in ("collision", "min_clearance", "reachable")
     )
-    return _compared(contact, clearance)
+    return _compared(contact[moved], clearance[moved])
 
 
 def _compared(contact, clearance):

@@ -1,18 +1,20 @@
-"""Numbers of the pages on environments: bands of training scenes, and jerk of movements steered along solutions.
+"""Numbers of the pages on environments: training scenes by difficulty, desks, and movements steered along solutions.
 
     OMP_NUM_THREADS=1 python benchmarks/scene_numbers.py --out docs/scenes.json
 
 `bands` holds the share of training scenes in each band of difficulty. The solution share of a scene is estimated
 from the plans of random actions, which is slightly too high. `drawn` holds how many scenes were drawn for the set
-`uniform`; those without a known solution were left out. `steered` holds the success and the median jerk ratio of hands
-that are steered along the stored solutions of `validation` scenes, with an action in every control step, and the jerk
-ratio of the solutions themselves.
+`uniform`; those without a known solution were left out. `desk` holds the success of the shipped agent with 0 and 64
+checks, and of methods without learning, in random scenes of the family. `steered` holds the success and the median jerk
+ratio of hands that are steered along the stored solutions of `validation` scenes, with an action in every control step,
+and the jerk ratio of the solutions themselves.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
@@ -20,14 +22,17 @@ import numpy as np
 from scene_sets.difficulty import planned_share
 
 from viapoint.envs.actions.via_points import Plan
+from viapoint.envs.mdp.task import family_sampler
 from viapoint.envs.registration import STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.time_scaling import required_time_scale
+from viapoint.training.evaluation.evaluator import evaluate
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import BANDS, bands, load
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, load
 
 ENVIRONMENTS = ("viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0", "viapoint/PandaObstacles-v0")
 TRAINING_SCENES, DRAWS = 1024, 256
+DESK_SCENES, CHECKS, METHODS = 300, (0, 64), ("search64", "search512", "planner")
 STEERED_SCENES = 200
 CORRECTION = 4.0
 """Gain of the pull to where the hand should be, [1/s]."""
@@ -41,6 +46,26 @@ def shares_of_bands(env_id: str, number: int = TRAINING_SCENES, draws: int = DRA
     simulation.close()
     found = np.bincount(bands(share), minlength=len(BANDS)) / number
     return dict(zip(BANDS, found.round(4).tolist(), strict=True))
+
+
+def at_desks(env_id: str, number: int = DESK_SCENES, methods: Sequence[str] = METHODS) -> dict[str, float]:
+    """Return the success of the shipped agent and of methods in random scenes of the family `desk`, by method."""
+    simulation = SceneSimulation(env_id, threads=1)
+    scenes = family_sampler(simulation.task, "desk")(
+        [np.random.default_rng(1_000 + i) for i in range(number)]
+    )
+    solution = np.zeros((number, simulation.task.action.size))
+    simulation.close()
+    frozen = FrozenScenes(
+        name="desk",
+        env_id=env_id,
+        scenes=scenes,
+        share=np.full(number, np.nan),
+        solution=solution,
+        family="desk",
+    )
+    found = evaluate(env_id, scenes=frozen, checks=CHECKS, baselines=methods, time_decisions=False)
+    return {row["method"]: round(row["success"]["rate"], 4) for row in found.rows}
 
 
 def steered(env_id: str, number: int = STEERED_SCENES, **env_kwargs: float) -> dict[str, float]:
@@ -105,6 +130,7 @@ def main() -> None:
     found = {
         "bands": {env_id: shares_of_bands(env_id) for env_id in ENVIRONMENTS},
         "drawn": {env_id: int(load("uniform", env_id).number.max()) + 1 for env_id in ENVIRONMENTS},
+        "desk": at_desks(ENVIRONMENTS[-1]),
         "steered": {
             planar: steered(planar),
             f"{planar}, control_step=0.02": steered(planar, control_step=0.02),

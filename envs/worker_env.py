@@ -161,7 +161,8 @@ class WorkerVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         given: dict[str, Any] = self._prototype.parse_options(options, len(rows))
         if any(map(any, obstacle_names(options.get("obstacles", ())))):  # for errors, which name them
             shapes = options["obstacles"]
-            given["obstacles"] = [shapes] * len(rows) if is_shape_list(shapes) else list(shapes)
+            scenes = [shapes] if is_shape_list(shapes) else list(shapes)
+            given["obstacles"] = scenes * len(rows) if len(scenes) == 1 else scenes
         asked, first = [], []
         for part in self.parts:
             begin, end = (int(np.searchsorted(rows, env)) for env in (part.start, part.stop))

@@ -10,7 +10,8 @@ import numpy as np
 
 from viapoint.envs.common.arrays import clamp, dot, safe_ratio, spread
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape, lowest_of_lines
+from viapoint.envs.geometry.segments import lowest_of_lines
+from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape
 from viapoint.primitives.array_api import Array, namespace_of, to_numpy
 
 

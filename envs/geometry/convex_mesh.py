@@ -12,17 +12,14 @@ import numpy as np
 from viapoint.envs.common.arrays import frozen, norm, spread
 from viapoint.envs.common.types import Float, Index
 from viapoint.envs.common.validation import as_constants
-from viapoint.envs.geometry.segments import nearest_on_segments
+from viapoint.envs.geometry.segments import best_of, lowest_of_lines, nearest_on_segments, nearest_to_origin
 from viapoint.envs.geometry.shape import (
     Components,
     Geom,
     Shape,
-    best_of,
     blocks,
     bounds_of_points,
     length,
-    lowest_of_lines,
-    nearest_to_origin,
 )
 from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
 
@@ -284,17 +281,23 @@ def _check_convex(vertices: Float, body: Polytope, faces: Any) -> None:
         )
     if faces is None:
         return
-    corners = np.asarray(faces)
+    try:
+        corners = np.asarray(faces)
+    except ValueError:
+        raise ValueError(
+            "faces must be triangles, integers of shape (F, 3), got rows of different lengths"
+        ) from None
     if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
         raise ValueError(f"faces must be triangles, integers of shape (F, 3), got shape {corners.shape}")
-    if corners.size and not 0 <= corners.min() <= corners.max() < len(vertices):
-        raise ValueError(f"faces must be indices of the {len(vertices)} vertices, got {corners.max()}")
+    wrong = corners[(corners < 0) | (corners >= len(vertices))]
+    if wrong.size:
+        raise ValueError(f"faces must be indices of the {len(vertices)} vertices, got {wrong[0]}")
     enclosed = abs(_volumes(vertices, corners).sum())
     whole = np.abs(_volumes(vertices, hull_triangles(vertices))).sum()
     if abs(enclosed - whole) > 10.0 * DENT * whole:
         raise ValueError(
-            f"faces are not those of a convex mesh: they enclose {enclosed:.4g} m^3, their hull "
-            f"{whole:.4g} m^3; {hint}"
+            f"faces are not those of a convex mesh, or not all their corners turn the same way seen from outside: they "
+            f"enclose {enclosed:.4g} m^3, their hull {whole:.4g} m^3; {hint}"
         )
 
 

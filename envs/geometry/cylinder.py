@@ -10,7 +10,8 @@ import numpy as np
 
 from viapoint.envs.common.arrays import clamp, safe_ratio, spread
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape, best_of
+from viapoint.envs.geometry.segments import best_of
+from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 NEWTON_STEPS = 12
@@ -132,13 +133,15 @@ class _Line:
             later, sooner = (at < 0.0) & (t > low), (at >= 0.0) & (t < high)
             low, falling = xp.where(later, t, low), xp.where(later, at, falling)
             high, rising = xp.where(sooner, t, high), xp.where(sooner, at, rising)
+        bracket = low, high
         t = low + (high - low) * safe_ratio(falling, falling - rising)
         for _ in range(NEWTON_STEPS):
             at, slope = self.rise(t)
             low, high = xp.where(at < 0.0, t, low), xp.where(at < 0.0, high, t)
             step = t - safe_ratio(at, slope)
             t = xp.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        return clamp(xp.where(within, t, ends), 0.0, 1.0)
+        # The derivative jumps in slope where the line crosses an end, which rounding may put just beyond the bracket.
+        return best_of(xp, self.signed, (clamp(xp.where(within, t, ends), 0.0, 1.0), *bracket))
 
     def rise(self, t: Array) -> tuple[Array, Array]:
         """Return half the first and second derivative of the squared distance at t."""

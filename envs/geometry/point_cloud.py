@@ -61,8 +61,13 @@ class PointCloud(Shape):
             radius: Radius of the spheres around the given points, [m].
             **pose: `position`, `quaternion` and `name`.
         """
-        if not (isinstance(spacing, Real) and spacing > 0.0):
-            raise cls._refusal(pose.get("name", ""), f"spacing must be greater than 0, got {spacing!r}")
+        for name, value, allowed in (
+            ("spacing", spacing, "greater than 0"),
+            ("radius", radius, "0 or greater"),
+        ):
+            number = isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= value < np.inf
+            if not number or (value == 0.0 and name == "spacing"):
+                raise cls._refusal(pose.get("name", ""), f"{name} must be {allowed}, got {value!r:.60}")
         given = cls(points, **pose).points
         cubes = np.unique(np.floor(given / spacing), axis=0)
         return cls((cubes + 0.5) * spacing, radius=0.5 * np.sqrt(3.0) * spacing + radius, **pose)

@@ -11,7 +11,7 @@ import numpy as np
 from viapoint.envs.common.arrays import in_space, norm, quaternion_to
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_constants
-from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
+from viapoint.envs.geometry.segments import nearest_to_origin, point_axis_squared, segment_axis_squared
 from viapoint.envs.geometry.shape import (
     FLAT,
     GUARD,
@@ -19,9 +19,8 @@ from viapoint.envs.geometry.shape import (
     Geom,
     Shape,
     length,
-    nearest_to_origin,
 )
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, namespace_of, to_numpy
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,7 @@ class Sphere(Shape):
 
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
-        return np.asarray(self.radius * directions)
+        return np.asarray(to_numpy(self.radius) * directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +139,7 @@ class Capsule(Shape):
 
     def segment_distance(self, first: Array, second: Array, radius: Array = 0.0) -> Array:
         """Return the distance from segments; see :meth:`Shape.segment_distance`."""
-        own, (first, second) = self._matched(first, second)
+        own, (first, second), radius = self._matched(radius, first=first, second=second)
         start, half = own._offset(first), own._half_axis
         gap = [p + h for p, h in zip(start, half, strict=True)]
         link = [second[..., i] - first[..., i] for i in range(3)]
@@ -184,4 +183,4 @@ class Capsule(Shape):
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
         ends = np.sign(directions[:, 2:]) * np.array([0.0, 0.0, float(self.half_length)])
-        return np.asarray(self.radius * directions + ends)
+        return np.asarray(to_numpy(self.radius) * directions + ends)

@@ -18,6 +18,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import frame_axes, in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
@@ -185,13 +186,29 @@ def obstacle_rows(obstacles: Any, dimension: int, shapes: Sequence[str] = CAPSUL
         return np.array([_row(i, part, dimension, tuple(shapes)) for i, part in enumerate(parts)])
     if not _has_lists(obstacles):
         return _checked_numbers(obstacles)
-    rows = np.zeros((len(obstacles), max(map(len, obstacles)), row_size(dimension, shapes)))
+    size, each = row_size(dimension, shapes), list[Float]()
     for i, scene in enumerate(obstacles):
         try:
-            if scene:
-                rows[i, : len(scene)] = obstacle_rows(scene, dimension, shapes)
+            each.append(_rows_of_scene(scene, dimension, shapes, size))
         except ValueError as error:
             raise ValueError(f"scene {i}: {error}") from None
+    rows = np.zeros((len(each), max(map(len, each)), size))
+    for row, found in zip(rows, each, strict=True):
+        row[: len(found)] = found
+    return rows
+
+
+def _rows_of_scene(scene: Any, dimension: int, shapes: Sequence[str], size: int) -> Float:
+    """Return the obstacles of one scene as rows of a size."""
+    if not isinstance(scene, list | tuple | np.ndarray):
+        raise ValueError(f"obstacles must be {LISTS}, got {scene!r:.60}")
+    if not len(scene):
+        return np.zeros((0, size))
+    rows = np.asarray(obstacle_rows(scene, dimension, shapes), dtype=np.float64)
+    if rows.shape[1:] == (row_size(dimension),) and size > row_size(dimension):
+        rows = widened(rows)
+    if rows.shape[1:] != (size,):
+        raise ValueError(f"rows of obstacles must have {size} numbers, got shape {rows.shape}")
     return rows
 
 
@@ -226,7 +243,7 @@ def _checked_numbers(obstacles: Any) -> Any:
     """
     try:
         array = np.asarray(obstacles)
-        real = array.dtype.kind in "fiub"
+        real = array.dtype.kind in "fiu"
     except (TypeError, ValueError, RuntimeError):  # torch: a tensor that follows a gradient
         real = False
     if not real:
@@ -255,6 +272,10 @@ def obstacles_from_rows(rows: Float) -> list[Shape]:
         array(0.1)
     """
     found = list[Shape]()
+    sizes = [row_size(d, shapes) for shapes in (CAPSULES, ()) for d in (2, 3)]
+    if np.ndim(rows) != 2 or np.shape(rows)[1] not in sizes:
+        raise ValueError(f"rows must have shape (n, .) with {sizes} numbers each, got shape {np.shape(rows)}")
+    rows = np.asarray(rows, dtype=np.float64)
     d = dimension_of(rows)
     for row in rows[rows[:, -1] > 0.0]:
         centre, axis, radius = in_space(row[:d]), in_space(row[d : 2 * d]), row[-1]
@@ -294,9 +315,8 @@ def observation_rows(
         >>> rows[0, 7:].astype(float).round(3).tolist()  # behind the one-hot
         [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.2, 0.25, 1.0]
     """
-    refuse_single(obstacles)
     given = as_obstacles(obstacles)
-    if len(given) > n_rows:
+    if len(given) > whole_number("n_rows", n_rows, 0):
         raise ValueError(f"there may be at most {n_rows} obstacles, got {len(given)}")
     kinds = list(SHAPES if shapes is None else shapes)
     rows = np.zeros((n_rows, len(kinds) + POSE_SIZE), np.float32)
@@ -363,7 +383,12 @@ def check_shapes(shapes: Any, dimension: int = 3) -> tuple[str, ...]:
     """
     known = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
     names = (shapes,) if isinstance(shapes, str) else tuple(shapes) if isinstance(shapes, Sequence) else ()
-    if not names or len(set(names)) < len(names) or not set(names) <= set(known):
+    if (
+        not all(isinstance(name, str) for name in names)
+        or not names
+        or len(set(names)) < len(names)
+        or not set(names) <= set(known)
+    ):
         raise ValueError(
             f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}; {MESH_HINT}"
         )

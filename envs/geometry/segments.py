@@ -1,11 +1,12 @@
-"""Nearest points of points, segments and the axes of capsules."""
+"""Nearest points of points, segments and the axes of capsules, and least values along a segment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from viapoint.envs.common.arrays import TINY, clamp, dot
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 
 def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
@@ -52,3 +53,52 @@ def nearest_on_segments(
     on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
     on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
     return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis
+
+
+def best_of(xp: Namespace, function: Any, candidates: Any) -> Array:
+    """Return the candidate with the least value of a function."""
+    best = None
+    for each in candidates:
+        value = function(each)
+        if best is None:
+            best, least = each, value
+        else:
+            best, least = xp.where(value < least, each, best), xp.minimum(value, least)
+    return best
+
+
+def lowest_of_lines(slopes: Array, offsets: Array) -> Array:
+    """Return t in [0, 1] where the greatest of K affine functions a_k t + b_k, shape (K, M), is least, shape (M,).
+
+    The minimum of max_k (a_k t + b_k) lies where a falling and a rising function cross. Each step replaces one of the
+    two by the greatest function at their crossing, so it ends after at most K steps, usually after three.
+    """
+    xp = namespace_of(slopes)
+    each = xp.arange(slopes.shape[1])
+    rounding = 8.0 * float(xp.finfo(slopes.dtype).eps)
+
+    def highest(t: Array) -> tuple[Array, Array, Array]:
+        values = slopes * t + offsets
+        line = xp.argmax(values, axis=0)
+        return slopes[line, each], offsets[line, each], values[line, each]
+
+    falling, rising = highest(xp.zeros_like(slopes[0])), highest(xp.ones_like(slopes[0]))
+    inside = (falling[0] < 0.0) & (rising[0] > 0.0)
+    t = xp.where(falling[0] >= 0.0, xp.zeros_like(slopes[0]), xp.ones_like(slopes[0]))
+    for _ in range(len(slopes)):
+        steeper = xp.where(inside, rising[0] - falling[0], xp.ones_like(t))
+        t = xp.where(inside, (falling[1] - rising[1]) / steeper, t)
+        slope, offset, value = highest(t)
+        crossing = falling[0] * t + falling[1]
+        if not (inside & (value > crossing + rounding * (1.0 + xp.abs(crossing)))).any():
+            break
+        down = slope < 0.0
+        falling = xp.where(down, slope, falling[0]), xp.where(down, offset, falling[1]), value
+        rising = xp.where(down, rising[0], slope), xp.where(down, rising[1], offset), value
+    return xp.clip(t, 0.0, 1.0)
+
+
+def nearest_to_origin(start: Sequence[Array], along: Sequence[Array]) -> Array:
+    """Return t in [0, 1] for which start + t * along is nearest to the origin."""
+    square = namespace_of(along[0]).maximum(dot(along, along), TINY)
+    return clamp(-dot(start, along) / square, 0.0, 1.0)

@@ -28,8 +28,9 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from viapoint.envs.common.arrays import TINY, clamp, dot, frame_axes, frozen, norm
+from viapoint.envs.common.arrays import dot, frame_axes, frozen, norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.segments import best_of
 from viapoint.primitives.array_api import (
     Array,
     Namespace,
@@ -162,7 +163,7 @@ class Shape(abc.ABC):
             points: Shape (..., 3), [m].
             radius: Radius of the spheres, [m].
         """
-        own, (points,) = self._matched(points)
+        own, (points,), radius = self._matched(radius, points=points)
         return own._signed(own._relative(points)) - radius
 
     def segment_distance(self, first: Array, second: Array, radius: Array = 0.0) -> Array:
@@ -173,7 +174,7 @@ class Shape(abc.ABC):
             second: The other end, [m]; it may be the same point.
             radius: Radius of the capsules, [m].
         """
-        own, (first, second) = self._matched(first, second)
+        own, (first, second), radius = self._matched(radius, first=first, second=second)
         xp = namespace_of(first)
         start, end = own._relative(first), own._relative(second)
 
@@ -181,8 +182,11 @@ class Shape(abc.ABC):
             return own._signed([a + share * (b - a) for a, b in zip(start, end, strict=True)])
 
         with nullcontext() if xp is np else xp.no_grad():
+            # At least one axis; sizes may have more of them than the ends.
             way = [(b - a)[None] for a, b in zip(start, end, strict=True)]
-            along = own._nearest([a[None] for a in start], way)[0]
+            along = own._nearest([a[None] for a in start], way)
+            axes = (len(getattr(own, name).shape) - len(last) for name, last in self.sizes.items())
+            along = along if len(along.shape) <= max(axes, default=0) else along[0]
         least = at(along)
         if not follows_gradient(least):
             return least - radius
@@ -349,14 +353,34 @@ class Shape(abc.ABC):
         """Return an error that names a shape before it exists."""
         return ValueError(f"{cls.kind}{f' {name!r}' if name else ''}: {message}")
 
-    def _matched(self, *points: Array) -> tuple[Self, list[Array]]:
+    def _matched(self, radius: Array, **points: Array) -> tuple[Self, list[Array], Array]:
+        """Return the shape, points by name, and a radius in one array library, dtype and device.
+
+        Raises:
+            ValueError: Something is not numeric or finite, the radius is negative, or shapes do not broadcast.
+        """
+        own, arrays = self._converted(points)
+        radius = checked_radius(radius, arrays[0])
+        leading = {name: tuple(array.shape[:-1]) for name, array in zip(points, arrays, strict=True)}
+        for name, last in {**self.sizes, "position": (3,), "quaternion": (4,)}.items():
+            shape = tuple(getattr(own, name).shape)
+            leading[name] = shape[: len(shape) - len(last)]
+        try:
+            broadcast_batch(
+                **leading, **({} if type(radius) is float else {"radius of the points": tuple(radius.shape)})
+            )
+        except ValueError as error:
+            raise self._error(str(error)) from None
+        return own, arrays, radius
+
+    def _converted(self, points: Mapping[str, Array]) -> tuple[Self, list[Array]]:
         """Return the shape and points in one array library, dtype and device."""
         if all(
             type(p) is np.ndarray and p.dtype == np.float64 and p.shape[-1:] == (3,)
-            for p in (*points, self.position)
+            for p in (*points.values(), self.position)
         ):
-            return self, list(points)
-        _, arrays = as_floats(**{f"points {i}": p for i, p in enumerate(points)})
+            return self, list(points.values())
+        _, arrays = as_floats(**points)
         for array in arrays:
             if tuple(array.shape[-1:]) != (3,):
                 raise self._error(f"points must have shape (..., 3), got shape {tuple(array.shape)}")
@@ -418,58 +442,25 @@ def _with_gradient(xp: Namespace, function: Any, t: Array, least: Array) -> Arra
     return xp.where(kink, least.detach() + mean - mean.detach(), least)
 
 
+def checked_radius(radius: Any, points: Array) -> Array:
+    """Return a radius, 0 or greater, as a number, or as an array like the points.
+
+    Raises:
+        ValueError: It is not numeric or finite, or is negative.
+    """
+    if type(radius) is float and 0.0 <= radius < np.inf:
+        return radius
+    xp, (array,) = as_floats(radius=radius)
+    if not (array >= 0.0).all():
+        raise ValueError(f"radius must be 0 or greater, got {radius!r:.60}")
+    if type(points) is np.ndarray:
+        return like(np, to_numpy(array), points)
+    return like(namespace_of(points), array, points) if xp is np else array.to(points)
+
+
 def length(vector: Components) -> Array:
     """Return the length of a vector, with a finite gradient at 0."""
     return namespace_of(vector[0]).sqrt(dot(vector, vector) + GUARD)
-
-
-def best_of(xp: Namespace, function: Any, candidates: Any) -> Array:
-    """Return the candidate with the least value of a function."""
-    best = None
-    for each in candidates:
-        value = function(each)
-        if best is None:
-            best, least = each, value
-        else:
-            best, least = xp.where(value < least, each, best), xp.minimum(value, least)
-    return best
-
-
-def lowest_of_lines(slopes: Array, offsets: Array) -> Array:
-    """Return t in [0, 1] where the greatest of K affine functions a_k t + b_k, shape (K, M), is least, shape (M,).
-
-    The minimum of max_k (a_k t + b_k) lies where a falling and a rising function cross. Each step replaces one of the
-    two by the greatest function at their crossing, so it ends after at most K steps, usually after three.
-    """
-    xp = namespace_of(slopes)
-    each = xp.arange(slopes.shape[1])
-    rounding = 8.0 * float(xp.finfo(slopes.dtype).eps)
-
-    def highest(t: Array) -> tuple[Array, Array, Array]:
-        values = slopes * t + offsets
-        line = xp.argmax(values, axis=0)
-        return slopes[line, each], offsets[line, each], values[line, each]
-
-    falling, rising = highest(xp.zeros_like(slopes[0])), highest(xp.ones_like(slopes[0]))
-    inside = (falling[0] < 0.0) & (rising[0] > 0.0)
-    t = xp.where(falling[0] >= 0.0, xp.zeros_like(slopes[0]), xp.ones_like(slopes[0]))
-    for _ in range(len(slopes)):
-        steeper = xp.where(inside, rising[0] - falling[0], xp.ones_like(t))
-        t = xp.where(inside, (falling[1] - rising[1]) / steeper, t)
-        slope, offset, value = highest(t)
-        crossing = falling[0] * t + falling[1]
-        if not (inside & (value > crossing + rounding * (1.0 + xp.abs(crossing)))).any():
-            break
-        down = slope < 0.0
-        falling = xp.where(down, slope, falling[0]), xp.where(down, offset, falling[1]), value
-        rising = xp.where(down, rising[0], slope), xp.where(down, rising[1], offset), value
-    return xp.clip(t, 0.0, 1.0)
-
-
-def nearest_to_origin(start: Components, along: Components) -> Array:
-    """Return t in [0, 1] for which start + t * along is nearest to the origin."""
-    square = namespace_of(along[0]).maximum(dot(along, along), TINY)
-    return clamp(-dot(start, along) / square, 0.0, 1.0)
 
 
 def blocks(number: int, width: int) -> Iterator[slice]:

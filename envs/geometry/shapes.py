@@ -7,6 +7,7 @@ import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
+from numbers import Real
 from typing import Any
 
 import mujoco
@@ -19,7 +20,7 @@ from viapoint.envs.geometry.cylinder import Cylinder
 from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape
+from viapoint.envs.geometry.shape import Shape, checked_radius
 from viapoint.primitives.array_api import Array, as_floats, like, namespace_of, to_numpy
 
 SHAPES: dict[str, type[Shape]] = {
@@ -101,7 +102,8 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
             raise ValueError(f"the key 'shape' is missing. {known}")
         raise ValueError(f"unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
     allowed = shape.parameters()
-    named = f"{kind} {values['name']!r}" if values.get("name") else str(kind)
+    name = values.get("name")
+    named = f"{kind} {name!r}" if isinstance(name, str) and name else str(kind)
     for name in values:
         if name not in allowed:
             known = f"Parameters are {', '.join(allowed)}"
@@ -160,7 +162,7 @@ def obstacles_from_json(text: str) -> list[Shape]:
     """
     try:
         values = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"obstacles must be JSON ({error})") from None
     if not isinstance(values, list):
         raise ValueError(f"obstacles must be a JSON list of dictionaries, got {type(values).__name__}")
@@ -193,15 +195,27 @@ def signed_distances(
         >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
         [0.02, 0.12]
     """
-    refuse_single(obstacles)
-    first = first if hasattr(first, "dtype") else np.asarray(first, dtype=np.float64)
+    obstacles = as_obstacles(obstacles)
+    ends = _like_tensors(
+        obstacles, **({"first": first} if second is None else {"first": first, "second": second})
+    )
+    xp = namespace_of(ends[0])
     if not obstacles:
-        return namespace_of(first).zeros_like(first[..., :0])
+        return xp.zeros_like(ends[0][..., :0])
     each = [
-        o.distance(first, radius) if second is None else o.segment_distance(first, second, radius)
-        for o in as_obstacles(obstacles)
+        o.distance(*ends, radius) if second is None else o.segment_distance(*ends, radius) for o in obstacles
     ]
-    return namespace_of(each[0]).stack(each, -1)
+    shape = np.broadcast_shapes(*(tuple(one.shape) for one in each))
+    return xp.stack([xp.broadcast_to(one, shape) for one in each], -1)
+
+
+def _like_tensors(obstacles: Sequence[Shape], **points: Array) -> list[Array]:
+    """Return points in one array library: that of torch tensors among them or among the obstacles, else NumPy."""
+    xp, arrays = as_floats(**points)
+    tensors = [each for o in obstacles if hasattr(each := o.position, "requires_grad")]
+    if xp is np and tensors:
+        arrays = [like(namespace_of(tensors[0]), each, tensors[0]) for each in arrays]
+    return arrays
 
 
 def nearest_distance(
@@ -230,15 +244,17 @@ def nearest_distance(
         np.float64(0.2)
     """
     obstacles = as_obstacles(obstacles)
-    given = (first, second, radius, *(o.position for o in obstacles))
-    if tensors := [each for each in given if hasattr(each, "requires_grad")]:
-        xp = namespace_of(tensors[0])
-        if first is not tensors[0]:
-            first = like(xp, np.asarray(first, dtype=np.float64), tensors[0])
-        each = signed_distances(obstacles, first, second, radius)
-        nearest = xp.full(each.shape[:-1], most, dtype=each.dtype, device=each.device)
+    if isinstance(most, bool) or not isinstance(most, Real) or most != most:
+        raise ValueError(f"most must be a number, got {most!r:.60}")
+    ends = _like_tensors(
+        obstacles, **({"first": first} if second is None else {"first": first, "second": second})
+    )
+    xp = namespace_of(ends[0])
+    radius = checked_radius(radius, ends[0])
+    if xp is not np:
+        each = signed_distances(obstacles, ends[0], *ends[1:] or (None,), radius)
+        nearest = xp.full(each.shape[:-1], float(most), dtype=each.dtype, device=each.device)
         return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
-    _, ends = as_floats(**{f"points {i}": end for i, end in enumerate((first, second)) if end is not None})
     ends = [end.astype(np.float64, copy=False) for end in ends]
     for end in ends:
         if end.shape[-1:] != (3,):
@@ -251,7 +267,7 @@ def nearest_distance(
     middle = flat[0] if second is None else 0.5 * (flat[0] + flat[1])
     reach = size + (0.0 if second is None else _length(flat[1] - middle))
     least = np.full(len(middle), float(most))
-    if not obstacles:
+    if not obstacles or not len(middle):
         return least.reshape(shape)
     spheres = [(to_numpy(c), float(to_numpy(r))) for c, r in (o.bounding_sphere for o in obstacles)]
     bounds = np.stack([_length(middle - centre) - wide - reach for centre, wide in spheres])

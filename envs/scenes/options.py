@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.base import Arm
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.rows import (
     CAPSULES,
@@ -21,6 +22,7 @@ from viapoint.envs.geometry.rows import (
     shape_number,
     widened,
 )
+from viapoint.envs.geometry.shape import UNIT_TOLERANCE
 from viapoint.envs.geometry.shapes import MESH_HINT, SHAPES, as_obstacle, as_obstacles, refuse_single
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
@@ -117,6 +119,8 @@ def given_scenes(
     options = _with_rows(options, arm.dimension, shapes)
     fields = sampled._asdict()
     given = {name: _parse(name, options[name], fields[name].shape) for name in options}
+    if "obstacles" in given and has_shapes(given["obstacles"]):
+        given["obstacles"] = _with_unit_quaternions(given["obstacles"])
     return Scenes(**{**{name: field.copy() for name, field in fields.items()}, **given})
 
 
@@ -133,6 +137,19 @@ def _with_rows(options: Mapping[str, Any], dimension: int, shapes: Sequence[str]
     return {**options, "obstacles": rows}
 
 
+def _with_unit_quaternions(rows: Float) -> Float:
+    """Return rows with shapes whose quaternions have length 1, if they nearly had."""
+    begin = 2 * dimension_of(rows) + 1
+    quaternion = rows[..., begin : begin + 4]
+    size = norm(quaternion)[..., None]
+    error = np.abs(size - 1.0)
+    # As in records, what has been normalised stays as it is.
+    inexact = (error > 8.0 * np.finfo(np.float64).eps) & (error <= UNIT_TOLERANCE)
+    again = rows.copy()
+    again[..., begin : begin + 4] = np.where(inexact, quaternion / np.where(inexact, size, 1.0), quaternion)
+    return again
+
+
 def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
     """Return the options of `reset` that set up one scene as JSON, with all digits and the names of obstacles.
 
@@ -141,7 +158,7 @@ def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
         env_id: Environment of the scene, for readers of the file.
 
     Raises:
-        ValueError: An option is unknown, or does not hold what `reset` takes for one scene.
+        ValueError: An option is unknown, or does not hold real numbers, or obstacles, of one scene.
 
     Example:
         >>> from viapoint.envs import Sphere, scene_from_json, scene_to_json
@@ -150,11 +167,15 @@ def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
         >>> scene_from_json(text)["obstacles"] == [ball]
         True
     """
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options must be those of reset, a dictionary, got {options!r:.60}")
     refuse_unknown_options(options, (*GIVEN, *CHANGES))
     record: dict[str, Any] = {"format": FORMAT, **({"env": env_id} if env_id else {})}
     for name, value in options.items():
         if name == "obstacles":
             refuse_single(value)
+            one = isinstance(value, list | tuple) and len(value) == 1 and is_shape_list(value[0])
+            value = value[0] if one else value
         if name == "obstacles" and is_shape_list(value):
             record[name] = [each.to_dict() for each in as_obstacles(value)]
         else:
@@ -217,7 +238,7 @@ def _rows_of_file(rows: Sequence[Any], shapes: Any) -> list[list[float]]:
         )
     column = array[:, 2 * dimension_of(array)]
     for i, number in enumerate(column):
-        name = shapes[int(number)] if 0.0 <= number < len(shapes) else number
+        name = shapes[int(number)] if 0.0 <= number < len(shapes) and number == int(number) else number
         if not isinstance(name, str) or name not in SHAPES:
             raise ValueError(
                 f"obstacle {i} of the scene file: unknown shape {name!r}. Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
@@ -305,7 +326,7 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
     """Return an option as an array of a shape: (N, D), or (N, n, .) with rows of zeros behind the given ones."""
     array = _numbers(name, value)
     result, size = np.zeros(shape), shape[-1]
-    if len(shape) == 3 and array.size == 0:
+    if len(shape) == 3 and array.size == 0 and (array.ndim != 2 or array.shape[1] or len(array) == shape[0]):
         array = array.reshape((0, size))
     rows = len(shape) == 3 and array.ndim in (2, 3) and array.shape[-1] == size
     if rows and array.shape[-2] > shape[1]:
@@ -315,7 +336,7 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
             hint = f"; an environment may have at most {MOST_OBSTACLES}, and PointCloud.covering makes fewer spheres"
         raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {number}{hint}")
     try:
-        if len(shape) == 2:
+        if len(shape) == 2 and array.shape in (shape, shape[1:], (1, size)):
             result[:] = array
         elif rows:
             result[:, : array.shape[-2]] = array
@@ -348,7 +369,7 @@ def _numbers(name: str, value: Any) -> Float:
     """
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
+        if array.dtype.kind not in "fiu":
             raise TypeError
         return array.astype(np.float64)
     except (TypeError, ValueError):

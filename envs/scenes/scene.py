@@ -200,7 +200,11 @@ def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
         place = centre[some][:, : scenes.start.shape[-1]]
         name = known[int(number)]
         again[some] = shape_rows(name, place, quaternion[some], half[some])
-        if (only := SHAPES[name].only_half) is not None:
+        shape, (x, y, z) = SHAPES[name], np.moveaxis(half[some], -1, 0)
+        strange[some] |= (half[some] <= 0.0).any(axis=-1) | (shape.round & (np.abs(x - y) > 1e-6))
+        if name in ("sphere", "capsule"):
+            strange[some] |= (z < x - 1e-6) | ((name == "sphere") & (z > x + 1e-6))
+        if (only := shape.only_half) is not None:
             strange[some] |= (np.abs(half[some] - only) > 1e-6).any(axis=-1)
     strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
     yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"

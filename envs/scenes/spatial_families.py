@@ -14,7 +14,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.draws import Site, Uniforms, between, box_rows, left, rotate
+from viapoint.envs.scenes.draws import Site, Uniforms, between, box_rows, left, rotate, unit
 
 BUILDER_NUMBERS = 6
 """Uniform numbers that make one structure or one obstacle."""
@@ -24,6 +24,10 @@ TABLE = (0.12, 0.25)
 """Half lengths of the sides of tables, [m]."""
 THING_WIDTH, THING_HEIGHT = (0.015, 0.04), (0.02, 0.07)
 """Half widths and half heights of things on a table, [m]."""
+DESK, STICK_OUT = (0.06, 0.12), 0.04
+"""Half depth of desks away from the hand, and the most by which things under them stick out, [m]."""
+UNDER, APART = (0.5, 1.0), (0.35, 0.8)
+"""Height of things under a desk, relative to the room there; distance of things from its middle, in half widths."""
 BIN, RIM = (0.13, 0.20), (0.02, 0.10)
 """Half width of bins and cages inside, and height of the rims of bins above the hand, [m]; a gripper fits in."""
 DEEP = (0.10, 0.18)
@@ -187,6 +191,35 @@ def table(uniforms: Uniforms, site: SpatialSite) -> Structures:
         wide = between(THING_WIDTH, v[..., 3:5])
         parts.append(_Box(_at_height(place, surface + half), heading, (wide[..., 0], wide[..., 1], half)))
     return _structures(parts, [DOWN] * 4)
+
+
+def desk(uniforms: Uniforms, site: SpatialSite) -> Structures:
+    """Return a table beside start or goal, higher than the hand, with two boxes on it and two that stick out under it.
+
+    The table stands between start and goal; the movement passes above it.
+    """
+    u = uniforms.take(BUILDER_NUMBERS)
+    end, line = _end(u, site), (site.goal - site.start)[:, None]
+    towards = np.where(u[..., 5:] < 0.5, line, -line)
+    towards[..., 2] = 0.0
+    out = rotate(unit(towards), 0.8 * (u[..., 0] - 0.5))
+    surface, gap = end[..., 2] + between(ABOVE, u[..., 1]), between(BIN, u[..., 2])
+    deep, wide = between(DESK, u[..., 3]), between(TABLE, u[..., 4])
+    middle = end + (gap + deep)[..., None] * out
+    parts = [_Box(_at_height(middle, surface - THICKNESS), out, (deep, wide, THICKNESS))]
+    for thing in range(4):
+        v = _more(u, thing)
+        size = between(THING_WIDTH, v[..., 3:5])
+        along = ((-1) ** thing * wide * between(APART, v[..., 1]))[..., None] * left(out)
+        if thing < 2:
+            half = between(THING_HEIGHT, v[..., 2])
+            place = middle + (0.8 * deep * (2.0 * v[..., 0] - 1.0))[..., None] * out + along
+            parts.append(_Box(_at_height(place, surface + half), out, (size[..., 0], size[..., 1], half)))
+        else:
+            half = 0.5 * between(UNDER, v[..., 2]) * (surface - 2.0 * THICKNESS)
+            place = end + (gap - STICK_OUT * v[..., 0] + size[..., 0])[..., None] * out + along
+            parts.append(_Box(_at_height(place, half), out, (size[..., 0], size[..., 1], half)))
+    return _structures(parts, [out] * 5)
 
 
 def bin_(uniforms: Uniforms, site: SpatialSite) -> Structures:

@@ -15,7 +15,14 @@ from viapoint.envs.common.arrays import in_space, norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.convex_mesh import NamedMesh
 from viapoint.envs.geometry.narrow_phase import LinkPositions
-from viapoint.envs.geometry.rows import CAPSULES, ShapeColumns, dimension_of, rotation_axes, shape_columns
+from viapoint.envs.geometry.rows import (
+    CAPSULES,
+    ShapeColumns,
+    dimension_of,
+    has_shapes,
+    rotation_axes,
+    shape_columns,
+)
 from viapoint.envs.geometry.shapes import SHAPES
 
 OUT_OF_THE_WAY, UPRIGHT = np.array([0.0, 0.0, -10.0]), np.array([1.0, 0.0, 0.0, 0.0])
@@ -123,7 +130,16 @@ class Simulator:
         """Place the arms of n simulations at rest with joint angles (n, J), [rad], and obstacles.
 
         Obstacles are rows of either kind, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
+
+        Raises:
+            ValueError: The rows name shapes, but the simulator was made for capsules, or the other way round.
         """
+        named = self._types is not None
+        if self._geoms and has_shapes(obstacles) is not named:
+            raise ValueError(
+                f"obstacles must be rows {'that name shapes' if named else 'of capsules'}, got {obstacles.shape[-1]} "
+                "numbers each"
+            )
         self.batch.state[sims] = self._rest_state
         self.batch.bind("qpos")[sims] = joints
         if not self._geoms:

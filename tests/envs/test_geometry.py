@@ -226,7 +226,7 @@ def test_gradients_in_single_precision_are_those_in_double(kind, generator, segm
 
 def test_points_that_are_no_numbers_are_refused():
     for ends in (([np.nan, 0.0, 0.0],), ([0.0, 0.0, 0.0], [0.0, np.inf, 0.0])):
-        with pytest.raises(ValueError, match=rf"points {len(ends) - 1} must be finite"):
+        with pytest.raises(ValueError, match=rf"{('first', 'second')[len(ends) - 1]} must be finite"):
             nearest_distance([Sphere(0.1)], *ends)
 
 
@@ -682,3 +682,110 @@ def test_obstacles_that_environments_lack_are_refused_with_their_index(obstacle,
     with pytest.raises(ValueError, match=re.escape(reason)):
         env.reset(seed=0, options={**ENDS, "obstacles": [BARS[0], obstacle]})
     env.close()
+
+
+@pytest.mark.parametrize("library", [np.asarray, torch.asarray])
+@pytest.mark.parametrize("kind", CLOSED)
+def test_sizes_pose_and_points_may_each_have_axes_of_a_batch(kind, library, generator):
+    """The distance of each item is that of the single shape from the single segment."""
+    for _ in range(40):
+        axes = [
+            tuple(3 if generator.random() < 0.5 else 1 for _ in range(2))[generator.integers(3) :]
+            for _ in range(4)
+        ]
+        sizes, poses, *points = axes
+        size = {
+            name: generator.uniform(0.02, 0.6, (*sizes, *last)) for name, last in SHAPES[kind].sizes.items()
+        }
+        position = generator.normal(size=(*poses, 3)) * 0.3
+        first, second = (generator.normal(size=(*each, 3)) for each in points)
+        found = SHAPES[kind](**size, position=position).segment_distance(library(first), library(second))
+        shape = np.broadcast_shapes(*axes)
+        assert found.shape == shape
+        for i in np.ndindex(shape):
+            one = {
+                name: np.broadcast_to(size[name], (*shape, *last))[i]
+                for name, last in SHAPES[kind].sizes.items()
+            }
+            alone = SHAPES[kind](**one, position=np.broadcast_to(position, (*shape, 3))[i])
+            ends = (np.broadcast_to(each, (*shape, 3))[i] for each in (first, second))
+            assert found[i].item() == pytest.approx(alone.segment_distance(*ends).item(), abs=1e-9)
+
+
+def test_cylinders_are_as_near_to_parallel_and_tangent_segments_as_to_their_nearest_points(generator):
+    number, share = 20_000, np.linspace(0.0, 1.0, 401)
+    radius, half = generator.uniform(0.02, 0.5, (2, number)).round(2)
+    turn = generator.uniform(-np.pi, np.pi, number)
+    outward = np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), axis=-1)
+    tangent = np.stack((-np.sin(turn), np.cos(turn), 0.0 * turn), axis=-1)
+    beside = outward * (radius * generator.choice([0.5, 1.0, 1.0 + 1e-9, 1.1], number))[:, None]
+    along = np.where(generator.random((number, 1)) < 0.5, (0.0, 0.0, 1.0), tangent)
+    along += 1e-3 * generator.normal(size=(number, 1)) * outward * (generator.random((number, 1)) < 0.3)
+    level = np.where(generator.random(number) < 0.5, half, 0.3 * half)[:, None] * (0.0, 0.0, 1.0)
+    before, behind = generator.uniform(-2.0, 2.0, (2, number, 1)).round(1)
+    first, second = (beside + level + each * along for each in (before, behind))
+    quaternion = generator.normal(size=(number, 4)).round(1)
+    quaternion[:, 0] += 1e-3
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    cylinder = Cylinder(radius, half, quaternion=quaternion)
+    axes = cylinder.rotation
+    first, second = ((axes @ each[..., None])[..., 0] for each in (first, second))
+    found = cylinder.segment_distance(first, second)
+    sampled = np.full(number, np.inf)
+    for t in share:
+        sampled = np.minimum(sampled, cylinder.distance(first + t * (second - first)))
+    assert (found - sampled).max() < 1e-9
+    np.testing.assert_allclose(cylinder.segment_distance(second, first), found, atol=1e-9)
+
+
+@pytest.mark.parametrize("radius", [np.nan, -0.1, True, "a", None, 1j, [0.1, np.inf]])
+def test_a_radius_of_points_is_0_or_greater(radius):
+    ball, point = Sphere(0.1), np.ones((2, 3))
+    calls = (
+        lambda: ball.distance(point, radius),
+        lambda: ball.segment_distance(point, point, radius),
+        lambda: Capsule(0.1, 0.1).segment_distance(point, point, radius),
+        lambda: signed_distances([ball], point, radius=radius),
+        lambda: nearest_distance([ball], point, radius=radius),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="radius"):
+            call()
+
+
+def test_what_does_not_fit_together_is_named():
+    with pytest.raises(ValueError, match="most must be a number, got nan"):
+        nearest_distance([Sphere(0.1)], np.ones(3), most=np.nan)
+    with pytest.raises(
+        ValueError, match=r"cylinder: leading dimensions do not broadcast: first \(4,\), second \(5,\)"
+    ):
+        Cylinder(0.1, 0.2).segment_distance(np.ones((4, 3)), np.ones((5, 3)))
+    with pytest.raises(ValueError, match=r"radius of the points \(3,\)"):
+        Box((0.1, 0.1, 0.1)).distance(np.ones((2, 3)), np.ones(3))
+    with pytest.raises(ValueError, match="first must be an array of real numbers, got None"):
+        nearest_distance([Sphere(0.1)], None)
+    with pytest.raises(ValueError, match="obstacles must be JSON"):
+        obstacles_from_json("[" * 100_000)
+    with pytest.raises(ValueError, match="got -1"):
+        ConvexMesh(CUBE, faces=[[0, 1, -1]])
+    with pytest.raises(ValueError, match="faces must be triangles"):
+        ConvexMesh(CUBE, faces=[[0, 1, 2], [0, 1]])
+    with pytest.raises(ValueError, match=r"radius must be 0 or greater, got -0\.1"):
+        PointCloud.covering(CUBE, spacing=0.2, radius=-0.1)
+    with pytest.raises(ValueError, match="n_rows must be a whole number"):
+        observation_rows([], 1.5)
+
+
+def test_lists_may_mix_libraries_and_batches():
+    points = np.ones((2, 3))
+    tensor, array = Sphere(0.1, position=torch.zeros(3, requires_grad=True)), Sphere(0.1)
+    for both in ([tensor, array], [array, tensor]):
+        found = signed_distances(both, points)
+        np.testing.assert_allclose(found.detach().numpy(), 3.0**0.5 - 0.1, rtol=1e-6)
+    batch = Sphere(np.array([0.1, 0.2]))
+    assert signed_distances([batch, array], points[0]).shape == (2, 2)
+    assert nearest_distance([array], np.zeros((0, 3))).shape == (0,)
+    rows = obstacle_rows(
+        [Sphere(torch.tensor(0.03, requires_grad=True), position=(0.5, 0.0, 0.1))], dimension=3
+    )
+    assert rows[0, -1] == pytest.approx(0.03)

@@ -12,13 +12,17 @@ from viapoint.envs import (
     ConvexMesh,
     Cylinder,
     HalfSpace,
+    PointCloud,
+    Sphere,
     observation_rows,
+    obstacle_rows,
     obstacles_from_rows,
     obstacles_to_json,
     scene_from_json,
     scene_to_json,
 )
 from viapoint.envs.geometry import shapes as geometry_shapes
+from viapoint.envs.geometry.rows import shape_rows
 
 PANDA = "viapoint/PandaObstacles-v0"
 SHAPES = ("capsule", "box", "half_space")
@@ -31,6 +35,13 @@ LISTS = "obstacles must be a list of shapes, dictionaries or rows of numbers"
 @pytest.fixture(scope="module")
 def env():
     made = gym.make(PANDA, shapes=SHAPES).unwrapped
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def several():
+    made = gym.make_vec(PANDA, num_envs=3, threads=1, shapes=SHAPES).unwrapped
     yield made
     made.close()
 
@@ -94,6 +105,7 @@ def test_half_spaces_up_to_the_limit_are_in_the_observation_space(env, normal):
         (np.array([CRATE]), f"{LISTS}, got array"),
         ((each for each in [CRATE]), f"{LISTS}, got <generator"),
         ([[0.1, 0.2], [0.3]], f"{LISTS}, got [["),
+        (np.zeros((1, 7), dtype=bool), f"{LISTS}, got array"),
     ],
 )
 def test_what_is_no_list_of_obstacles_is_refused_with_what_is(env, obstacles, reason):
@@ -170,11 +182,78 @@ def test_changes_of_a_scene_survive_json():
         ({"goal": np.zeros((2, 3))}, "options['goal'] must be those of one scene, got 2 scenes"),
         ({"start": "here"}, "options['start'] must be real numbers"),
         ({"start": (np.nan, 0.0, 0.1)}, "options['start'] must be finite, got nan"),
+        ({"start": (True, False, True)}, "options['start'] must be real numbers"),
+        ([], "options must be those of reset, a dictionary, got []"),
     ],
 )
 def test_what_is_no_scene_is_not_written(options, reason):
     with pytest.raises(ValueError, match=re.escape(reason)):
         scene_to_json(options)
+
+
+def test_a_batch_of_one_scene_is_written_as_that_scene():
+    assert scene_to_json({"obstacles": [[HOUSE]]}) == scene_to_json({"obstacles": [HOUSE]})
+
+
+@pytest.mark.parametrize("start", [0.45, [0.45], [[0.45]] * 3, [[[0.45, -0.33, 0.4]]], [0.45, -0.33]])
+def test_ends_have_one_number_for_each_axis(several, start):
+    with pytest.raises(ValueError, match=re.escape("options['start'] must have shape (3, 3) or (3,), got")):
+        several.reset(seed=0, options={**ENDS, "start": start})
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "reason"),
+    [
+        ([[CRATE], None, []], f"scene 1: {LISTS}, got None"),
+        ([[CRATE], 3, []], f"scene 1: {LISTS}, got 3"),
+        ([[CRATE], [[0.0] * 5], []], "scene 1: rows of obstacles must have 15 numbers, got shape (1, 5)"),
+        ([[], []], "options['obstacles'] must have shape (n, 15) or (3, n, 15)"),
+    ],
+)
+def test_obstacles_of_each_scene_are_lists(several, obstacles, reason):
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        several.reset(seed=0, options={**ENDS, "obstacles": obstacles})
+
+
+def test_scenes_may_have_lists_and_rows_of_different_lengths(several):
+    cloud = PointCloud([(0.2, 0.5, 0.4), (0.2, 0.6, 0.4)], radius=0.02)
+    capsule = obstacle_rows([Sphere(0.03, position=(0.2, 0.6, 0.4))], dimension=3)
+    several.reset(seed=0, options={**ENDS, "obstacles": [[CRATE, cloud], capsule, []]})
+    assert several.scenes.present.sum(axis=1).tolist() == [3, 1, 0]
+
+
+def box_row(half=(0.03, 0.04, 0.05), kind="box", quaternion=(1.0, 0.0, 0.0, 0.0)):
+    return shape_rows(kind, np.array([0.2, 0.6, 0.4]), np.array(quaternion), np.array(half))[None]
+
+
+@pytest.mark.parametrize(
+    ("kind", "half"),
+    [
+        ("box", (-0.3, 0.05, 0.05)),
+        ("box", (0.0, 0.05, 0.05)),
+        ("cylinder", (0.05, 0.06, 0.1)),
+        ("cylinder", (0.05, 0.05, -0.1)),
+        ("capsule", (0.05, 0.05, 0.02)),
+        ("sphere", (0.05, 0.05, 0.1)),
+    ],
+)
+def test_rows_of_shapes_have_possible_half_lengths(kind, half):
+    env = gym.make(PANDA, shapes=("capsule", "sphere", "box", "cylinder")).unwrapped
+    reset(env, box_row(half, kind), "is no row of a shape", ENDS)
+    env.close()
+
+
+def test_quaternions_of_rows_are_normalised_if_they_nearly_are(env):
+    env.reset(seed=0, options={**ENDS, "obstacles": box_row(quaternion=(1.0009, 0.0, 0.0, 0.0))})
+    begin = 2 * 3 + 1
+    assert env.batch.scenes.obstacles[0, 0, begin : begin + 4].tolist() == [1.0, 0.0, 0.0, 0.0]
+    reset(env, box_row(quaternion=(1.01, 0.0, 0.0, 0.0)), "is no row of a shape", ENDS)
+
+
+@pytest.mark.parametrize("rows", [np.ones(7), np.ones((2, 2, 7)), np.ones((1, 6)), "rows"])
+def test_obstacles_are_read_from_a_table_of_rows(rows):
+    with pytest.raises(ValueError, match=r"rows must have shape \(n, .\)"):
+        obstacles_from_rows(rows)
 
 
 def test_misspelled_parts_of_a_scene_file_are_refused():

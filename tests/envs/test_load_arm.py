@@ -425,3 +425,27 @@ def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):
     env.close()
     with pytest.raises(ValueError, match="another arm is registered as"):
         register_arm(ur5e(velocity_limit=1.0))
+
+
+def test_a_urdf_file_is_read_as_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ["base", "upper", "lower", "wrist_1", "wrist_2", "wrist_3", "tool"]
+    axes = ["0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1", "0 1 0"]
+    heights = [0.0, 0.1, 0.4, 0.35, 0.1, 0.1]
+    inertia = '<inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>'
+    tube = '<origin xyz="0 0 .1"/><geometry><cylinder radius=".03" length=".2"/></geometry>'
+    links = [f'<link name="{name}">{inertia}<collision>{tube}</collision></link>' for name in names]
+    joints = [
+        f'<joint name="joint_{i}" type="revolute"><parent link="{names[i]}"/><child link="{names[i + 1]}"/>'
+        f'<origin xyz="0 0 {heights[i]}"/><axis xyz="{axes[i]}"/>'
+        '<limit lower="-3" upper="3" velocity="3" effort="80"/></joint>'
+        for i in range(6)
+    ]
+    Path("my_arm.urdf").write_text(f'<robot name="r">{"".join(links + joints)}</robot>')
+    page = (DOCS / "bring-your-arm.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
+    exec(snippet, {})
+    order, home = [f"joint_{i}" for i in range(6)], (0.0, 0.3, 1.2, 1.6416, 0.0, 0.0)
+    arm = load_arm("my_arm.xml", hand_site="hand", joints=order, home=home)
+    assert arm.joint_names == tuple(order)
+    np.testing.assert_allclose(arm.torque_limit, 80.0)

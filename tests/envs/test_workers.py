@@ -134,6 +134,12 @@ def test_given_scenes_and_their_errors_are_those_of_one_process(env_id):
     options = alone.scenes.as_options()
     several.reset(seed=2)
     assert_same(several.reset(seed=3, options=options), alone.reset(seed=3, options=options))
+    near = Sphere(0.001, position=(0.0, 1.0, 0.0), name="ball")
+    for obstacles in ([near], [[near]], [[near] if i == 4 else [] for i in range(N)]):
+        given = {**options, "obstacles": obstacles}
+        given.pop("courses", None)
+        assert_same(several.reset(seed=3, options=given), alone.reset(seed=3, options=given))
+    assert_same(several.reset(seed=3, options=options), alone.reset(seed=3, options=options))
     before = several.observe()
     far = options["goal"].copy()
     far[4] = 9.0

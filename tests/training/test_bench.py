@@ -2,8 +2,11 @@
 
 import json
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
+from viapoint.envs.sim.simulator import Simulator
 from viapoint.training.cli import bench
 from viapoint.training.config.configs import BenchConfig
 
@@ -14,6 +17,28 @@ def test_measurements_take_turns():
     assert calls == ["a", "b"] * 3
     assert len(times) == 2
     assert all(time >= 0.0 for time in times)
+
+
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"])
+def test_the_engine_alone_simulates_the_obstacles_of_the_environments(env_id, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        bench, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[0]
+    )
+    envs = gym.make_vec(env_id, num_envs=6, threads=1).unwrapped
+    envs.reset(seed=0)
+    actions = 0.3 * np.ones((6, *envs.single_action_space.shape), np.float32)
+    scenes, steps = envs.scenes, 400
+    bench._engine(envs.task, scenes, actions, steps, threads=1)
+    sims = np.arange(6)
+    joints = np.asarray(envs.arm.inverse_kinematics(scenes.start))
+    envs._simulator.place(sims, joints, scenes.obstacles, scenes.present)
+    controls = np.zeros((6, steps, made[0].model.nu))
+    alone, there = (each.rollout(sims, controls) for each in (made[0], envs._simulator))
+    np.testing.assert_array_equal(alone.joints, there.joints)
+    np.testing.assert_array_equal(alone.contact, there.contact)
+    assert there.contact.any()
+    envs.close()
 
 
 def test_every_ratio_is_of_its_two_sides(tmp_path, monkeypatch, capsys):

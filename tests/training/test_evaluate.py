@@ -5,10 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
-from viapoint.training.planners.baselines import StoredSolutions, make_method
-from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import BANDS
+from viapoint.training.evaluation.evaluator import (
+    SLOW_DECISION,
+    MethodResult,
+    evaluate_methods,
+    single_decision_times,
+)
+from viapoint.training.planners.baselines import RandomVias, StoredSolutions, make_method
+from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation
+from viapoint.training.scene_sets.scene_set import BANDS, load
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -181,6 +186,30 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
     assert results[0].decision_times == pytest.approx(np.full(39, 0.001))
     assert results[1].decision_times == pytest.approx([slow.cost])
     assert [len(goals) for goals in quick.goals] == [40, *[1] * 40]
+
+
+def test_every_decision_of_an_episode_is_timed_where_plans_are_revised():
+    env_id = "viapoint/PlanarMovingObstacles-v0"
+    scenes = load("test", env_id).scenes.take(slice(0, 4))
+    simulation = new_simulation(env_id, 4, threads=1)
+    method = make_method("straight", env_id, threads=1)
+    times = list(single_decision_times(method, scenes, simulation, 100, 60.0))
+    played = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
+    simulation.close()
+    assert len(times) == played.info["decisions"].sum() > len(scenes.start)
+
+
+def test_the_best_of_random_actions_in_one_scene_is_found_without_further_simulations(small_scenes):
+    one = small_scenes.scenes.take([0])
+    simulation = SceneSimulation(ENV, 64, threads=1)
+    alone, among = (RandomVias(simulation, 16) for _ in range(2))
+    chosen = alone.decide({}, one)
+    steps = [env.physics_steps for env in alone._for_one_scene._envs.values()]
+    assert [env.num_envs for env in alone._for_one_scene._envs.values()] == [16]
+    assert sum(steps) > 0
+    among.__dict__["_for_one_scene"] = simulation
+    np.testing.assert_array_equal(chosen, among.decide({}, one))
+    simulation.close()
 
 
 def test_comparisons_are_with_the_first(small_scenes):

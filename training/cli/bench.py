@@ -31,6 +31,8 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
 TRAJECTORIES, SAMPLES = 4096, 200
+EPISODES = 20
+"""Episodes of a single environment that are timed together."""
 MIDDLE = 0.3
 """Bound of the components of random actions, so that most movements are within reach."""
 
@@ -106,13 +108,13 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
     env.reset(seed=0)
     action = _actions(env.action_space, 1)[0]
     inner: Any = env.unwrapped
-    scenes, before = inner.batch.scenes, inner.physics_steps
+    before = inner.physics_steps
     env.step(action)
     steps = inner.physics_steps - before
 
     def episodes() -> float:
         spent = 0.0
-        for _ in range(20):
+        for _ in range(EPISODES):
             began = time.perf_counter()
             env.reset()
             ready = time.perf_counter()
@@ -120,13 +122,10 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
             spent += time.perf_counter() - (began if resets else ready)
         return spent
 
-    alone = _engine(inner.task, scenes, action[None], steps, threads=1)
-
-    def engine() -> None:
-        for _ in range(20):
-            alone()
-
-    rates = _rates(env, episodes, engine, 20 * steps, repeats)
+    # The time of a step depends on the scene, so the engine has as many scenes.
+    scenes = inner.task.sampler()([np.random.default_rng(seed) for seed in range(EPISODES)])
+    engine = _engine(inner.task, scenes, np.repeat(action[None], EPISODES, axis=0), steps, threads=1)
+    rates = _rates(env, episodes, engine, EPISODES * steps, repeats)
     env.close()
     return Ratio(f"make, one environment, {'reset and step' if resets else 'step'}", *rates)
 
@@ -155,8 +154,13 @@ def _engine(
 ) -> Callable[[], Any]:
     """Return a rollout of the engine alone with the same controls, scenes and records as in the environment."""
     number = len(actions)
-    rows = task.observation.n_rows
-    simulator = Simulator(task.collision_model, n_obstacles=rows, num_envs=number, threads=threads)
+    simulator = Simulator(
+        task.collision_model,
+        n_obstacles=task.observation.n_rows,
+        num_envs=number,
+        threads=threads,
+        shapes=task.scenes.shapes,
+    )
     joints = np.asarray(task.arm.inverse_kinematics(scenes.start))
     simulator.place(np.arange(number), joints, scenes.obstacles, scenes.present)
     movement = task.action.decode(actions.astype(np.float64), scenes.start, scenes.goal).trajectory()

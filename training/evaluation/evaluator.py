@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.types import Float, Int, Observation
 from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
@@ -386,16 +386,40 @@ def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation,
 def single_decision_times(
     method: Method, scenes: Scenes, simulation: SceneSimulation, most: int, budget: float
 ) -> Iterator[float]:
-    """Yield the wall times of up to `most` single decisions, [s]; none begins when the budget, [s], is spent."""
-    began = time.perf_counter()
-    for row in range(min(most, len(scenes.start))):
-        one = scenes.take(slice(row, row + 1))
-        observation = simulation.observe(one)
+    """Yield the wall times of single decisions, [s], until there are `most` of them or the budget, [s], is spent.
+
+    In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
+    """
+    began, stopwatch = time.perf_counter(), _Stopwatch(method)
+    replanning = isinstance(simulation, EpisodeSimulation) and not hasattr(method, "execute")
+    alone = EpisodeSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
+    with closing(alone) if alone else nullcontext():
+        for row in range(min(most, len(scenes.start))):
+            one = scenes.take(slice(row, row + 1))
+            decided = stopwatch.decide(simulation.observe(one), one)
+            if alone is not None:
+                alone.play(stopwatch, one, decided)
+            yield from stopwatch.seconds
+            most -= len(stopwatch.seconds)
+            stopwatch.seconds.clear()
+            if most <= 0 or time.perf_counter() - began > budget:
+                break
+
+
+class _Stopwatch:
+    """Method whose decisions are timed."""
+
+    def __init__(self, method: Method) -> None:
+        self.name, self._method = method.name, method
+        self.seconds: list[float] = []
+        """Wall times of the decisions, [s]."""
+
+    def decide(self, observation: Observation, scenes: Any) -> Float:
+        """Return the decision of the method."""
         before = time.perf_counter()
-        method.decide(observation, one)
-        yield time.perf_counter() - before
-        if time.perf_counter() - began > budget:
-            break
+        decided = self._method.decide(observation, scenes)
+        self.seconds.append(time.perf_counter() - before)
+        return decided
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -77,6 +78,11 @@ class RandomVias:
         self._generator = np.random.default_rng(0)
         self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
 
+    @functools.cached_property
+    def _for_one_scene(self) -> SceneSimulation:
+        """Simulation of as many actions as there are: a larger one would simulate more movements."""
+        return new_simulation(self._simulation.env_id, self._count, **self._simulation.kwargs)
+
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the best of the random actions, see :class:`Method`."""
         number, size = len(scenes.start), self._simulation.task.action.size
@@ -84,7 +90,8 @@ class RandomVias:
         if self._count == 1:
             return actions[:, 0]
         every = scenes.take(np.repeat(np.arange(number), self._count))
-        reward = self._simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
+        simulation = self._for_one_scene if number == 1 else self._simulation
+        reward = simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 

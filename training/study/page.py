@@ -137,7 +137,7 @@ def summary(
     """Return a table of the rows on a set: success by band, jerk, time, decision time and training."""
     bands = shown_bands(numbers["sets"][name])
     bands = bands if len(bands) > 1 else []  # one band is the whole set
-    head = ["method", "seeds", "success (95 %)", *bands, "collision", "jerk ratio", "jerk / planner"]
+    head = ["method", "seeds", "success (95 %)", *bands, "collision", "jerk ratio", "jerk ratio / planner"]
     head += ["movement", "decision", "training"]
     lines = [head]
     for each in chosen(numbers, ids):

@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.types import Bool, Float
-from viapoint.training.evaluation.statistics import across_seeds, mcnemar, probability_of_improvement
+from viapoint.training.evaluation.statistics import (
+    across_seeds,
+    interquartile_mean,
+    mcnemar,
+    probability_of_improvement,
+)
 from viapoint.training.io.files import read_json
 from viapoint.training.io.installed import versions
 from viapoint.training.runs.run_dir import Run
@@ -143,6 +148,7 @@ def _environment(study: Study, env: Environment, known: Numbers) -> Numbers:
         chosen = new if new is not None and (kept is None or _covers(new, kept)) else kept
         if chosen is not None:
             time = times.get(row.id, {}).get("median", (kept or {}).get("decision_time"))
+            time = time if row.entry.timed else None
             rows.append({**wanted, **chosen, "decision_time": time})
     compared = _comparisons(study.compare, rows)
     return {"id": env.id, "sets": described, "rows": rows, "compared": compared}
@@ -336,7 +342,7 @@ def numbers_of(runs: Runs, frozen: FrozenScenes) -> Numbers:
             band: interval(frozen.band == i) for i, band in enumerate(BANDS) if (frozen.band == i).any()
         },
         "by_family": {each: interval(frozen.family == each) for each in families},
-        "collision": float(np.mean(known("collision"))),
+        "collision": float(interquartile_mean(np.array(known("collision")))),
         "jerk_ratio": _median(known("jerk_ratio")),
         "time": _median(known("time")),
         "jerk": over_seeds("jerk"),
