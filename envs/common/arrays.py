@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float, Numbers
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 N = TypeVar("N", bound=Numbers)
 Record = TypeVar("Record", bound=tuple[Any, ...])
@@ -114,3 +114,15 @@ def quaternion_to(direction: Any) -> Float:
     quaternion = np.empty(4)
     mujoco.mju_quatZ2Vec(quaternion, np.asarray(direction, dtype=np.float64))
     return quaternion
+
+
+def best_of(xp: Namespace, function: Any, candidates: Any) -> Array:
+    """Return the candidate with the least value of a function."""
+    best = None
+    for each in candidates:
+        value = function(each)
+        if best is None:
+            best, least = each, value
+        else:
+            best, least = xp.where(value < least, each, best), xp.minimum(value, least)
+    return best

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, NamedTuple, Self
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import frozen, norm, spread
+from viapoint.envs.common.arrays import best_of, frozen, norm, spread
 from viapoint.envs.common.types import Float, Index
 from viapoint.envs.common.validation import as_constants
-from viapoint.envs.geometry.segments import best_of, lowest_of_lines, nearest_on_segments, nearest_to_origin
+from viapoint.envs.geometry.segments import lowest_of_lines, nearest_on_segments, nearest_to_origin
 from viapoint.envs.geometry.shape import (
     Components,
     Geom,

@@ -8,9 +8,8 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import clamp, safe_ratio, spread
+from viapoint.envs.common.arrays import best_of, clamp, safe_ratio, spread
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.segments import best_of
 from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from viapoint.envs.common.arrays import TINY, clamp, dot
-from viapoint.primitives.array_api import Array, Namespace, namespace_of
+from viapoint.primitives.array_api import Array, namespace_of
 
 
 def point_axis_squared(offset: Sequence[Array], axis: Sequence[Array]) -> Array:
@@ -53,18 +52,6 @@ def nearest_on_segments(
     on_link = clamp(xp.where(crosses, crossing, 0.0), 0.0, 1.0)
     on_axis = clamp((b * on_link + f) / e, 0.0, 1.0)
     return clamp((b * on_axis - c) / a, 0.0, 1.0), on_axis
-
-
-def best_of(xp: Namespace, function: Any, candidates: Any) -> Array:
-    """Return the candidate with the least value of a function."""
-    best = None
-    for each in candidates:
-        value = function(each)
-        if best is None:
-            best, least = each, value
-        else:
-            best, least = xp.where(value < least, each, best), xp.minimum(value, least)
-    return best
 
 
 def lowest_of_lines(slopes: Array, offsets: Array) -> Array:

@@ -28,9 +28,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from viapoint.envs.common.arrays import dot, frame_axes, frozen, norm
+from viapoint.envs.common.arrays import best_of, dot, frame_axes, frozen, norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.segments import best_of
 from viapoint.primitives.array_api import (
     Array,
     Namespace,

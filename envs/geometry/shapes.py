@@ -196,26 +196,26 @@ def signed_distances(
         [0.02, 0.12]
     """
     obstacles = as_obstacles(obstacles)
-    ends = _like_tensors(
-        obstacles, **({"first": first} if second is None else {"first": first, "second": second})
-    )
-    xp = namespace_of(ends[0])
+    start, end = _like_tensors(obstacles, first, second)
+    xp = namespace_of(start)
     if not obstacles:
-        return xp.zeros_like(ends[0][..., :0])
+        return xp.zeros_like(start[..., :0])
     each = [
-        o.distance(*ends, radius) if second is None else o.segment_distance(*ends, radius) for o in obstacles
+        o.distance(start, radius) if end is None else o.segment_distance(start, end, radius)
+        for o in obstacles
     ]
     shape = np.broadcast_shapes(*(tuple(one.shape) for one in each))
     return xp.stack([xp.broadcast_to(one, shape) for one in each], -1)
 
 
-def _like_tensors(obstacles: Sequence[Shape], **points: Array) -> list[Array]:
+def _like_tensors(obstacles: Sequence[Shape], first: Array, second: Array | None) -> list[Any]:
     """Return points in one array library: that of torch tensors among them or among the obstacles, else NumPy."""
-    xp, arrays = as_floats(**points)
+    given = {"first": first} if second is None else {"first": first, "second": second}
+    xp, arrays = as_floats(**given)
     tensors = [each for o in obstacles if hasattr(each := o.position, "requires_grad")]
     if xp is np and tensors:
         arrays = [like(namespace_of(tensors[0]), each, tensors[0]) for each in arrays]
-    return arrays
+    return [*arrays, None][:2]
 
 
 def nearest_distance(
@@ -246,13 +246,11 @@ def nearest_distance(
     obstacles = as_obstacles(obstacles)
     if isinstance(most, bool) or not isinstance(most, Real) or most != most:
         raise ValueError(f"most must be a number, got {most!r:.60}")
-    ends = _like_tensors(
-        obstacles, **({"first": first} if second is None else {"first": first, "second": second})
-    )
+    ends = [end for end in _like_tensors(obstacles, first, second) if end is not None]
     xp = namespace_of(ends[0])
     radius = checked_radius(radius, ends[0])
     if xp is not np:
-        each = signed_distances(obstacles, ends[0], *ends[1:] or (None,), radius)
+        each = signed_distances(obstacles, first, second, radius)
         nearest = xp.full(each.shape[:-1], float(most), dtype=each.dtype, device=each.device)
         return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
     ends = [end.astype(np.float64, copy=False) for end in ends]
