@@ -32,7 +32,7 @@ from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, l
 
 ENVIRONMENTS = ("viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0", "viapoint/PandaObstacles-v0")
 TRAINING_SCENES, DRAWS = 1024, 256
-DESK_SCENES, CHECKS, METHODS = 300, (0, 64), ("search64", "search512", "planner")
+DESK_SCENES, CHECKS, METHODS = 300, (0, 64), ("search64", "search512")
 STEERED_SCENES = 200
 CORRECTION = 4.0
 """Gain of the pull to where the hand should be, [1/s]."""
