@@ -20,24 +20,22 @@ def test_measurements_take_turns():
 
 
 @pytest.mark.parametrize("env_id", ["viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"])
-def test_the_engine_alone_simulates_the_obstacles_of_the_environments(env_id, monkeypatch):
+def test_the_engine_alone_simulates_the_movements_of_the_environments(env_id, monkeypatch):
     made = []
-    monkeypatch.setattr(
-        bench, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[0]
-    )
-    envs = gym.make_vec(env_id, num_envs=6, threads=1).unwrapped
+
+    def simulator(*args, **kwargs):
+        made.append(Simulator(*args, **kwargs))
+        return made[0]
+
+    monkeypatch.setattr(bench, "Simulator", simulator)
+    envs = gym.make_vec(env_id, num_envs=8, threads=1).unwrapped
     envs.reset(seed=0)
-    actions = 0.3 * np.ones((6, *envs.single_action_space.shape), np.float32)
-    scenes, steps = envs.scenes, 400
-    bench._engine(envs.task, scenes, actions, steps, threads=1)
-    sims = np.arange(6)
-    joints = np.asarray(envs.arm.inverse_kinematics(scenes.start))
-    envs._simulator.place(sims, joints, scenes.obstacles, scenes.present)
-    controls = np.zeros((6, steps, made[0].model.nu))
-    alone, there = (each.rollout(sims, controls) for each in (made[0], envs._simulator))
-    np.testing.assert_array_equal(alone.joints, there.joints)
-    np.testing.assert_array_equal(alone.contact, there.contact)
-    assert there.contact.any()
+    actions = 0.2 * np.ones((8, *envs.single_action_space.shape), np.float32)
+    engine, steps = bench._engine(envs.task, envs.scenes, actions, threads=1)
+    engine()
+    assert envs.execute_actions(actions).info["collision"].any()
+    np.testing.assert_array_equal(made[0].batch.state, envs._simulator.batch.state)
+    assert steps == envs.physics_steps
     envs.close()
 
 

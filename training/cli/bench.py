@@ -23,6 +23,7 @@ import viapoint.envs
 from viapoint import primitives
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sim.executor import Executor
 from viapoint.envs.sim.simulator import Simulator
 from viapoint.training.config.configs import BenchConfig
 from viapoint.training.io.files import write_json
@@ -87,17 +88,14 @@ def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
     env: Any = gym.make_vec(env_id, num_envs=num_envs)
     env.reset(seed=0)
     actions = _actions(env.single_action_space, num_envs)
-    scenes, before = env.unwrapped.scenes, env.unwrapped.physics_steps
-    env.step(actions)
-    steps = (env.unwrapped.physics_steps - before) // num_envs
-    engine = _engine(env.unwrapped.task, scenes, actions, steps, threads=0)
+    engine, steps = _engine(env.unwrapped.task, env.unwrapped.scenes, actions, threads=0)
 
     def step() -> float:
         began = time.perf_counter()
         env.step(actions)
         return time.perf_counter() - began
 
-    rates = _rates(env, step, engine, num_envs * steps, repeats)
+    rates = _rates(env, step, engine, steps, repeats)
     env.close()
     return Ratio(f"make_vec, {num_envs} environments", *rates)
 
@@ -108,9 +106,6 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
     env.reset(seed=0)
     action = _actions(env.action_space, 1)[0]
     inner: Any = env.unwrapped
-    before = inner.physics_steps
-    env.step(action)
-    steps = inner.physics_steps - before
 
     def episodes() -> float:
         spent = 0.0
@@ -124,8 +119,8 @@ def _single(env_id: str, repeats: int, *, resets: bool) -> Ratio:
 
     # The time of a step depends on the scene, so the engine has as many scenes.
     scenes = inner.task.sampler()([np.random.default_rng(seed) for seed in range(EPISODES)])
-    engine = _engine(inner.task, scenes, np.repeat(action[None], EPISODES, axis=0), steps, threads=1)
-    rates = _rates(env, episodes, engine, EPISODES * steps, repeats)
+    engine, steps = _engine(inner.task, scenes, np.repeat(action[None], EPISODES, axis=0), threads=1)
+    rates = _rates(env, episodes, engine, steps, repeats)
     env.close()
     return Ratio(f"make, one environment, {'reset and step' if resets else 'step'}", *rates)
 
@@ -150,30 +145,31 @@ def _rates(
 
 
 def _engine(
-    task: Task, scenes: Scenes, actions: NDArray[np.float32], steps: int, threads: int
-) -> Callable[[], Any]:
-    """Return a rollout of the engine alone with the same controls, scenes and records as in the environment."""
-    number = len(actions)
+    task: Task, scenes: Scenes, actions: NDArray[np.float32], threads: int
+) -> tuple[Callable[[], Any], int]:
+    """Return rollouts of the engine alone and their physics steps: the same movements as in the environment."""
     simulator = Simulator(
         task.collision_model,
         n_obstacles=task.observation.n_rows,
-        num_envs=number,
+        num_envs=len(actions),
         threads=threads,
         shapes=task.scenes.shapes,
     )
     joints = np.asarray(task.arm.inverse_kinematics(scenes.start))
-    simulator.place(np.arange(number), joints, scenes.obstacles, scenes.present)
-    movement = task.action.decode(actions.astype(np.float64), scenes.start, scenes.goal).trajectory()
-    controls = np.ascontiguousarray(
-        task.arm.controls(*movement.sample(simulator.timestep * np.arange(steps)))
-    )
+    simulator.place(np.arange(len(actions)), joints, scenes.obstacles, scenes.present)
+    plan = task.action.decode(actions.astype(np.float64), scenes.start, scenes.goal)
+    stages = Executor(simulator)
+    groups = [stages.build_references(each) for each in stages.scale_time(scenes, plan).groups()]
+    runs = [(each.movements.sims[each.reachable], each.controls[each.reachable]) for each in groups]
     state = simulator.batch.state.copy()
 
-    def rollout() -> None:
+    def rollouts() -> None:
         simulator.batch.state[:] = state
-        simulator.batch.rollout(steps, controls, record=simulator.recorded)
+        for sims, controls in runs:
+            if len(sims):
+                simulator.batch.rollout(controls.shape[1], controls, record=simulator.recorded, ids=sims)
 
-    return rollout
+    return rollouts, sum(controls.shape[0] * controls.shape[1] for _, controls in runs)
 
 
 def _actions(space: Any, number: int) -> NDArray[np.float32]:
