@@ -32,10 +32,14 @@ def test_the_stated_misses_of_contact_are_all_of_them():
     assert {row["poses"] for row in FOUND["agreement"]} == {10_000}
     assert f"pass right through a box ({number} of 10,000)" in TEXT
     wrong = {(arm, shape): row["wrong"] for arm, rows in CONTACTS.items() for shape, row in rows.items()}
-    for env in ("viapoint/PlanarWholeArm-v0", "viapoint/PandaObstacles-v0"):
-        assert CONTACTS["movements"][env]["poses"] == 10_000
-    contacts = CONTACTS["movements"]["viapoint/PlanarWholeArm-v0"]["contacts"]
-    assert f"among boxes, {contacts:,} of them with contact" in TEXT
+    arm, panda = (
+        CONTACTS["movements"][f"viapoint/{task}-v0"] for task in ("PlanarWholeArm", "PandaObstacles")
+    )
+    assert (
+        f"in {arm['poses']:,} random movements of `PlanarWholeArm` among boxes, {arm['contacts']:,} of them"
+        in TEXT
+    )
+    assert f"so they do in {panda['poses']:,} movements in `PandaObstacles`" in TEXT
     assert list(CONTACTS)[1:] == ["planar", "panda", "ur5e", "fetch", "planar hand"]
     assert {row["poses"] for row in CONTACTS["planar"].values()} == {10_000}
     boxes = {arm: CONTACTS[arm]["box"]["shallowest"] for arm in ("planar", "ur5e")}
