@@ -2,7 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/geometry.py --out docs/geometry.json
 
-Rows are shapes, each against spheres and capsules of random sizes and poses. Columns of agreement:
+Rows are shapes, each against spheres and capsules of random sizes and poses; a tenth of the capsules are parallel to an axis
+of the shape. Columns of agreement:
 
     coal       greatest difference of the distance from that of coal, where the bodies do not touch, [m]
     MuJoCo     the same of mj_geomDistance
@@ -90,9 +91,12 @@ class Probes(NamedTuple):
 
     @classmethod
     def around(cls, shape: Shape, number: int, generator: np.random.Generator, *, long: bool) -> Probes:
-        """Return probes near a shape; half of them are nearly in contact."""
+        """Return probes near a shape; half of them are nearly in contact, and a tenth parallel to one of its axes."""
         first = np.asarray(shape.position) + generator.uniform(-0.4, 0.4, (number, 3))
-        second = first + long * generator.uniform(-0.4, 0.4, (number, 3))
+        ways = generator.uniform(-0.4, 0.4, (number, 3))
+        for axis, way in enumerate(shape.rotation.T):
+            ways[10 * axis :: 30] = ways[10 * axis :: 30, :1] * way
+        second = first + long * ways
         radius = generator.uniform(0.01, 0.1, number)
         gap = shape.segment_distance(first, second) - generator.uniform(-NEAR, NEAR, number)
         return cls(first, second, np.where((np.arange(number) % 2 == 0) & (gap > 0.005), gap, radius))
@@ -283,7 +287,8 @@ def plain_segment(shape: Shape) -> Callable[[Float, Float], Float] | None:
                 u, gap = q - p, p - start
                 a, e, b = (u * u).sum(axis=-1), v @ v, u @ v
                 d, f = (u * gap).sum(axis=-1), gap @ v
-                s = np.clip((b * f - d * e) / (a * e - b * b), 0.0, 1.0)
+                crossing = np.maximum(a * e - b * b, 1e-12 * a * e)  # of parallel segments, any point will do
+                s = np.clip((b * f - d * e) / crossing, 0.0, 1.0)
                 t = np.clip((b * s + f) / e, 0.0, 1.0)
                 s = np.clip((b * t - d) / a, 0.0, 1.0)
                 return norm(gap + s[:, None] * u - t[:, None] * v, axis=-1) - shape.radius
