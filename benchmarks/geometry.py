@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/geometry.py --out docs/geometry.json
 
-Rows are shapes, each against spheres and capsules of random sizes and poses; a tenth of the capsules are parallel to an axis
-of the shape. Columns of agreement:
+Rows are shapes, each against spheres and capsules of random sizes and poses; a tenth of the capsules are parallel to
+an axis of the shape. Columns of agreement:
 
     coal       greatest difference of the distance from that of coal, where the bodies do not touch, [m]
     MuJoCo     the same of mj_geomDistance
