@@ -55,21 +55,18 @@ def cover_geom(model: mujoco.MjModel, data: mujoco.MjData, geom: int, tolerance:
     """Return capsules and spheres that together contain a geom, in the world's frame.
 
     Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
-    covered, with a distance of `tolerance`, [m], between capsules and geom at most. Planes, height fields and other
-    unbounded geoms have no capsules.
+    covered, with a distance of `tolerance`, [m], between capsules and geom at most.
 
     Raises:
-        ValueError: The geom needs more than MOST_CAPSULES capsules, or is flat.
+        ValueError: The geom is of another type, needs more than MOST_CAPSULES capsules, or is flat.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
         half = size[1] * turn[:, 2] if kind == Geom.mjGEOM_CAPSULE else np.zeros(3)
         return [Capsule(np.stack((place - half, place + half)), float(size[0]), 0.0)]
-    corners, larger = polytope_around(model, geom)
-    if not len(corners):
-        return []
     try:
+        corners, larger = polytope_around(model, geom)
         found = cover_points(corners, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
@@ -80,7 +77,10 @@ def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
     """Return the corners of a polytope that contains a geom, in the geom's frame, shape (n, 3), and its excess, [m].
 
     The excess is an upper bound of the distance of the corners from the geom. It is 0 for boxes and the convex hulls of
-    meshes. Geoms that are neither these nor cylinders and ellipsoids have no corners.
+    meshes.
+
+    Raises:
+        ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     if kind == Geom.mjGEOM_MESH:
@@ -100,7 +100,10 @@ def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
         poles = np.array([(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
         wide = rim[0, 0]
         return np.asarray(size * wide * np.concatenate((*rings, poles))), float(size.max() * (wide**2 - 1.0))
-    return np.empty((0, 3)), 0.0
+    raise ValueError(
+        "a link may have geoms of the types sphere, capsule, cylinder, ellipsoid, box and mesh, not "
+        f"{kind.name.removeprefix('mjGEOM_').lower()}"
+    )
 
 
 def _rim(number: int) -> Float:

@@ -37,6 +37,8 @@ TABLE_MARGIN_FACTOR = 2.0
 """Factor by which margins may be smaller, and rotations greater, between the nodes of a table than at them."""
 MAX_JOINT_SLOPE = 25.0
 """Greatest rotation of a joint per distance of the hand, [rad/m]: several times that of smooth solutions."""
+BLOCK = 50_000
+"""Distances between links that are computed at once, which fit into the cache."""
 ROOM_SCENES = 64
 """Scenes that are sampled to check that movements fit into the workspace."""
 
@@ -108,6 +110,11 @@ class Feasibility:
 
         Margins may be smaller, and rotations greater, by a `factor` of 1 or more.
         """
+        blocks = max(math.ceil(len(hand) * len(self._pairs) / BLOCK), 1)
+        parts = zip(np.array_split(hand, blocks), np.array_split(joints, blocks), strict=True)
+        return np.concatenate([self._feasible(*part, factor) for part in parts])
+
+    def _feasible(self, hand: Float, joints: Float, factor: float) -> Bool:
         (error, rotation), (inside, above, apart) = self._errors(hand, joints), self._margins(joints)
         good = (error < HAND_TOLERANCE) & (rotation < ORIENTATION_TOLERANCE * factor)
         good &= (inside > JOINT_MARGIN / factor).all(axis=-1) & (np.abs(hand).max(axis=-1) < MAX_COORDINATE)

@@ -67,7 +67,10 @@ class Sphere(Shape):
         return {"radius": half[..., 0]}
 
     def _relative(self, points: Array) -> Components:
-        return self._offset(points)
+        offset = self._offset(points)
+        if len(self.quaternion.shape) == 1:
+            return offset
+        return [part + 0.0 * self.quaternion[..., 0] for part in offset]  # they turn nothing, but are a batch
 
     def _signed(self, points: Components) -> Array:
         return length(points) - self.radius

@@ -249,13 +249,13 @@ def _checked_numbers(obstacles: Any) -> Any:
     if not real:
         raise ValueError(f"obstacles must be {LISTS}, got {obstacles!r:.80}")
     if array.ndim > 1 and array.size:
-        wrong = (array != 0.0).any(axis=-1) & ~(array[..., -1] > 0.0)
+        wrong = ~np.isfinite(array).all(axis=-1) | ((array != 0.0).any(axis=-1) & ~(array[..., -1] > 0.0))
         if wrong.any():
             index = tuple(int(i) for i in np.argwhere(wrong)[0])
             place = f"scene {index[0]}: " if len(index) > 1 else ""
-            raise ValueError(
-                f"{place}obstacle {index[-1]} has no positive radius (last number): {array[index].tolist()}"
-            )
+            finite = np.isfinite(array[index]).all()
+            what = "has no positive radius (last number)" if finite else "must be finite"
+            raise ValueError(f"{place}obstacle {index[-1]} {what}: {array[index].tolist()}")
     return obstacles
 
 
@@ -264,6 +264,9 @@ def obstacles_from_rows(rows: Float) -> list[Shape]:
 
     Args:
         rows: Rows of either kind, shape (n, .), [m].
+
+    Raises:
+        ValueError: Rows have another number of values, or the kind of a row is no shape.
 
     Example:
         >>> import numpy as np
@@ -277,9 +280,13 @@ def obstacles_from_rows(rows: Float) -> list[Shape]:
         raise ValueError(f"rows must have shape (n, .) with {sizes} numbers each, got shape {np.shape(rows)}")
     rows = np.asarray(rows, dtype=np.float64)
     d = dimension_of(rows)
-    for row in rows[rows[:, -1] > 0.0]:
+    for i in np.flatnonzero(rows[:, -1] > 0.0):
+        row = rows[i]
         centre, axis, radius = in_space(row[:d]), in_space(row[d : 2 * d]), row[-1]
         kind, _, quaternion, half = shape_columns(row)
+        if has_shapes(row) and row[2 * d] not in range(len(SHAPES)):
+            kinds = ", ".join(f"{number} {name}" for number, name in enumerate(SHAPES))
+            raise ValueError(f"obstacle {i} has the kind {row[2 * d]:g}; kinds are {kinds}")
         shape = list(SHAPES.values())[int(kind)]
         if shape is not Capsule or (has_shapes(row) and axis.any()):
             exact = shape.from_box(centre, quaternion, half)

@@ -95,15 +95,15 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         raise ValueError(f"an obstacle must be a shape of viapoint.envs or a dictionary, got {value!r:.80}")
     values = dict(value)
     kind = values.pop("shape", None)
-    shape = SHAPES.get(kind) if isinstance(kind, str) else None
+    shape, name = SHAPES.get(kind) if isinstance(kind, str) else None, values.get("name")
+    named = f"{name!r}: " if isinstance(name, str) and name else ""
     if shape is None:
         known = f"Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
         if kind is None:
-            raise ValueError(f"the key 'shape' is missing. {known}")
-        raise ValueError(f"unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
+            raise ValueError(f"{named}the key 'shape' is missing. {known}")
+        raise ValueError(f"{named}unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
     allowed = shape.parameters()
-    name = values.get("name")
-    named = f"{kind} {name!r}" if isinstance(name, str) and name else str(kind)
+    named = f"{kind} {named}".rstrip(": ")
     for name in values:
         if name not in allowed:
             known = f"Parameters are {', '.join(allowed)}"
@@ -125,6 +125,8 @@ def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
         ValueError: obstacle 1: sphere: radius must be greater than 0, got -1.0
     """
     refuse_single(values)
+    if not isinstance(values, Iterable):
+        raise ValueError(f"obstacles must be {LISTS}, got {values!r:.80}")
     found = []
     for i, value in enumerate(values):
         try:
@@ -257,9 +259,16 @@ def nearest_distance(
     for end in ends:
         if end.shape[-1:] != (3,):
             raise ValueError(f"points must have shape (..., 3), got shape {end.shape}")
-    for each in obstacles:
-        each.require_single()
-    shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
+    for i, each in enumerate(obstacles):
+        try:
+            each.require_single()
+        except ValueError as error:
+            raise ValueError(f"obstacle {i}: {error}") from None
+    try:
+        shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
+    except ValueError:
+        sizes = ", ".join(map(str, (*(end.shape for end in ends), np.shape(radius))))
+        raise ValueError(f"points and radius must broadcast, got the shapes {sizes}") from None
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
     middle = flat[0] if second is None else 0.5 * (flat[0] + flat[1])

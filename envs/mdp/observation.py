@@ -201,7 +201,8 @@ class ReplanningObservationLayout(ObservationLayout):
         """Return observations at times since the start, shape (N,), [s], in fresh arrays of shape (N, .) each."""
         now = scenes.at(time)
         d, number = self.dimension, len(time)
-        now.obstacles[..., :d] = np.clip(now.obstacles[..., :d], -FARTHEST, FARTHEST)
+        farthest = FARTHEST if self.shapes == CAPSULES else FARTHEST_SHAPE
+        now.obstacles[..., :d] = np.clip(now.obstacles[..., :d], -farthest, farthest)
         seen = self.observe(joints, default.state.position, now)
         parts = {
             "velocity": np.clip(default.state.velocity, -GREATEST_SPEED, GREATEST_SPEED),

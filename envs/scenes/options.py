@@ -207,7 +207,7 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
     """
     try:
         record = json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"the scene file is not JSON: {error}") from None
     if not isinstance(record, Mapping) or record.get("format") != FORMAT:
         raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')

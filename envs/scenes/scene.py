@@ -12,7 +12,15 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
 from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
-from viapoint.envs.geometry.rows import has_shapes, rotation_axes, shape_columns, shape_number, shape_rows
+from viapoint.envs.geometry.rows import (
+    has_shapes,
+    pair_distance,
+    rotation_axes,
+    shape_columns,
+    shape_number,
+    shape_rows,
+    widened,
+)
 from viapoint.envs.geometry.shape import UNIT_TOLERANCE
 from viapoint.envs.geometry.shapes import SHAPES
 
@@ -138,6 +146,15 @@ def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = (()
     """Yield the faults that N scenes can have; see :func:`check_scenes`."""
     yield from _problems_of_ends(scenes, collision_model.arm)
     yield from _problems_of_sizes(scenes, names)
+    if scenes.present.any() and (base := getattr(collision_model.arm, "base", ())):
+        inside = _contain(scenes, base)
+        yield (
+            np.asarray(inside.any(axis=-1)),
+            lambda i: (
+                f"{_obstacle(scenes, names, i, inside[i].argmax())} contains the base of the arm; it may overlap the "
+                "base, but not contain it"
+            ),
+        )
     for name, point in (("start", scenes.start), ("goal", scenes.goal)):
         clearance = rest_clearance(scenes, point, collision_model)
         touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
@@ -175,6 +192,21 @@ def _problems_of_sizes(scenes: Scenes, names: Names) -> Iterator[Problem]:
             wrong.any(axis=-1),
             lambda i, w=wrong, x=what: f"{_obstacle(scenes, names, i, w[i].argmax())} {x}",  # type: ignore[misc]
         )
+
+
+def _contain(scenes: Scenes, base: Sequence[Any]) -> Bool:
+    """Return which obstacles contain all capsules of an arm's base, shape (N, n).
+
+    As obstacles are convex, they contain a capsule if they contain the balls around both ends of its axis.
+    """
+    rows = widened(scenes.obstacles)[scenes.present]
+    inside, contain = np.ones(len(rows), dtype=bool), np.zeros(scenes.present.shape, dtype=bool)
+    for capsule in base:
+        for end in capsule.ends:
+            place = np.broadcast_to(np.asarray(end, dtype=np.float64), (len(rows), 3))
+            inside &= pair_distance(rows, place) <= -capsule.radius
+    contain[scenes.present] = inside
+    return contain
 
 
 def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Any, str]]:

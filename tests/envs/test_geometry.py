@@ -189,6 +189,13 @@ def test_torch_and_single_precision_give_the_same(kind, generator, segments):
     assert shape.distance(tensors[0].float()).dtype == torch.float32
 
 
+def test_cylinders_in_single_precision_are_right_to_a_tenth_of_a_millimetre(generator):
+    for radius, half_length in ((0.2, 0.2), (0.05, 0.3)):
+        shape, ends = Cylinder(radius, half_length), generator.uniform(-1.0, 1.0, (2, 100_000, 3))
+        single = shape.segment_distance(*ends.astype(np.float32))
+        np.testing.assert_allclose(single, shape.segment_distance(*ends), atol=1e-4)
+
+
 @ALL
 def test_gradients_are_those_of_finite_differences(kind, generator, segments):
     shape, step = random_shape(kind, generator), 1e-6
@@ -535,7 +542,7 @@ FOLLOWED = torch.zeros(4, 3, requires_grad=True)
     ],
 )
 def test_errors_of_all_constructors_have_the_name_of_the_obstacle(make, reason):
-    with pytest.raises(ValueError, match=r"^\w+ 'it': ") as caught:
+    with pytest.raises(ValueError, match=r"^(obstacle 0: )?\w+ 'it': ") as caught:
         make()
     assert reason in str(caught.value)
 
@@ -774,6 +781,24 @@ def test_what_does_not_fit_together_is_named():
         PointCloud.covering(CUBE, spacing=0.2, radius=-0.1)
     with pytest.raises(ValueError, match="n_rows must be a whole number"):
         observation_rows([], 1.5)
+    with pytest.raises(ValueError, match=r"must broadcast, got the shapes \(4, 3\), \(3,\)"):
+        nearest_distance([Sphere(0.1)], np.ones((4, 3)), radius=np.ones(3))
+    with pytest.raises(ValueError, match="obstacle 1: sphere: must be one shape here, got a batch"):
+        nearest_distance([Sphere(0.1), Sphere(np.ones(2))], np.ones((4, 3)))
+    with pytest.raises(ValueError, match=r"obstacles must be a list .*, got None"):
+        signed_distances(None, np.ones(3))
+    with pytest.raises(ValueError, match="obstacle 0: 'crate': unknown shape 'boxx', did you mean 'box'"):
+        signed_distances([{"shape": "boxx", "name": "crate"}], np.ones(3))
+
+
+@pytest.mark.parametrize("segments", [False, True])
+@pytest.mark.parametrize("kind", CLOSED)
+def test_a_batch_of_quaternions_is_a_batch_of_shapes(kind, segments):
+    sizes = {name: np.full(last, 0.1) for name, last in SHAPES[kind].sizes.items()}
+    shape = SHAPES[kind](**sizes, quaternion=np.eye(4))
+    ends = [np.array((1.0, 0.2, 0.3)), np.array((0.5, 0.2, 0.3))][: 1 + segments]
+    found = shape.segment_distance(*ends) if segments else shape.distance(*ends)
+    assert found.shape == (4,)
 
 
 def test_lists_may_mix_libraries_and_batches():

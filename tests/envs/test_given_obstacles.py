@@ -28,6 +28,7 @@ PANDA = "viapoint/PandaObstacles-v0"
 SHAPES = ("capsule", "box", "half_space")
 ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
 HOUSE = Box((0.3, 0.3, 0.3), position=(0.2, 0.0, 0.4), name="house")
+PLINTH = Box((0.15, 0.12, 0.12), position=(-0.04, 0.0, 0.05), name="plinth")
 CRATE = Box((0.03, 0.03, 0.03), position=(0.2, 0.6, 0.4))
 LISTS = "obstacles must be a list of shapes, dictionaries or rows of numbers"
 
@@ -71,7 +72,8 @@ def reset(env, obstacles, reason, ends):
             [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0), name="wall")],
             "obstacle 0 'wall' (half_space through (3.5, 0, 0) m with normal (-1, 0, 0)) has its surface over 1 m",
         ),
-        ([HalfSpace(position=(0.0, 0.0, 0.9))], "half_space through (0, 0, 0.9) m with normal (0, 0, 1)) touches"),
+        ([HalfSpace(position=(0.0, 0.0, 0.9))], "half_space through (0, 0, 0.9) m with normal (0, 0, 1)) contains"),
+        ([CRATE, PLINTH], "obstacle 1 'plinth' (box at (-0.04, 0, 0.05) m, half lengths (0.15, 0.12, 0.12) m) contain"),
     ],
 )  # fmt: skip
 def test_errors_name_the_obstacle_as_the_user_gave_it(env, obstacles, reason, ends):
@@ -250,10 +252,49 @@ def test_quaternions_of_rows_are_normalised_if_they_nearly_are(env):
     reset(env, box_row(quaternion=(1.01, 0.0, 0.0, 0.0)), "is no row of a shape", ENDS)
 
 
+def test_obstacles_may_overlap_the_base(env):
+    low = Box((0.15, 0.12, 0.05), position=PLINTH.position)
+    observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": [low]})
+    assert env.observation_space.contains(observation)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "ends"),
+    [
+        (PANDA, ENDS),
+        ("viapoint/PandaMovingObstacles-v0", ENDS),
+        ("viapoint/PlanarMovingObstacles-v0", {"start": (-0.2, 0.3), "goal": (0.2, 0.3)}),
+    ],
+)
+def test_walls_are_observed_where_they_are(env_id, ends):
+    """Also where obstacles may move: their cubes are up to 2 m away."""
+    env = gym.make(env_id, shapes=SHAPES).unwrapped
+    wall = HalfSpace.facing((0.0, -1.0, 0.0), position=(0.0, 0.9, 0.0))
+    observation, _ = env.reset(seed=0, options={**ends, "obstacles": [wall]})
+    seen = env.observation_layout.obstacles(observation["obstacles"][0])
+    np.testing.assert_allclose(seen.centre, (0.0, 1.9, 0.0), atol=1e-6)
+    assert env.observation_space.contains(observation)
+    env.close()
+
+
+@pytest.mark.parametrize("kind", [99.0, -1.0, 2.7])
+def test_rows_of_unknown_kinds_are_refused(kind):
+    good = shape_rows("box", np.zeros(3), np.array((1.0, 0.0, 0.0, 0.0)), np.full(3, 0.1))
+    bad = good.copy()
+    bad[6] = kind
+    with pytest.raises(ValueError, match=f"obstacle 1 has the kind {kind:g}; kinds are 0 sphere, 1 capsule"):
+        obstacles_from_rows(np.stack((good, bad)))
+
+
 @pytest.mark.parametrize("rows", [np.ones(7), np.ones((2, 2, 7)), np.ones((1, 6)), "rows"])
 def test_obstacles_are_read_from_a_table_of_rows(rows):
     with pytest.raises(ValueError, match=r"rows must have shape \(n, .\)"):
         obstacles_from_rows(rows)
+
+
+def test_nothing_is_no_scene_file():
+    with pytest.raises(ValueError, match="not JSON"):
+        scene_from_json(None)
 
 
 def test_misspelled_parts_of_a_scene_file_are_refused():

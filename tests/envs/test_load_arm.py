@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from imported_arms import HOME, JOINTS, UR5E, ur5e
 
 import viapoint.envs
-from viapoint.envs.arm_import import capsule_fit
+from viapoint.envs.arm_import import capsule_fit, reachability
 from viapoint.envs.arm_import.capsule_fit import cover_geom, cover_points, polytope_around
 from viapoint.envs.arm_import.loader import load_arm
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
@@ -27,6 +27,8 @@ from viapoint.envs.registration import OWN_ARM_TASKS
 
 assert viapoint.envs, "importing it registers the environments"
 
+CORNERS = " ".join(f"{x} {y} {z}" for x, y, z in np.ndindex(2, 2, 2))
+CUBE_MESH = f'<mesh name="cube" vertex="{CORNERS}"/>'
 DOCS = Path(__file__).parents[2] / "docs"
 FETCH = {
     "hand_site": "robot0:grip",
@@ -301,6 +303,12 @@ def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
         (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo cannot compile .*arm.xml.*mass"),
         (lambda text: text[:-20], "MuJoCo cannot read .*arm.xml' as an MJCF file"),
         (
+            lambda text: text.replace("<worldbody>", f"<asset>{CUBE_MESH}</asset><worldbody>").replace(
+                '<geom type="box"', '<geom name="case" type="sdf" mesh="cube" mass="0.1"/><geom type="box"'
+            ),
+            "geom case: a link may have geoms of the types sphere, capsule, .* and mesh, not sdf",
+        ),
+        (
             lambda text: text.replace('<joint name="wrist_1" class="wrist"/>', "").replace(
                 '<joint name="wrist_2"',
                 '<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"',
@@ -314,6 +322,14 @@ def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
     path.write_text(change(UR5E.read_text(encoding="utf-8")), encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         load_arm(path, hand_site="hand", joints=JOINTS, home=HOME)
+
+
+def test_feasibility_does_not_depend_on_how_many_distances_are_computed_at_once(arm, monkeypatch):
+    kwargs = {"hand_site": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
+    monkeypatch.setattr(reachability, "BLOCK", 997)
+    again = load_arm(UR5E, **kwargs)
+    assert again.workspace == arm.workspace
+    assert again.shape == arm.shape
 
 
 def test_joints_may_have_any_names(tmp_path):

@@ -270,7 +270,7 @@ CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
         ({"shape": "box", "size": (0.1, 0.1, 0.1), "quaternion": (1, 1, 0, 0)}, "quaternion must have length 1"),
         ({"shape": "pyramid"}, "obstacle 0: unknown shape 'pyramid'"),
         (np.full((1, 15), 0.1), "is no row of a shape"),
-        (np.full((1, 7), np.nan), "obstacle 0 has no positive radius (last number): [nan, "),
+        (np.full((1, 7), np.nan), "obstacle 0 must be finite: [nan, "),
         ([[0.5, 0.0, 0.3, 0.0, 0.0, 0.1, -0.03]], "obstacle 0 has no positive radius"),
         (torch.zeros((1, 7), requires_grad=True), "must be a list of shapes, dictionaries or rows of numbers"),
         (PointCloud(np.full((300, 3), 0.3)), "at most 256, and PointCloud.covering makes fewer spheres"),
