@@ -1,6 +1,7 @@
 """The page of the environments says what the code does."""
 
 import inspect
+import json
 import re
 from pathlib import Path
 
@@ -30,6 +31,20 @@ def table(section):
 @pytest.fixture
 def env():
     return gym.make("viapoint/PlanarObstacles-v0").unwrapped
+
+
+def test_the_stated_speeds_relative_to_mujoco_are_the_measured_ones():
+    docs = Path(__file__).parents[2] / "docs"
+    lines = (docs / "vectorized.md").read_text(encoding="utf-8").splitlines()
+    names = {
+        "256 environments of `make_vec`": "make_vec, 256 environments",
+        "one environment of `make`, steps alone": "make, one environment, step",
+        "one environment of `make`, with resets": "make, one environment, reset and step",
+    }
+    found = [json.loads((docs / f"bench-{name}-obstacles.json").read_text()) for name in ("planar", "panda")]
+    for shown, name in names.items():
+        ratios = " | ".join(f"{each[name]['ratio']:.2f}" for each in found)
+        assert f"| {shown} | {ratios} |" in lines
 
 
 def test_the_sections_are_in_the_order_of_gymnasium():
