@@ -377,7 +377,7 @@ def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
         ({"goal": (0.9, 0.4)}, r"goal \(0.9, 0.4\) m is .* out of the arm's reach"),
         ({"goal": (-0.2, 0.3)}, "start and goal are 0.0000 m apart; at least 0.02 m"),
         ({"obstacles": [(0.0, 0.3, 0.1)]}, r"obstacles must have shape \(n, 5\), got \(1, 3\)"),
-        ({"obstacles": [(0.0, np.inf, 0.0, 0.0, 0.1)]}, "obstacles must be finite"),
+        ({"obstacles": [(0.0, np.inf, 0.0, 0.0, 0.1)]}, "obstacle 0 must be finite"),
         ({"obstacles": [(0.0, 0.3, 0.0, 0.0, 0.5)]}, "has a radius over 0.1 m"),
         ({"obstacles": [(-0.2, 0.3, 0.0, 0.0, 0.02)]}, "obstacle 0 .* touches the arm at the start"),
         (
