@@ -105,7 +105,7 @@ class SerialArm:
     shape: tuple[LinkCapsule, ...]
     """Capsules of the links in order from the base; the last one ends in the hand."""
     base: tuple[LinkCapsule, ...]
-    """Capsules of the base, which obstacles may overlap and the arm must not touch."""
+    """Capsules of the base, which obstacles may overlap but not contain, and which the arm must not touch."""
     self_pairs: tuple[tuple[int, int], ...]
     """Pairs of capsules that must not touch one another, as indices into `(*shape, *base)`."""
     off_table: tuple[int, ...]

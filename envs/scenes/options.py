@@ -326,9 +326,8 @@ def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
     """Return an option as an array of a shape: (N, D), or (N, n, .) with rows of zeros behind the given ones."""
     array = _numbers(name, value)
     result, size = np.zeros(shape), shape[-1]
-    lists = (
-        len(array) if array.ndim == 2 and array.shape[1] == 0 else shape[0]
-    )  # empty ones, one for each scene
+    # Empty lists, one for each scene.
+    lists = len(array) if array.ndim == 2 and array.shape[1] == 0 else shape[0]
     if len(shape) == 3 and array.size == 0 and lists == shape[0]:
         array = array.reshape((0, size))
     rows = len(shape) == 3 and array.ndim in (2, 3) and array.shape[-1] == size
