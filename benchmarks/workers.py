@@ -25,6 +25,8 @@ from viapoint.training import RayVecEnv, ViaVecEnv
 
 ENVS = ("viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0")
 CORES = (1, 2, 4, 8, 16)
+WARM_UP = 8
+"""Steps before those that are timed: scenes are then as many ahead as later."""
 SPIN = """
 import time
 end, count = time.perf_counter() + 0.2, 0
@@ -45,27 +47,29 @@ def measured(env_id: str, num_envs: int, repeats: int) -> dict[str, Any]:
     }
     generator = np.random.default_rng(0)
     shape = num_envs, *envs["threads=1"].single_action_space.shape
-    actions = generator.uniform(-0.3, 0.3, (repeats + 1, *shape)).astype(np.float32)
+    actions = generator.uniform(-0.3, 0.3, (WARM_UP + repeats, *shape)).astype(np.float32)
     for env in envs.values():
         env.reset() if isinstance(env, ViaVecEnv) else env.reset(seed=0)
-        env.step(actions[0])
+        for action in actions[:WARM_UP]:
+            env.step(action)
     physics = timed(envs["threads=1"].unwrapped._simulator, "rollout")
     times: dict[str, list[float]] = {name: [] for name in envs}
     busy: dict[str, list[float]] = {name: [] for name in envs}
     free = []
-    for action in actions[1:]:  # equal seeds: all ways have the same scenes
+    for action in actions[WARM_UP:]:  # equal seeds: all ways have the same scenes
         free.append(free_cores())
         for name, env in envs.items():
             began, worked = time.perf_counter(), time.thread_time()
             env.step(action)
             busy[name].append(time.thread_time() - worked)
             times[name].append(time.perf_counter() - began)
-    step = {name: float(np.median(each)) for name, each in times.items()}
-    engine = float(np.median(physics.of_each(repeats)))
+    # Means, because only some steps sample scenes.
+    step = {name: float(np.mean(each)) for name, each in times.items()}
+    engine = float(np.mean(physics.of_each(repeats)))
     parts = {
         "engine": engine,
-        "python": float(np.median(busy["threads=1"])) - engine,
-        "serial": float(np.median(busy["workers=2"])),
+        "python": float(np.mean(busy["threads=1"])) - engine,
+        "serial": float(np.mean(busy["workers=2"])),
         "message": message_time(envs["workers=2"]),
         "infos of SB3": infos_time(envs["ViaVecEnv, workers=2"], actions[0]),
     }

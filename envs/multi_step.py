@@ -32,7 +32,7 @@ class MultiStepVectorEnv(ReachVectorEnv):
         observation, reward, info = self.execute_actions(actions)
         last, rows = None, np.flatnonzero(self.terminated | self.truncated)
         if rows.size:
-            self._start(rows, self._draw(self.generators, rows, {}))
+            self._start(rows, self._draw_next(rows))
             last, observation = observation, self.observe()
         return Transition(observation, reward, self.terminated.copy(), self.truncated.copy(), info, last)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Index, Int, Single
-from viapoint.envs.geometry.broad_phase import ball_bounds, lift_quadratic
+from viapoint.envs.geometry.broad_phase import HalfLinks, ball_bounds, lift_quadratic
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, pair_clearance
 
 STRETCH = 8
@@ -70,10 +70,11 @@ def nearest_approach(
     seen = about[np.arange(len(least))[:, None], middles]
     excursion = _excursions(about, seen)[:, :, links].max(axis=-1) + np.float32(SWEEP_ROUNDING)
     first, second = seen[:, :, links[:, 0]], seen[:, :, links[:, 1]]
-    around = np.float32(0.5) * norm(second - first) + excursion + np.array(radii, np.float32)
-    centres = np.moveaxis(np.float32(0.5) * (first + second), -1, 1).reshape(len(least), 3, -1)
+    thick, half = excursion + np.array(radii, np.float32), np.float32(0.5) * (second - first)
+    centres, axes = (np.moveaxis(each, -1, 1).reshape(len(least), 3, -1) for each in (first + half, half))
     shown = np.where(present[..., None], obstacles, 0.0)
-    bounds = ball_bounds(lift_quadratic(centres), around.reshape(len(least), -1), shown)
+    around, thick = ((norm(half) + thick).reshape(len(least), -1), thick.reshape(len(least), -1))
+    bounds = ball_bounds(lift_quadratic(centres), around, shown, HalfLinks(axes, thick))
     size = np.array(radii)
 
     def clearance(each: Index, row: Index, link: Index, times: Index) -> Float:

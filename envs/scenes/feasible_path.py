@@ -40,7 +40,7 @@ class DrawOrder(NamedTuple):
     groups: tuple[int, ...]
     """Attempts that are drawn one after the other at a scene."""
     ahead: int
-    """Attempts, for one scene or for each two of several, up to which several groups are drawn at once."""
+    """Attempts at all scenes up to which several groups are computed at once."""
 
 
 def sample_ends(
@@ -145,7 +145,7 @@ DRAW_ORDER = {
     # Most scenes in space need one attempt, but a tunnel a hundred.
     3: DrawOrder(
         n_ends=12, n_paths=8, n_first=2, n_times=16, by_column=False, via_points=_spatial_via_points,
-        groups=(1, 2, 4, *[8] * 400), ahead=32,
+        groups=(1, 2, 4, *[8] * 400), ahead=320,
     ),
 }  # fmt: skip
 """Order of draws by the dimension of the arm's workspace."""

@@ -1,13 +1,18 @@
 """Rejection sampling of scenes, in the plane and in space.
 
-In a scene, the straight movement hits an obstacle and the feasible path does not. Each scene has a random generator of
-its own and is a function of its numbers alone; attempts at all scenes are computed together.
+In a scene, the straight movement hits an obstacle and the feasible path does not. An attempt at a scene takes the next
+numbers of a random generator, and the first good attempt is the scene. Numbers are drawn in groups of attempts; the
+next scene of a generator begins after the group of the good attempt. So scenes do not depend on how many attempts are
+computed at once, or with which others: those at many scenes are computed together.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,14 +34,16 @@ Distribution = SceneDistribution | SpaceDistribution
 
 FAMILY_ATTEMPTS = 2000
 """Attempts at a scene of a family in the plane; few of them succeed."""
-TOGETHER = 1280
-"""Attempts that are computed at once: only the first good one of a scene counts, so not all of them."""
-MOST_AHEAD = 320
-"""Greatest number of attempts, over all scenes, for which several groups are drawn at once."""
+TOGETHER = 1024
+"""Attempts that are computed at once: more take as much time each."""
+MOST = 24
+"""Attempts at one scene for which further groups are begun: those after the first good one are in vain."""
+SHARED_GROUPS = 8
+"""Groups of attempts at a scene that share the number :attr:`SceneSampler.fixed`."""
+AHEAD = 4
+"""Scenes of each generator that may wait in a queue."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
-SHARED_GROUPS = 8
-"""Groups of attempts at a scene that share the number :attr:`ObstacleSampler.fixed`."""
 
 
 class SceneSampler:
@@ -64,7 +71,7 @@ class SceneSampler:
             obstacles = SpatialObstacles(collision_model, drawn)
         planar = WholeArmObstacles if collision_model.whole_arm else HandObstacles
         self._obstacles: ObstacleSampler = obstacles or planar(collision_model, drawn)  # type: ignore[arg-type]
-        self._order = order or DRAW_ORDER[self.arm.dimension]
+        self.order = order or DRAW_ORDER[self.arm.dimension]
 
     def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
         """Sample one scene from each generator.
@@ -76,37 +83,39 @@ class SceneSampler:
         Raises:
             RuntimeError: No scene was found in many attempts, for example with given ends at the border of the reach.
         """
-        number, dimension, fixed = len(generators), self.arm.dimension, self._obstacles.fixed
-        scenes = Scenes(
-            np.zeros((number, dimension)),
-            np.zeros((number, dimension)),
-            np.zeros((number, self._obstacles.rows, self._row_size)),
-        )
-        pending, shared = np.arange(number), np.zeros(number)
-        if fixed is not None:
-            shared = np.array([each.random() for each in generators])
-        numbers = AttemptNumbers(generators, self._size, self._order)
-        while len(pending) and not numbers.exhausted:
-            made = numbers.made
-            u = numbers.draw(pending)
-            if fixed is not None:
-                sharing = max(sum(self._order.groups[:SHARED_GROUPS]) - made, 0)
-                u[:, :sharing, self._size - self._reshape_size - self._obstacles.size + fixed] = shared[
-                    pending, None
-                ]
-            first = self._attempts(u, pending, ends, scenes)
-            numbers.put_back(pending, first)
-            pending = pending[first < 0]
-        if len(pending):
-            raise RuntimeError(self._not_found(numbers.made, pending[0], ends))
-        if self._spare:
-            spare = np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0)))
-            scenes = scenes._replace(obstacles=spare)
-        return scenes
+        scenes, pending = self.empty(len(generators)), np.arange(len(generators))
+        attempts = [Attempts(self, each) for each in generators]
+        apart = len({id(each.bit_generator) for each in generators}) == len(generators)
+        while len(pending):
+            left = np.ones(len(pending), dtype=bool)
+            for begin in range(0, len(pending), TOGETHER):
+                some = pending[begin : begin + TOGETHER]
+                given = None if ends is None else (ends[0][some], ends[1][some])
+                for which, found, _ in next_attempts([attempts[k] for k in some], given, apart=apart):
+                    scenes.put(some[which], found)
+                    left[begin + which] = False
+            pending = pending[left]
+        return self.with_spare_rows(scenes)
 
-    def _not_found(self, attempts: int, scene: int, ends: Ends) -> str:
+    def empty(self, number: int) -> Scenes:
+        """Return arrays of zeros for scenes, without spare rows."""
+        start, goal = np.zeros((2, number, self.arm.dimension))
+        return Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
+
+    def with_spare_rows(self, scenes: Scenes) -> Scenes:
+        """Return scenes with empty rows for given obstacles, of which there may be more than are drawn."""
+        if not self._spare:
+            return scenes
+        return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0))))
+
+    def part(self, generator: np.random.Generator) -> SceneSampler:
+        """Return the sampler of a generator's next scene, which the generator may draw among several."""
+        return self
+
+    def not_found(self, attempts: int, ends: Ends) -> str:
+        """Return the message for a scene, with given ends or not, of which no attempt was good."""
         where = (
-            f"between start {ends[0][scene]} and goal {ends[1][scene]}"
+            f"between start {ends[0]} and goal {ends[1]}"
             if ends is not None
             else f"in the workspace {self.arm.workspace} m of {self.arm.name}; an arm of your own may need a larger "
             "one, or fewer obstacles (n_obstacles)"
@@ -114,16 +123,22 @@ class SceneSampler:
         n_obstacles = self.distribution.n_obstacles
         return f"no scene with {n_obstacles} obstacles was found in {attempts} attempts {where}"
 
+    @functools.cached_property
+    def size(self) -> int:
+        """Uniform numbers of one attempt."""
+        ends = 2 * self.arm.dimension * self.order.n_ends
+        return ends + 3 * self.order.n_paths + self._obstacles.size + self._reshape_size
+
+    @functools.cached_property
+    def fixed(self) -> int | None:
+        """Index of the number that attempts of the first groups share; None for none."""
+        fixed = self._obstacles.fixed
+        return None if fixed is None else self.size - self._reshape_size - self._obstacles.size + fixed
+
     @property
     def _row_size(self) -> int:
         """Number of values of an obstacle."""
         return row_size(self.arm.dimension, self.distribution.shapes)
-
-    @property
-    def _size(self) -> int:
-        """Uniform numbers of one attempt."""
-        ends = 2 * self.arm.dimension * self._order.n_ends
-        return ends + 3 * self._order.n_paths + self._obstacles.size + self._reshape_size
 
     @property
     def _reshape_size(self) -> int:
@@ -131,34 +146,9 @@ class SceneSampler:
         shaped = self.distribution.shapes != CAPSULES
         return RESHAPE_NUMBERS * self._obstacles.rows if shaped else 0
 
-    def _attempts(self, u: Float, pending: Int, ends: Ends, scenes: Scenes) -> Int:
-        """Store the scene of the first good attempt at each, and return which it was, shape (P,), -1 for none.
-
-        Args:
-            u: Uniform numbers, shape (P, attempts, .).
-            pending: Indices of the scenes, shape (P,).
-            ends: See :meth:`__call__`.
-            scenes: Array to store the scenes in.
-        """
-        rest, begin, good = np.arange(len(pending)), 0, np.full(len(pending), -1)
-        while begin < u.shape[1] and len(rest):
-            several = max(TOGETHER // len(rest), 1)
-            some = u[rest, begin : begin + several]
-            each = np.repeat(rest, some.shape[1])
-            where = pending[each]
-            given = None if ends is None else (ends[0][where], ends[1][where])
-            found, attempt = self._attempt(Uniforms(some.reshape(-1, self._size)), given)
-            owner = each[found]
-            first = np.flatnonzero(np.concatenate(([True], owner[1:] != owner[:-1]))[: len(owner)])
-            solved = owner[first]
-            scenes.put(pending[solved], attempt.take(first))
-            good[solved] = begin + found[first] % some.shape[1]
-            rest, begin = np.flatnonzero(good < 0), begin + several
-        return good
-
-    def _attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
+    def attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
         """Return the indices of good attempts and their scenes; each stage looks at the rows that are left."""
-        d, order, arm = self.distribution, self._order, self.arm
+        d, order, arm = self.distribution, self.order, self.arm
         u = uniforms.take_table(order.n_ends, 2 * arm.dimension, by_column=order.by_column)
         start, goal, good = sample_ends(u, arm, d.distance, d.steepness, d.reach_margin, ends)
         rows = np.flatnonzero(good)
@@ -205,10 +195,12 @@ class UniformSampler(SceneSampler):
         self._uniform = UniformScenes(collision_model, _drawn(distribution))
 
     @property
-    def _size(self) -> int:
+    def size(self) -> int:
+        """See :attr:`SceneSampler.size`."""
         return self._uniform.size + self._reshape_size
 
-    def _attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
+    def attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
+        """See :meth:`SceneSampler.attempt`."""
         rows, scenes = self._uniform(uniforms, ends)
         return self._reshaped(uniforms.at(rows), rows, scenes)
 
@@ -223,87 +215,147 @@ class MixedSampler(SceneSampler):
         super().__init__(collision_model, distribution)
         self._uniform = UniformSampler(collision_model, distribution)
 
-    def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
-        """Sample one scene from each generator, see :meth:`SceneSampler.__call__`."""
-        number, d = len(generators), self.arm.dimension
-        uniform = np.array([each.random() for each in generators]) < self.distribution.uniform_share
-        most = self.distribution.n_obstacles[1]
-        scenes = Scenes(
-            np.zeros((number, d)), np.zeros((number, d)), np.zeros((number, most, self._row_size))
-        )
-        for rows, sample in (
-            (np.flatnonzero(uniform), self._uniform),
-            (np.flatnonzero(~uniform), super().__call__),
-        ):
-            if rows.size:
-                some = None if ends is None else (ends[0][rows], ends[1][rows])
-                scenes.put(rows, sample([generators[int(row)] for row in rows], some))
-        return scenes
+    def part(self, generator: np.random.Generator) -> SceneSampler:
+        """Return the sampler of a generator's next scene, as its first number says."""
+        return self._uniform if generator.random() < self.distribution.uniform_share else self
 
 
-class AttemptNumbers:
-    """Uniform numbers for attempts at N scenes.
+class Attempts:
+    """Attempts at the next scene of one random generator, until one is good."""
 
-    While few scenes are left, several groups of attempts are drawn at once, as computing them together is faster. The
-    generators are then put back to where the group of the first good attempt ended, so results do not depend on it.
+    def __init__(self, sampler: SceneSampler, generator: np.random.Generator) -> None:
+        self.generator, self.sampler = generator, sampler.part(generator)
+        self._shared = 0.0 if self.sampler.fixed is None else generator.random()
+        self.made = 0
+        """Attempts that were taken."""
+        self._rest = np.empty((0, self.sampler.size))
+        # Attempts up to the end of each group that was drawn, and the generator's state there.
+        self._groups: list[tuple[int, Any]] = []
+
+    def take(self, least: int, most: int) -> Float:
+        """Return the numbers of the next attempts, shape (n, size); n = 0 after the last.
+
+        Args:
+            least: Attempts for which further groups are begun.
+            most: Greatest number n.
+        """
+        groups, sampler = self._groups, self.sampler
+        while len(self._rest) < least and len(groups) < len(sampler.order.groups):
+            count = sampler.order.groups[len(groups)]
+            drawn = self.generator.random((count, sampler.size))
+            if sampler.fixed is not None and len(groups) < SHARED_GROUPS:
+                drawn[:, sampler.fixed] = self._shared
+            groups.append((count + (groups[-1][0] if groups else 0), self.generator.bit_generator.state))
+            self._rest = np.concatenate((self._rest, drawn)) if len(self._rest) else drawn
+        taken, self._rest = self._rest[:most], self._rest[most:]
+        self.made += len(taken)
+        return taken
+
+    def end(self, attempt: int) -> Any:
+        """Set the generator back to the end of the group that holds an attempt, and return its state there."""
+        state = next(state for end, state in self._groups if attempt < end)
+        if state is not self._groups[-1][1]:
+            self.generator.bit_generator.state = state
+        return state
+
+
+def next_attempts(
+    attempts: Sequence[Attempts], ends: Ends = None, *, apart: bool = True
+) -> Iterator[tuple[Int, Scenes, list[Any]]]:
+    """Compute the next attempts at several scenes.
 
     Args:
-        generators: N generators; if several scenes share one, only one group is drawn at once.
-        size: Numbers of one attempt.
-        order: Groups of attempts.
+        attempts: Attempts at N scenes, at most TOGETHER.
+        ends: Starts and goals of the N scenes, see :meth:`SceneSampler.__call__`.
+        apart: False if scenes share a generator: whole groups are then drawn in turn.
+
+    Yields:
+        Indices of scenes with a good attempt, the scenes, and the states of their generators.
+
+    Raises:
+        RuntimeError: There are no further attempts at a scene.
+    """
+    number, order = len(attempts), attempts[0].sampler.order
+    least = min(max(order.ahead // number, 1), MOST) if apart else 1
+    most = max(TOGETHER // number, least) if apart else max(order.groups)
+    taken = [each.take(least, most) for each in attempts]
+    for k, each in enumerate(attempts):
+        if not len(taken[k]):
+            raise RuntimeError(
+                each.sampler.not_found(each.made, None if ends is None else (ends[0][k], ends[1][k]))
+            )
+    for sampler in dict.fromkeys(each.sampler for each in attempts):
+        some = np.array([k for k, each in enumerate(attempts) if each.sampler is sampler])
+        counts = np.array([len(taken[k]) for k in some])
+        owner, begin = np.repeat(some, counts), np.repeat(np.cumsum(counts) - counts, counts)
+        given = None if ends is None else (ends[0][owner], ends[1][owner])
+        found, scenes = sampler.attempt(Uniforms(np.concatenate([taken[k] for k in some])), given)
+        first = np.flatnonzero(np.diff(owner[found], prepend=-1))
+        which, place = owner[found[first]], found[first] - begin[found[first]]
+        states = [
+            attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
+            for k, at in zip(which, place, strict=True)
+        ]
+        yield which, scenes.take(first), states
+
+
+class SceneQueue:
+    """Scenes of N random generators that are sampled ahead, so that attempts at many scenes are computed together.
+
+    The scenes are those that the sampler returns, and the generators end in the same states: each scene waits with the
+    states of its generator before and after it, and is discarded if the generator has been used in the meantime.
     """
 
-    def __init__(self, generators: Sequence[np.random.Generator], size: int, order: DrawOrder) -> None:
-        self._generators, self._size, self._order = generators, size, order
-        self._apart = len({id(each.bit_generator) for each in generators}) == len(generators)
-        self._ahead = min(order.ahead * max(len(generators) // 2, 1), MOST_AHEAD)
-        self._group = 0
-        self._groups: tuple[int, ...] = ()
-        self._states: list[list[Any]] = []
+    def __init__(self, sampler: SceneSampler, number: int) -> None:
+        self._sampler = sampler
+        self._scenes = sampler.empty(number * AHEAD)
+        self._first, self._waiting = np.zeros((2, number), dtype=np.int64)
+        self._attempts: dict[int, Attempts] = {}
+        self._before: dict[int, Any] = {}
+        self._after: dict[int, deque[Any]] = {}
 
-    @property
-    def made(self) -> int:
-        """Attempts at each scene so far."""
-        return sum(self._order.groups[: self._group])
+    def __call__(self, generators: Sequence[np.random.Generator], rows: Int) -> Scenes:
+        """Return the next scenes of the generators at `rows`.
 
-    @property
-    def exhausted(self) -> bool:
-        """Flag: there are no further attempts."""
-        return self._group >= len(self._order.groups)
+        Raises:
+            RuntimeError: No scene was found in many attempts.
+        """
+        for k in rows:
+            if not _same(self._before.get(k), generators[k].bit_generator.state):
+                self._restart(k, generators[k])
+        while not self._waiting[rows].all():
+            self._sample()
+        scenes = self._scenes.take(rows * AHEAD + self._first[rows])
+        self._first[rows] = (self._first[rows] + 1) % AHEAD
+        self._waiting[rows] -= 1
+        for k in rows:
+            self._before[k] = generators[k].bit_generator.state = self._after[k].popleft()
+        return self._sampler.with_spare_rows(scenes)
 
-    def draw(self, scenes: Int) -> Float:
-        """Return numbers of the next attempts at P scenes, shape (P, attempts, size)."""
-        groups = self._order.groups[self._group :]
-        self._groups = groups[:1]
-        for attempts in groups[1:] if self._apart else ():
-            if len(scenes) * (sum(self._groups) + attempts) > self._ahead:
-                break
-            self._groups += (attempts,)
-        self._group += len(self._groups)
-        drawn = np.empty((len(scenes), sum(self._groups), self._size))
-        self._states = [
-            self._fill(self._generators[int(i)], each) for i, each in zip(scenes, drawn, strict=True)
-        ]
-        return drawn
+    def _restart(self, k: int, generator: np.random.Generator) -> None:
+        """Begin anew where a generator is."""
+        self._before[k], self._after[k], self._waiting[k] = generator.bit_generator.state, deque(), 0
+        self._attempts[k] = Attempts(self._sampler, copy.deepcopy(generator))
 
-    def put_back(self, scenes: Int, first: Int) -> None:
-        """Put the generators of P scenes back to the end of the group of the first good attempt, -1 for none."""
-        if len(self._groups) == 1:
-            return
-        ends = np.cumsum(self._groups)
-        for i, states, attempt in zip(scenes, self._states, first, strict=True):
-            if 0 <= attempt < ends[-1] - self._groups[-1]:
-                self._generators[int(i)].bit_generator.state = states[int((attempt >= ends).sum())]
+    def _sample(self) -> None:
+        """Compute attempts for the generators with the fewest scenes waiting."""
+        some = np.array([k for k in self._attempts if self._waiting[k] < AHEAD])
+        some = some[np.argsort(self._waiting[some], kind="stable")[:TOGETHER]]
+        for which, scenes, states in next_attempts([self._attempts[k] for k in some]):
+            rows = some[which]
+            self._scenes.put(rows * AHEAD + (self._first[rows] + self._waiting[rows]) % AHEAD, scenes)
+            self._waiting[rows] += 1
+            for k, state in zip(rows, states, strict=True):
+                self._after[k].append(state)
+                self._attempts[k] = Attempts(self._sampler, self._attempts[k].generator)
 
-    def _fill(self, generator: np.random.Generator, drawn: Float) -> list[Any]:
-        """Fill the rows of each group; return the states of the generator after all but the last."""
-        states, begin = [], 0
-        for attempts in self._groups:
-            if begin:
-                states.append(generator.bit_generator.state)
-            generator.random(out=drawn[begin : begin + attempts])
-            begin += attempts
-        return states
+
+def _same(first: Any, second: Any) -> bool:
+    """Return True if states of bit generators are equal; those with arrays count as different."""
+    try:
+        return bool(first == second)
+    except ValueError:
+        return False
 
 
 def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -> SceneSampler:

@@ -9,10 +9,6 @@ from viapoint.envs.geometry.broad_phase import HalfLinks, ball_bounds, lift_quad
 from viapoint.envs.geometry.distance import point_distance_squared, segment_distance_squared
 from viapoint.envs.geometry.rows import obstacles_from_rows, pair_distance, shape_rows
 from viapoint.envs.geometry.shapes import SHAPES
-from viapoint.envs.scenes import sampler as sampling
-from viapoint.envs.scenes.config import SpaceDistribution
-from viapoint.envs.scenes.feasible_path import DRAW_ORDER
-from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.swept_volume import SweptVolume
 
 N, TIMES, ROWS = 40, 16, 12
@@ -103,30 +99,6 @@ def test_obstacles_that_are_hit_come_closer_than_the_margin(kind, generator, bod
         hits = bodies.hits(rows, margin + more)
         assert (clearance[hits] < more).all()
         assert hits.sum() > 0.5 * (clearance < more).sum() > 0.0
-
-
-def test_scenes_do_not_depend_on_how_many_attempts_are_looked_at_together(monkeypatch):
-    sampler, found = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution()), []
-    for together in (1, 30, 10_000):
-        monkeypatch.setattr(sampling, "TOGETHER", together)
-        found.append(sampler([np.random.default_rng(seed) for seed in range(20)]))
-    for other in found[1:]:
-        assert all((mine == theirs).all() for mine, theirs in zip(found[0], other, strict=True))
-
-
-@pytest.mark.parametrize("shared", [False, True])
-def test_scenes_and_generators_do_not_depend_on_how_many_attempts_are_looked_at_ahead(shared):
-    found = []
-    for ahead in (0, 30, 1_000):
-        order = DRAW_ORDER[3]._replace(ahead=ahead)
-        sampler = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution(), order=order)
-        generators = [np.random.default_rng(0 if shared else seed) for seed in range(8)]
-        generators = generators[:1] * 8 if shared else generators
-        for _ in range(2):
-            scenes = sampler(generators)
-        found.append((*scenes, [each.random() for each in generators]))
-    for other in found[1:]:
-        assert all(np.array_equal(mine, theirs) for mine, theirs in zip(found[0], other, strict=True))
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere", "half_space"])

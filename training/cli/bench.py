@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint import primitives
 from viapoint.envs.mdp.task import Task
+from viapoint.envs.scenes.sampler import AHEAD
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Executor
 from viapoint.envs.sim.simulator import Simulator
@@ -32,6 +33,8 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
 TRAJECTORIES, SAMPLES = 4096, 200
+WARM_UP = 2 * AHEAD
+"""Steps before those that are timed: scenes are then as many ahead as later."""
 EPISODES = 20
 """Episodes of a single environment that are timed together."""
 MIDDLE = 0.3
@@ -72,15 +75,20 @@ def run(config: BenchConfig, console: Console | None = None) -> None:
         write_json(config.json, {each.name: each._asdict() for each in ratios})
 
 
-def fastest(repeats: int, *calls: Callable[[], Any]) -> list[float]:
-    """Return the least time of each call, [s]; calls alternate, so that load on the machine affects all of them."""
+def timed(repeats: int, *calls: Callable[[], Any]) -> list[list[float]]:
+    """Return the times of each call, [s]; calls alternate, so that load on the machine affects all of them."""
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
         for call, mine in zip(calls, times, strict=True):
             began = time.perf_counter()
             call()
             mine.append(time.perf_counter() - began)
-    return [min(each) for each in times]
+    return times
+
+
+def fastest(repeats: int, *calls: Callable[[], Any]) -> list[float]:
+    """Return the least time of each call, [s]."""
+    return [min(each) for each in timed(repeats, *calls)]
 
 
 def _simulation(env_id: str, num_envs: int, repeats: int) -> Ratio:
@@ -130,18 +138,20 @@ def _rates(
 ) -> tuple[float, float, str, float]:
     """Return physics steps per second of both sides, counted in the environment, as the lengths of episodes differ.
 
-    `step` returns the seconds that count.
+    They are means, because only some steps sample scenes. `step` returns the seconds that count.
     """
-    best = 0.0
+    for _ in range(WARM_UP):
+        step()
+    spent, before = 0.0, env.unwrapped.physics_steps
 
     def counted() -> None:
-        nonlocal best
-        before = env.unwrapped.physics_steps
-        spent = step()
-        best = max(best, (env.unwrapped.physics_steps - before) / spent)
+        nonlocal spent
+        spent += step()
 
-    _, raw = fastest(repeats, counted, engine)
-    return best, raw_steps / raw, "physics steps/s", best / (raw_steps / raw)
+    _, raw = timed(repeats, counted, engine)
+    speed = (env.unwrapped.physics_steps - before) / spent
+    engine_speed = repeats * raw_steps / sum(raw)
+    return speed, engine_speed, "physics steps/s", speed / engine_speed
 
 
 def _engine(
@@ -218,10 +228,12 @@ def _decisions(name: str, envs: Sequence[Any], actions: NDArray[np.float32], rep
     """Return decisions per second of two vector environments."""
     for env in envs:
         env.reset()
-    times = fastest(repeats, *(partial(env.step, actions) for env in envs))
+    steps = [partial(env.step, actions) for env in envs]
+    timed(WARM_UP, *steps)
+    times = timed(repeats, *steps)
     for env in envs:
         env.close()
-    first, second = (len(actions) / each for each in times)
+    first, second = (len(actions) * repeats / sum(each) for each in times)
     return Ratio(name, first, second, "decisions/s", first / second)
 
 

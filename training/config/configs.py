@@ -303,7 +303,7 @@ class BenchConfig(Config):
     num_envs: int = 512
     """Environments in the batch."""
     repeats: int = 9
-    """Alternating measurements of each side, of which the fastest counts."""
+    """Alternating measurements of each side; environments count with their mean, primitives with the fastest."""
     workers: int = 0
     """Worker processes to compare with as many threads; 0 leaves the comparison out."""
     json: Path | None = None

@@ -1,0 +1,120 @@
+"""The scenes of a generator do not depend on how many attempts are computed at once, or on scenes sampled ahead."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs.arms import ADULT, PANDA
+from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.scenes import sampler as sampling
+from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
+from viapoint.envs.scenes.feasible_path import DRAW_ORDER
+from viapoint.envs.scenes.sampler import AHEAD, SceneQueue, SceneSampler, scene_sampler
+
+SAMPLERS = {
+    "space": lambda: scene_sampler(CollisionModel(PANDA, True), SpaceDistribution()),
+    "plane": lambda: scene_sampler(CollisionModel(ADULT, True), SceneDistribution()),
+    "mixed": lambda: scene_sampler(CollisionModel(ADULT, False), SceneDistribution(uniform_share=0.5)),
+    "with room for given obstacles": lambda: scene_sampler(
+        CollisionModel(ADULT, True), SceneDistribution(n_obstacles=(1, 40), uniform_share=0.5)
+    ),
+    "without obstacles": lambda: scene_sampler(
+        CollisionModel(PANDA, True), SpaceDistribution(n_obstacles=(0, 0))
+    ),
+}
+
+
+@pytest.fixture(params=SAMPLERS, scope="module")
+def sampler(request):
+    return SAMPLERS[request.param]()
+
+
+def seeded(number, bits=np.random.PCG64):
+    return [np.random.Generator(bits(seed)) for seed in range(number)]
+
+
+def equal(first, second):
+    return all(np.array_equal(mine, theirs) for mine, theirs in zip(first, second, strict=True))
+
+
+def following(generators):
+    """The next number of each generator, which is left where it is."""
+    states = [each.bit_generator.state for each in generators]
+    found = [each.random() for each in generators]
+    for each, state in zip(generators, states, strict=True):
+        each.bit_generator.state = state
+    return found
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("ahead", [0, 30, 1000])
+@pytest.mark.parametrize("together", [5, 10_000])
+def test_scenes_do_not_depend_on_how_many_attempts_are_computed_at_once(monkeypatch, shared, ahead, together):
+    found = []
+    for changed in (False, True):
+        order = DRAW_ORDER[3]
+        if changed:
+            monkeypatch.setattr(sampling, "TOGETHER", together)
+            monkeypatch.setattr(sampling, "MOST", 100)
+            order = order._replace(ahead=ahead)
+        sampler = SceneSampler(CollisionModel(PANDA, True), SpaceDistribution(), order=order)
+        generators = seeded(1) * 8 if shared else seeded(8)
+        first, second = sampler(generators), sampler(generators)
+        found.append((*first, *second, following(generators)))
+    assert equal(*found)
+
+
+def test_a_queue_returns_the_scenes_of_its_sampler_and_leaves_generators_in_the_same_states(sampler):
+    queue, mine, theirs = SceneQueue(sampler, 12), seeded(12), seeded(12)
+    chance = np.random.default_rng(0)
+    for _ in range(3 * AHEAD):
+        rows = np.flatnonzero(chance.random(12) < 0.6)
+        assert equal(queue(mine, rows), sampler([theirs[row] for row in rows]))
+        assert following(mine) == following(theirs)
+
+
+def test_a_queue_follows_generators_that_are_used_or_replaced_between_its_scenes(sampler):
+    queue, mine, theirs, rows = SceneQueue(sampler, 4), seeded(4), seeded(4), np.arange(4)
+    for _ in range(3):
+        assert equal(queue(mine, rows), sampler(theirs))
+        for generators in (mine, theirs):
+            generators[1].random()
+            sampler(generators[2:3])
+            generators[3] = np.random.default_rng(9)
+
+
+def test_a_queue_serves_generators_whose_states_hold_arrays(sampler):
+    mine, theirs = (seeded(3, np.random.MT19937) for _ in range(2))
+    queue = SceneQueue(sampler, 3)
+    for _ in range(3):
+        assert equal(queue(mine, np.arange(3)), sampler(theirs))
+        assert following(mine) == following(theirs)
+
+
+def test_scenes_that_cannot_be_found_are_refused_by_sampler_and_queue_with_the_number_of_attempts():
+    order = DRAW_ORDER[3]._replace(groups=(1, 2))
+    distribution = SpaceDistribution(families=("tunnel",), n_obstacles=(8, 8))
+    sampler = SceneSampler(CollisionModel(PANDA, True), distribution, order=order)
+    with pytest.raises(
+        RuntimeError, match=r"no scene with \(8, 8\) obstacles was found in 3 attempts in the"
+    ):
+        sampler(seeded(20))
+    with pytest.raises(RuntimeError, match="in 3 attempts"):
+        SceneQueue(sampler, 20)(seeded(20), np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "steps"), [("PlanarWholeArm-v0", 9), ("PandaObstacles-v0", 9), ("PlanarWholeArmStep-v0", 250)]
+)
+def test_episodes_are_those_that_the_sampler_draws_from_the_generators_of_the_seeds(env_id, steps):
+    envs = gym.make_vec(f"viapoint/{env_id}", num_envs=5)
+    envs.reset(seed=0)
+    sampler, generators, ended = envs.unwrapped.task.sampler(), seeded(5), np.zeros(5)
+    sampler(generators)
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
+        rows = np.flatnonzero(terminated | truncated)
+        assert equal(envs.unwrapped.scenes.take(rows), sampler([generators[row] for row in rows]))
+        ended[rows] += 1
+    assert (ended >= 2).all()
+    envs.close()
