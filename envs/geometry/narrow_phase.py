@@ -73,7 +73,7 @@ def nearest_approach(
     thick, half = excursion + np.array(radii, np.float32), np.float32(0.5) * (second - first)
     centres, axes = (np.moveaxis(each, -1, 1).reshape(len(least), 3, -1) for each in (first + half, half))
     shown = np.where(present[..., None], obstacles, 0.0)
-    around, thick = ((norm(half) + thick).reshape(len(least), -1), thick.reshape(len(least), -1))
+    around, thick = (each.reshape(len(least), -1) for each in (norm(half) + thick, thick))
     bounds = ball_bounds(lift_quadratic(centres), around, shown, HalfLinks(axes, thick))
     size = np.array(radii)
 
