@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ RETRIES = 2
 """Number of times that a trial whose worker died is begun again."""
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # otherwise Ray replaces 127.0.0.1 by another address
+    "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
@@ -125,6 +126,9 @@ def _import_libraries() -> tuple[Any, Any]:
 @contextmanager
 def _connected(address: str | None, workers: int | None) -> Iterator[None]:
     """Connect to a cluster, or start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study."""
+    loopback = address is None or address.startswith(("127.0.0.1:", "localhost:"))
+    if loopback:  # otherwise Ray replaces 127.0.0.1 by another address of the machine
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     ray, _ = _import_libraries()
     if ray.is_initialized():
         yield
@@ -133,11 +137,15 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
     if address is None:
         settings |= {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
+        if address is not None:  # Ray itself tries for minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address=address or "local", **settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(
-            f"no Ray cluster can be used at {address} ({reason}); start one with: ray start --head"
+            f"no Ray cluster can be used at {address} ({reason}); `ray start --head` starts one, and one that has a "
+            "token needs RAY_AUTH_MODE=token"
         ) from None
     try:
         yield
@@ -150,14 +158,14 @@ def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> 
     _, tune = _import_libraries()
 
     def work(config: Values) -> None:
-        label = config["trial"].folder(Path()).as_posix()
+        metrics = {"label": config["trial"].folder(Path()).as_posix()}
         try:
             first = run_trial(config["trial"], folder)["rows"][0]
-        except Exception as error:  # worth no second try, unlike a worker that died
-            tune.report({"label": label, "error": _one_line(error)})
-        else:
             rate = 100.0 * first["solved"].count("1") / len(first["solved"])
-            tune.report({"label": f"{label}: {rate:.1f} % of {first['set']}"})
+            metrics["label"] += f": {rate:.1f} % of {first['set']}"
+        except Exception as error:  # worth no second try, unlike a worker that died
+            metrics["error"] = _one_line(error)
+        tune.report(metrics)
 
     tuner = tune.Tuner(
         tune.with_resources(work, lambda config: config["trial"].resources),
@@ -263,17 +271,19 @@ def _domain(tune: Any, given: Any) -> Any:
 
 def _write_search(search: Search, results: Any, folder: Path) -> None:
     """Write all trials of a search as CSV, and the best one as JSON with the command that trains it."""
-    paths = {f"config/{path}": path for path in search.parameters}
-    table = results.get_dataframe().rename(columns=paths)[[*search.parameters, "success", "decisions"]]
+    lines = [{**each.config, **each.metrics} for each in results if each.error is None]
+    table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
     # A training that was stopped early had less success than others with as many decisions.
     table = table.sort_values(["decisions", "success"], ascending=False)
-    place = search.folder(folder)
-    write_bytes(place / "trials.csv", table.to_csv(index=False).encode())
+    write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
     chosen = search.with_parameters({path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen.config(folder), out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"]}
-    write_json(place / "best.json", {**record, "training": config.as_json(), "command": config.command})
+    write_json(
+        search.folder(folder) / "best.json",
+        {**record, "training": config.as_json(), "command": config.command},
+    )
 
 
 def _one_line(error: BaseException) -> str:
