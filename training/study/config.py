@@ -233,9 +233,7 @@ def _study(
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
         for name, fields in _points(given or {}):
             if name in rows:
-                raise ValueError(
-                    f"agents, baselines and searches must have different names, {name} is there twice"
-                )
+                raise ValueError(f"rows must have different names, {name} is there twice")
             rows.add(name)
             for env in fields.pop("environments", list(known)):
                 if env not in known:
@@ -260,9 +258,7 @@ def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[st
             raise ValueError(f"{pattern} must be values by name, got {fields!r}")
         grid = (fields or {}).get("grid", {})
         if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
-            raise ValueError(
-                f"grid of {pattern} must be lists of values by the path of a field, got {grid!r}"
-            )
+            raise ValueError(f"grid of {pattern} must be lists by the path of a field, got {grid!r}")
         for values in itertools.product(*grid.values()):
             point, name = {key: value for key, value in (fields or {}).items() if key != "grid"}, str(pattern)
             for path, value in zip(grid, values, strict=True):

@@ -41,7 +41,8 @@ def run(config: StudyConfig) -> None:
     """Run a study from its file, and print where its tables are."""
     study = Study.from_yaml(config.file)
     table = run_study(study, out=config.out, address=config.address, workers=config.workers, told=print)
-    print(markdown(table, study.name))
+    if len(table):
+        print(markdown(table, study.name))
     print(f"tables and figures: {config.out or study.out}")
 
 
@@ -224,7 +225,7 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
     failed = _failures(results, search.trials)
     if len(failed) == search.trials:
         return failed
-    _write_search(search, results, folder)  # settings that cannot be trained do not end a search
+    told(_write_search(search, results, folder))  # settings that cannot be trained do not end a search
     return []
 
 
@@ -269,8 +270,8 @@ def _domain(tune: Any, given: Any) -> Any:
     return (tune.loguniform if log else tune.uniform)(low, high)
 
 
-def _write_search(search: Search, results: Any, folder: Path) -> None:
-    """Write all trials of a search as CSV, and the best one as JSON with the command that trains it."""
+def _write_search(search: Search, results: Any, folder: Path) -> str:
+    """Write all trials of a search as CSV and the best one as JSON, and return a line about it."""
     lines = [{**each.config, **each.metrics} for each in results if each.error is None]
     table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
     # A training that was stopped early had less success than others with as many decisions.
@@ -279,11 +280,9 @@ def _write_search(search: Search, results: Any, folder: Path) -> None:
     best = table.to_dict("records")[0]
     chosen = search.with_parameters({path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen.config(folder), out=None)
-    record = {"viapoint": "search", "key": search.key, "success": best["success"]}
-    write_json(
-        search.folder(folder) / "best.json",
-        {**record, "training": config.as_json(), "command": config.command},
-    )
+    record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
+    write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
+    return f"best of {search.name}, {100.0 * best['success']:.1f} %: {config.command}"
 
 
 def _one_line(error: BaseException) -> str:
