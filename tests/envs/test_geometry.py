@@ -9,6 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from viapoint.envs import (
     SHAPES,
@@ -40,7 +41,6 @@ ALL = pytest.mark.parametrize("kind", SHAPES)
 CLOSED = [kind for kind, shape in SHAPES.items() if shape.in_scenes and shape.sizes]
 """Shapes whose parameters may be a batch of sizes."""
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
-POSE = {"position": (0.1, -0.2, 0.3), "quaternion": (0.5, -0.5, 0.1, 0.7)}
 
 
 def searched(kind):
@@ -96,15 +96,10 @@ def test_the_search_that_a_new_shape_inherits_finds_the_same(kind, generator, se
 @ALL
 def test_capsules_along_faces_edges_and_axes(kind):
     """Where formulas divide by zero: segments that are parallel to, perpendicular to, or on something."""
-    shape = as_obstacle(
-        {
-            "shape": kind,
-            **{name: np.full(shape, 0.1) for name, shape in SHAPES[kind].sizes.items()},
-            **{
-                name: 2.0 * CUBE - 0.1 for name in ("vertices", "points") if name in SHAPES[kind].parameters()
-            },
-        }
-    )
+    values = {name: np.full(last, 0.1) for name, last in SHAPES[kind].sizes.items()}
+    for name in {"vertices", "points"} & set(SHAPES[kind].parameters()):
+        values[name] = 2.0 * CUBE - 0.1
+    shape = SHAPES[kind](**values)
     places = 0.1 * np.array(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij")).reshape(3, -1).T
     first, second = np.repeat(places, len(places), axis=0), np.tile(places, (len(places), 1))
     found = shape.segment_distance(first, second)
@@ -118,21 +113,15 @@ def test_capsules_along_faces_edges_and_axes(kind):
 @ALL
 def test_distances_move_with_the_shape(kind, generator, segments):
     shape, (first, second) = random_shape(kind, generator), segments
-    turn, shift = HalfSpace(**POSE).rotation, np.array([0.3, -0.1, 0.2])
-    matrix = turn @ shape.rotation
-    w = 0.5 * np.sqrt(max(1.0 + np.trace(matrix), 1e-9))
-    x, y, z = (
-        np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-        / 4
-        / w
+    turn, shift = Rotation.from_rotvec((0.5, -1.0, 2.0)), np.array([0.3, -0.1, 0.2])
+    quaternion = (turn * Rotation.from_matrix(shape.rotation)).as_quat(scalar_first=True)
+    place = turn.as_matrix() @ shape.position + shift
+    moved = as_obstacle({**shape.to_dict(), "position": place, "quaternion": quaternion})
+    there = [turn.apply(end) + shift for end in segments]
+    np.testing.assert_allclose(moved.distance(there[0]), shape.distance(first), atol=1e-7)
+    np.testing.assert_allclose(
+        moved.segment_distance(*there), shape.segment_distance(first, second), atol=1e-7
     )
-    values = {**shape.to_dict(), "position": turn @ shape.position + shift, "quaternion": (w, x, y, z)}
-    moved = as_obstacle(values)
-    for distance, ends in (("distance", [first]), ("segment_distance", [first, second])):
-        there = [end @ turn.T + shift for end in ends]
-        np.testing.assert_allclose(
-            getattr(moved, distance)(*there), getattr(shape, distance)(*ends), atol=1e-7
-        )
 
 
 @ALL
@@ -164,15 +153,11 @@ def test_descriptions_contain_the_shape(kind, generator):
     inside = places[shape.distance(places) < 0.0]
     assert len(inside) > 40
     assert (np.linalg.norm(inside - centre, axis=-1) <= radius).all()
-    outlines = shape.footprint()
     covered = np.zeros(len(inside), dtype=bool)
-    for outline in outlines:
-        following = np.roll(outline, -1, axis=0)
-        side = np.cross(
-            np.append(following - outline, np.zeros((len(outline), 1)), axis=1)[:, None],
-            np.append(inside[:, :2] - outline[:, None], np.zeros((len(outline), len(inside), 1)), axis=-1),
-        )[..., 2]
-        covered |= (side >= -2e-4).all(axis=0)
+    for outline in shape.footprint():
+        edge, apart = np.roll(outline, -1, axis=0) - outline, inside[:, None, :2] - outline
+        side = edge[:, 0] * apart[..., 1] - edge[:, 1] * apart[..., 0]
+        covered |= (side >= -2e-4).all(axis=1)
     assert kind == "half_space" or covered.all()
     middle, half = shape.box()
     if kind != "half_space":
@@ -199,10 +184,8 @@ def test_json_keeps_obstacles_as_they_are(kind, generator):
     assert obstacles_from_json(obstacles_to_json(every)) == every
     shape = every[0]
     named = as_obstacle({**shape.to_dict(), "name": "it"})
-    assert named.name == "it"
     assert named != shape
-    assert obstacles_from_json(obstacles_to_json([shape, named])) == [shape, named]
-    assert obstacles_from_json(obstacles_to_json([shape.to_dict()])) == [shape]
+    assert obstacles_from_json(obstacles_to_json([shape.to_dict(), named])) == [shape, named]
     assert json.loads(obstacles_to_json([shape]))[0]["shape"] == kind
 
 
@@ -226,20 +209,8 @@ def test_the_nearest_of_many_obstacles_is_the_least_of_all_distances(generator, 
     assert sum(asked) < 0.3 * len(balls) * len(segments[0])  # most are skipped
 
 
-def test_a_mesh_of_a_box_is_the_box(generator, segments):
-    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (0.1, 0.2, 0.05)
-    box, mesh = Box((0.1, 0.2, 0.05), **POSE_UNIT), ConvexMesh(corners, **POSE_UNIT)
-    assert len(mesh.polytope.offsets) == 6
-    assert len(mesh.polytope.edges) == 12
-    np.testing.assert_allclose(mesh.distance(segments[0]), box.distance(segments[0]), atol=1e-9)
-    np.testing.assert_allclose(mesh.segment_distance(*segments), box.segment_distance(*segments), atol=1e-9)
-
-
-POSE_UNIT = {**POSE, "quaternion": np.array(POSE["quaternion"]) / np.linalg.norm(POSE["quaternion"])}
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("parts", [2, 5, 7])
+@pytest.mark.parametrize("parts", [1, 2, 5, 7])
 def test_a_mesh_of_a_subdivided_box_is_the_box(parts, dtype, generator, segments):
     """Corners in lines give triangles of no area, and rounding tilts the others."""
     half, axis = np.array([0.05, 0.05, 0.08]), np.linspace(-1.0, 1.0, parts + 1)
@@ -257,7 +228,7 @@ def test_a_mesh_of_a_subdivided_box_is_the_box(parts, dtype, generator, segments
         np.testing.assert_allclose(mesh.distance(points), box.distance(points), atol=atol)
     np.testing.assert_allclose(mesh.segment_distance(*ends), box.segment_distance(*ends), atol=atol)
     if dtype is np.float64:
-        assert len(mesh.polytope.offsets) == 6
+        assert (len(mesh.polytope.offsets), len(mesh.polytope.edges)) == (6, 12)
     for inside in (0.9 * axis[:1], np.array([0.99, 0.1, -0.3])):
         with pytest.raises(ValueError):
             ConvexMesh(np.concatenate((surface, placed(inside * np.ones((1, 3))))))
@@ -329,81 +300,61 @@ def test_functions_of_lists_take_dictionaries(segments):
 DENTED = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0.1, 0.1, 0.1)])
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        "box",
-        {"size": (1, 1, 1)},
-        {"shape": 3},
-        {"shape": "torus"},
-        {"shape": "box"},
-        {"shape": "cylinder", "radius": 0.1},
-        {"shape": "box", "size": (1, 1, 1), "centre": 0},
-        {"shape": "box", "size": (0.1, -0.1, 0.1)},
-        {"shape": "box", "size": (0.1, 0.1)},
-        {"shape": "sphere", "radius": 0.0},
-        {"shape": "sphere", "radius": np.nan},
-        {"shape": "sphere", "radius": 0.1, "name": 3},
-        {"shape": "sphere", "radius": np.ones(4), "position": np.zeros((3, 3))},
-        {"shape": "capsule", "radius": "a", "half_length": 1},
-        {"shape": "half_space", "position": (0, 0)},
-        {"shape": "half_space", "position": (0, 0, np.inf)},
-        {"shape": "half_space", "quaternion": (1, 1, 0, 0)},
-        {"shape": "half_space", "quaternion": (0, 0, 0, 0)},
-        {"shape": "convex_mesh", "vertices": CUBE[:3]},
-        {"shape": "convex_mesh", "vertices": CUBE[:4]},
-        {"shape": "convex_mesh", "vertices": np.zeros((5, 3))},
-        {"shape": "convex_mesh", "vertices": CUBE * np.nan},
-        {"shape": "convex_mesh", "vertices": CUBE * 1e200},
-        {"shape": "convex_mesh", "vertices": DENTED},
-        {"shape": "point_cloud", "points": [(0, 0, 0), (0, np.nan, 0)]},
-        {"shape": "point_cloud", "points": np.zeros((0, 3))},
-        {"shape": "point_cloud", "points": CUBE, "radius": 0},
-        {"shape": "point_cloud", "points": CUBE, "radius": np.ones(8)},
+REFUSED = {
+    "sphere": [{"radius": radius} for radius in (0.0, np.nan, -0.1, "a")],
+    "capsule": [{"radius": 0.1, "half_length": 0.1, "name": 3}, {"radius": 0.1}],
+    "cylinder": [{"radius": np.ones(4), "half_length": 1.0, "position": np.zeros((3, 3))}],
+    "box": [{}, {"size": (0.1, -0.1, 0.1)}, {"size": (0.1, 0.1)}, {"size": (1, 1, 1), "centre": 0}],
+    "half_space": [
+        *({"position": position} for position in ((0, 0), (0, 0, np.inf))),
+        *({"quaternion": quaternion} for quaternion in ((1, 1, 0, 0), (0, 0, 0, 0))),
     ],
-)
+    "convex_mesh": [
+        {"vertices": vertices}
+        for vertices in (CUBE[:3], CUBE[:4], np.zeros((5, 3)), CUBE * np.nan, CUBE * 1e200, DENTED)
+    ],
+    "point_cloud": [
+        *({"points": points} for points in ([(0, 0, 0), (0, np.nan, 0)], np.zeros((0, 3)))),
+        *({"points": CUBE, "radius": radius} for radius in (0, np.ones(8))),
+    ],
+    "torus": [{}],
+    3: [{}],
+}
+
+
+@pytest.mark.parametrize(
+    "value", ["box", {"size": (1, 1, 1)}, *({"shape": kind, **each} for kind in REFUSED for each in REFUSED[kind])]
+)  # fmt: skip
 def test_invalid_obstacles_are_refused_with_their_index(value):
     with pytest.raises(ValueError, match=r"^obstacle 1: "):
         as_obstacles([Sphere(0.1), value])
 
 
-POINT, BALLS = np.ones(3), Sphere(np.ones(2))
+POINT, BALL, BALLS = np.ones(3), Sphere(0.1), Sphere(np.ones(2))
 
 
 @pytest.mark.parametrize(
     ("function", "arguments"),
     [
-        (HalfSpace.facing, ((0, 0, 0),)),
-        (HalfSpace.facing, ((0, np.nan, 1),)),
-        (HalfSpace.facing, ((0, 1),)),
-        (Capsule.between, ((0, 1), np.zeros((2, 3)), 0.1)),
-        (Capsule.between, ((0, 1), (0, 1), 0.1)),
-        (Capsule.between, ((0, 1), (0, np.inf), 0.1)),
-        (ConvexMesh.hull, (CUBE[:4],)),
-        (ConvexMesh.hull, (CUBE[:3],)),
-        (PointCloud.covering, (CUBE, -1.0)),
-        (PointCloud.covering, (CUBE, 0.2, -0.1)),
-        (BALLS.box, ()),
-        (BALLS.footprint, ()),
+        *((HalfSpace.facing, (normal,)) for normal in ((0, 0, 0), (0, np.nan, 1), (0, 1))),
+        *((Capsule.between, ((0, 1), end, 0.1)) for end in (np.zeros((2, 3)), (0, 1), (0, np.inf))),
+        *((ConvexMesh.hull, (points,)) for points in (CUBE[:4], CUBE[:3])),
+        *((PointCloud.covering, (CUBE, *numbers)) for numbers in ((-1.0,), (0.0,), (0.2, -0.1))),
+        *((method, ()) for method in (BALLS.box, BALLS.footprint, BALLS.geoms)),
         (add_to_model, (mujoco.MjSpec(), [BALLS])),
-        (add_to_model, (mujoco.MjSpec(), [Sphere(0.1, name="obstacle_1"), Sphere(0.1)])),
-        (signed_distances, (Sphere(0.1), POINT)),
-        (signed_distances, (None, POINT)),
-        (signed_distances, ([{"shape": "boxx"}], POINT)),
-        (nearest_distance, (Sphere(0.1), POINT)),
-        (nearest_distance, ([BALLS], POINT)),
-        (nearest_distance, ([Sphere(0.1)], None)),
-        (nearest_distance, ([Sphere(0.1)], POINT * np.nan)),
-        (nearest_distance, ([Sphere(0.1)], POINT, POINT * np.inf)),
-        (nearest_distance, ([Sphere(0.1)], POINT, None, 0.0, np.nan)),
-        (nearest_distance, ([Sphere(0.1)], np.ones((4, 3)), None, np.ones(3))),
+        (add_to_model, (mujoco.MjSpec(), [Sphere(0.1, name="obstacle_1"), BALL])),
+        *((signed_distances, (each, POINT)) for each in (BALL, None, [{"shape": "boxx"}])),
+        *((nearest_distance, (each, POINT)) for each in (BALL, [BALLS])),
+        *(
+            (nearest_distance, ([BALL], *ends))
+            for ends in ((None,), (POINT * np.nan,), (POINT, POINT * np.inf))
+        ),
+        (nearest_distance, ([BALL], POINT, None, 0.0, np.nan)),
+        (nearest_distance, ([BALL], np.ones((4, 3)), None, np.ones(3))),
         (Cylinder(0.1, 0.2).segment_distance, (np.ones((4, 3)), np.ones((5, 3)))),
         (Box((0.1, 0.1, 0.1)).distance, (np.ones((2, 3)), np.ones(3))),
-        (obstacles_from_json, ("[",)),
-        (obstacles_from_json, ("{}",)),
-        (obstacles_from_json, ("[" * 100_000,)),
-        (observation_rows, ([Sphere(0.1), Sphere(0.1)], 1)),
-        (observation_rows, ([], 1.5)),
+        *((obstacles_from_json, (text,)) for text in ("[", "{}", "[" * 100_000)),
+        *((observation_rows, given) for given in (([BALL, BALL], 1), ([], 1.5))),
     ],
 )
 def test_invalid_arguments_are_refused(function, arguments):
