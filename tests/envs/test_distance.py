@@ -37,16 +37,6 @@ def test_segment_distance_is_the_least_of_all_point_distances(dimension):
     np.testing.assert_allclose(exact, brute, atol=3e-3)
 
 
-def test_parallel_and_degenerate_segments():
-    link = np.array([[[0.0, 0.0]]]), np.array([[[1.0, 0.0]]])
-    obstacles = np.array(
-        [[[0.5, 0.2, 0.1, 0.0, 0.01], [2.0, 0.0, 0.3, 0.0, 0.01], [0.5, 0.0, 0.0, 0.0, 0.01]]]
-    )
-    np.testing.assert_allclose(
-        np.sqrt(segment_distance_squared(*link, obstacles))[0, :, 0], [0.2, 0.7, 0.0], atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("whole_arm", [False, True])
 def test_contact_exactly_where_clearance_is_negative(whole_arm):
     number = 3000

@@ -386,25 +386,17 @@ BARS = [Capsule.between((-0.1, 0.35), (0.0, 0.38), 0.02), Sphere(0.03, position=
 ENDS = {"start": (-0.3, 0.3), "goal": (0.2, 0.35)}
 
 
-def test_reset_takes_shapes_and_dictionaries_as_obstacles():
-    env = gym.make("viapoint/PlanarObstacles-v0").unwrapped
-    rows = obstacle_rows(BARS, 2)
-    wanted, _ = env.reset(seed=0, options={**ENDS, "obstacles": rows})
-    for obstacles in (BARS, tuple(each.to_dict() for each in BARS)):
-        observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": obstacles})
-        np.testing.assert_array_equal(observation["obstacles"], wanted["obstacles"])
-    assert [each.kind for each in obstacles_from_rows(env.batch.scenes.obstacles[0])] == ["capsule", "sphere"]
-    again = obstacle_rows(obstacles_from_rows(env.batch.scenes.obstacles[0]), 2)
-    np.testing.assert_allclose(again, rows, atol=1e-12)
-    several, _ = env.reset(seed=1, options={"obstacles": BARS})  # start and goal are drawn clear of them
-    assert several["obstacles"][-7] == 0.0
+def test_reset_and_plans_take_shapes_dictionaries_and_rows_alike():
+    env, rows = gym.make("viapoint/PlanarObstacles-v0").unwrapped, obstacle_rows(BARS, 2)
+    search, plans = GeometrySearch("viapoint/PlanarObstacles-v0", 32), []
+    for obstacles in (BARS, [each.to_dict() for each in BARS], rows.tolist()):
+        env.reset(seed=0, options={**ENDS, "obstacles": obstacles})
+        np.testing.assert_array_equal(env.batch.scenes.obstacles[0, :2], rows)
+        plans.append(search.plan(**ENDS, obstacles=obstacles).waypoints)
+        np.testing.assert_array_equal(plans[0], plans[-1])
+    np.testing.assert_allclose(obstacle_rows(obstacles_from_rows(rows), 2), rows, atol=1e-12)
+    env.reset(seed=1, options={"obstacles": BARS})  # start and goal are drawn clear of them
     env.close()
-
-
-def test_plans_avoid_shapes_as_they_avoid_rows():
-    search = GeometrySearch("viapoint/PlanarObstacles-v0", 32)
-    plans = [search.plan(**ENDS, obstacles=each) for each in (BARS, obstacle_rows(BARS, 2).tolist())]
-    np.testing.assert_array_equal(plans[0].waypoints, plans[1].waypoints)
 
 
 @pytest.mark.parametrize("kind", CLOSED)

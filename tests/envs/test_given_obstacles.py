@@ -44,28 +44,26 @@ def several():
     made.close()
 
 
+CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
+
+
 @pytest.mark.parametrize("ends", [ENDS, {}], ids=["ends given", "ends drawn"])
 @pytest.mark.parametrize(
     "obstacles",
     [
-        [HOUSE],
-        [[CRATE, HOUSE.to_dict()]],
-        [CRATE, PLINTH],
-        [CRATE, Box((1.5, 0.1, 0.1), name="long")],
-        [Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0), name="far")],
-        [Cylinder(0.1, 0.1, name="can")],
-        [ConvexMesh([*np.eye(3), (0, 0, 0)], name="mesh")],
-        [HalfSpace(position=(0.3, 0.0, -1.5))],
-        [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0), name="wall")],
-        [HalfSpace(position=(0.0, 0.0, 0.9))],
+        [HOUSE], [[CRATE, HOUSE.to_dict()]], [CRATE, PLINTH], [HalfSpace(position=(0.0, 0.0, 0.9))],  # touch the arm
+        [Box((1.5, 0.1, 0.1))], [Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0))],  # too large, too far
+        [HalfSpace(position=(0.3, 0.0, -1.5))], [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0))],
+        [Cylinder(0.1, 0.1)], [ConvexMesh(CUBE)], [{"shape": "pyramid"}],  # not among the shapes
+        [PointCloud([*CUBE, *CUBE])], [PointCloud(np.full((300, 3), 0.3))], [CRATE] * 9,  # too many
+        np.zeros((1, 9, 15)),
+        CRATE, CRATE.to_dict(), None, obstacles_to_json([CRATE]), np.array([CRATE]), (each for each in [CRATE]),
+        [[0.1, 0.2], [0.3]], [[0.5, 0.0, 0.3, 0.0, 0.0, 0.1, -0.03]], np.zeros((1, 7), dtype=bool),
+        np.full((1, 7), np.nan), np.full((1, 15), 0.1),  # no row of a shape
     ],
-)
-def test_obstacles_that_touch_the_arm_or_exceed_the_limits_are_refused(env, obstacles, ends):
-    last = obstacles[0][-1] if isinstance(obstacles[0], list) else obstacles[-1]
-    name = "house" if isinstance(last, dict) else last.name
-    with pytest.raises(
-        ValueError, match=rf"obstacle {len(np.ravel(obstacles)) - 1} .*{name}"
-    ):  # as the user gave it
+)  # fmt: skip
+def test_impossible_obstacles_are_refused(env, obstacles, ends):
+    with pytest.raises(ValueError):
         env.reset(seed=0, options={**ends, "obstacles": obstacles})
 
 
@@ -85,26 +83,6 @@ def test_half_spaces_up_to_the_limit_are_in_the_observation_space(env, normal):
     assert env.observation_space.contains(observation)
     with pytest.raises(ValueError):
         env.reset(options={**ENDS, "obstacles": [HalfSpace.facing(normal, position=-1.01 * normal)]})
-
-
-@pytest.mark.parametrize(
-    "obstacles",
-    [
-        [CRATE] * 9,
-        np.zeros((1, 9, 15)),
-        CRATE,
-        CRATE.to_dict(),
-        None,
-        obstacles_to_json([CRATE]),
-        np.array([CRATE]),
-        (each for each in [CRATE]),
-        [[0.1, 0.2], [0.3]],
-        np.zeros((1, 7), dtype=bool),
-    ],
-)
-def test_lists_of_something_else_or_too_long_are_refused(env, obstacles):
-    with pytest.raises(ValueError):
-        env.reset(seed=0, options={**ENDS, "obstacles": obstacles})
 
 
 def test_observation_rows_take_dictionaries():
@@ -169,17 +147,11 @@ def test_changes_of_a_scene_survive_json():
 @pytest.mark.parametrize(
     "options",
     [
-        [],
-        {"begin": (0.1, 0.2)},
-        {"obstacles": HOUSE},
-        {"obstacles": [[HOUSE], [CRATE]]},
-        {"obstacles": [{"shape": "cube"}]},
-        {"goal": np.zeros((2, 3))},
-        {"start": "here"},
-        {"start": (np.nan, 0.0, 0.1)},
-        {"start": (True, False, True)},
+        [], {"begin": (0.1, 0.2)}, {"goal": np.zeros((2, 3))},
+        {"start": "here"}, {"start": (np.nan, 0.0, 0.1)}, {"start": (True, False, True)},
+        {"obstacles": HOUSE}, {"obstacles": [[HOUSE], [CRATE]]}, {"obstacles": [{"shape": "cube"}]},
     ],
-)
+)  # fmt: skip
 def test_invalid_scenes_are_not_written(options):
     with pytest.raises(ValueError):
         scene_to_json(options)
@@ -218,14 +190,10 @@ def box_row(half=(0.03, 0.04, 0.05), kind="box", quaternion=(1.0, 0.0, 0.0, 0.0)
 @pytest.mark.parametrize(
     ("kind", "half"),
     [
-        ("box", (-0.3, 0.05, 0.05)),
-        ("box", (0.0, 0.05, 0.05)),
-        ("cylinder", (0.05, 0.06, 0.1)),
-        ("cylinder", (0.05, 0.05, -0.1)),
-        ("capsule", (0.05, 0.05, 0.02)),
-        ("sphere", (0.05, 0.05, 0.1)),
+        ("box", (-0.3, 0.05, 0.05)), ("box", (0.0, 0.05, 0.05)), ("cylinder", (0.05, 0.06, 0.1)),
+        ("cylinder", (0.05, 0.05, -0.1)), ("capsule", (0.05, 0.05, 0.02)), ("sphere", (0.05, 0.05, 0.1)),
     ],
-)
+)  # fmt: skip
 def test_rows_of_shapes_have_possible_half_lengths(kind, half):
     env = gym.make(PANDA, shapes=("capsule", "sphere", "box", "cylinder")).unwrapped
     with pytest.raises(ValueError):
@@ -267,18 +235,10 @@ def test_walls_are_observed_where_they_are(env_id, ends):
 
 
 GOOD = shape_rows("box", np.zeros(3), np.array((1.0, 0.0, 0.0, 0.0)), np.full(3, 0.1))
+UNKNOWN = [np.where(np.arange(len(GOOD)) == 6, kind, GOOD)[None] for kind in (99.0, -1.0, 2.7)]
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [
-        *(np.stack((GOOD, np.where(np.arange(len(GOOD)) == 6, kind, GOOD))) for kind in (99.0, -1.0, 2.7)),
-        np.ones(7),
-        np.ones((2, 2, 7)),
-        np.ones((1, 6)),
-        "rows",
-    ],
-)
+@pytest.mark.parametrize("rows", [*UNKNOWN, np.ones(7), np.ones((2, 2, 7)), np.ones((1, 6)), "rows"])
 def test_obstacles_are_read_from_a_table_of_rows_of_known_kinds(rows):
     with pytest.raises(ValueError):
         obstacles_from_rows(rows)

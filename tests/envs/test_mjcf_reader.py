@@ -106,6 +106,8 @@ def test_weak_joints_are_given_time(limit, factor):
     *_, info = env.step(np.zeros((16, 4), np.float32))
     assert info["is_success"].all()
     assert info["stretch"].mean() > factor
+    centre = env.unwrapped.action_layout.centre_duration
+    np.testing.assert_allclose(info["duration"], centre * info["stretch"])
     env.close()
 
 
@@ -118,7 +120,7 @@ def test_actuators_may_act_on_the_joint_in_its_parents_frame(tmp_path):
 
 def test_a_workspace_that_is_reached_is_taken_whatever_its_corners():
     box = ((0.24, -0.40, 0.09), (0.61, 0.41, 0.37))
-    arm = ur5e(workspace=box)
+    arm = ur5e(workspace=((0.61, -0.40, 0.37), (0.24, 0.41, 0.09)))
     assert arm.workspace == box
     low, high = np.array(arm.ik.box)
     assert (low <= box[0]).all()

@@ -187,14 +187,9 @@ def test_random_scenes_have_all_shapes_and_contact_is_negative_clearance(env_id,
 
 def test_what_replaces_a_capsule_is_inside_it(generator):
     for d in (2, 3):
-        rows = np.concatenate(
-            (
-                generator.uniform(-0.3, 0.3, (200, d)),
-                generator.uniform(-0.1, 0.1, (200, d)),
-                np.full((200, 1), 0.03),
-            ),
-            axis=-1,
-        )
+        rows = np.full((200, 2 * d + 1), 0.03)
+        rows[:, :d] = generator.uniform(-0.3, 0.3, (200, d))
+        rows[:, d : 2 * d] = generator.uniform(-0.1, 0.1, (200, d))
         rows[::2, d : 2 * d] = 0.0
         other = reshaped(rows, generator.random((200, RESHAPE_NUMBERS)), ("sphere", "box", "cylinder"))
         points = np.zeros((200, 3))
@@ -203,18 +198,13 @@ def test_what_replaces_a_capsule_is_inside_it(generator):
         np.testing.assert_array_equal(other[:, :d], rows[:, :d])
 
 
-def ellipsoid():
-    """The class of CONTRIBUTING.md."""
+def test_the_ellipsoid_of_contributing_can_be_in_scenes(monkeypatch, generator):
     page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (code,) = [each for each in blocks if "class Ellipsoid" in each]
     names = {}
     exec(code.partition("SHAPES[Ellipsoid.kind]")[0], names)
-    return names["Ellipsoid"]
-
-
-def test_an_ellipsoid_of_ones_own_can_be_in_scenes(monkeypatch, generator):
-    monkeypatch.setitem(SHAPES, "ellipsoid", ellipsoid())
+    monkeypatch.setitem(SHAPES, "ellipsoid", names["Ellipsoid"])
     values = {"size": (0.03, 0.04, 0.06), "position": (0.45, 0.0, 0.4), "quaternion": (0.6, 0.8, 0.0, 0.0)}
     egg, points = as_obstacle({"shape": "ellipsoid", **values}), generator.uniform(-0.2, 0.8, (200, 3))
     env = gym.make(PANDA, shapes=("capsule", "ellipsoid")).unwrapped
@@ -232,31 +222,6 @@ def test_an_ellipsoid_of_ones_own_can_be_in_scenes(monkeypatch, generator):
 CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
 
 
-@pytest.mark.parametrize(
-    "obstacles",
-    [
-        [Box((0.3, 0.3, 0.3), position=(0.45, -0.3, 0.4))],
-        [Box((0.05, 0.05, 2.0), position=(0.5, 0.0, 0.3))],
-        [Sphere(0.05, position=(3.0, 0.0, 0.3))],
-        [ConvexMesh(CUBE, name="die")],
-        [PointCloud([CUBE[0], (0.45, -0.33, 0.4)])],
-        [PointCloud([*CUBE, *CUBE])],
-        [PointCloud(np.full((300, 3), 0.3))],
-        [{"shape": "point_cloud", "points": [(np.nan, 0.0, 0.0)]}],
-        [{"shape": "convex_mesh", "vertices": [*CUBE, (0.05, 0.05, 0.05)]}],
-        [{"shape": "box", "size": (0.1, 0.0, 0.1)}],
-        [{"shape": "box", "size": (0.1, 0.1, 0.1), "quaternion": (1, 1, 0, 0)}],
-        [{"shape": "pyramid"}],
-        np.full((1, 15), 0.1),
-        np.full((1, 7), np.nan),
-        [[0.5, 0.0, 0.3, 0.0, 0.0, 0.1, -0.03]],
-    ],
-)
-def test_impossible_obstacles_are_refused(env, obstacles):
-    with pytest.raises(ValueError):
-        env.reset(options={**ENDS, "obstacles": obstacles})
-
-
 @pytest.fixture
 def mesh():
     name = register_example("lump")
@@ -271,14 +236,10 @@ def test_contact_with_a_mesh_in_mujoco_is_negative_clearance(mesh):
 
 
 def test_a_registered_mesh_is_an_obstacle_of_scenes(mesh, generator):
-    shape = ConvexMesh(
-        mesh.mesh.vertices, position=(0.45, 0.0, 0.4), quaternion=(0.6, 0.0, 0.8, 0.0), name="a"
-    )
-    named = {"shape": "lump", "position": (0.45, 0.0, 0.4), "quaternion": (0.6, 0.0, 0.8, 0.0)}
-    envs, points = (
-        gym.make_vec(PANDA, num_envs=2, shapes=("box", "lump")),
-        generator.uniform(-0.2, 0.8, (200, 3)),
-    )
+    pose = {"position": (0.45, 0.0, 0.4), "quaternion": (0.6, 0.0, 0.8, 0.0)}
+    shape, named = ConvexMesh(mesh.mesh.vertices, **pose), {"shape": "lump", **pose}
+    envs = gym.make_vec(PANDA, num_envs=2, shapes=("box", "lump"))
+    points = generator.uniform(-0.2, 0.8, (200, 3))
     observation, _ = envs.reset(options={**ENDS, "obstacles": [[shape], [CRATE, as_obstacle(named)]]})
     centre, half = shape.box()
     np.testing.assert_allclose(observation["obstacles"][0, 0, :5], (0, 1, *centre), atol=1e-6)
@@ -358,8 +319,6 @@ def test_a_coarse_cloud_contains_the_fine_one(generator):
     assert len(coarse.points) <= 4**3
     where = generator.uniform(-0.3, 0.6, (500, 3))
     assert (coarse.distance(where) <= fine.distance(where) + 1e-12).all()
-    with pytest.raises(ValueError):
-        PointCloud.covering(points, 0.0)
 
 
 @pytest.mark.parametrize("shapes", [(), ("box", "box"), ("pyramid",), ("convex_mesh",), ("half_space",), 3])
