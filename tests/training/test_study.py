@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from viapoint.training import Study, run_study
-from viapoint.training.study.run import StudyFailedError
+from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
 from viapoint.training.study.tables import COLUMNS, markdown
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -48,16 +48,24 @@ def results_in(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A study that ran through."""
+def ray():
+    """One Ray for all studies of this process, as each start takes seconds."""
+    ray, _ = _import_libraries()
+    with _connected(None, 2):
+        yield ray
+
+
+@pytest.fixture(scope="module")
+def whole(ray, tmp_path_factory):
+    """A study that ran through: its folder, table, lines and results."""
     folder = tmp_path_factory.mktemp("whole") / "out"
     told = []
     table = run_study(Study.from_dict(GIVEN), out=folder, told=told.append)
-    return folder, table, told
+    return folder, table, told, results_in(folder)
 
 
 def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
-    folder, table, told = whole
+    folder, table, told, before = whole
     assert list(table.columns) == COLUMNS
     assert len(told) == 7  # two agents with two seeds each, and three baselines
     rows = table.set_index("method")
@@ -71,7 +79,6 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     pd.testing.assert_frame_equal(pd.read_csv(folder / "results.csv"), table, check_dtype=False)
     assert "| straight" in (folder / "results.md").read_text()
     assert (folder / "PlanarObstacles-v0.png").stat().st_size > 10_000
-    before = results_in(folder)
     again, lines = run_study(Study.from_dict(GIVEN), out=folder), []
     pd.testing.assert_frame_equal(again, table, check_dtype=False)
     assert results_in(folder) == before
@@ -81,7 +88,7 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
 
 
 def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
-    folder, _, _ = whole
+    folder = whole[0]
     before = results_in(folder)
     other = {**GIVEN, "agents": {"viaq": {**TRAINING, "hyperparameters": {**FEW, "batch_size": 8}}}}
     with pytest.raises(StudyFailedError, match="other settings"):
@@ -107,7 +114,7 @@ def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
     lines = []
     run_study(Study.from_dict(GIVEN), out=folder, told=lines.append)
     assert len(lines) == 7 - complete
-    assert results_in(folder) == results_in(whole[0])
+    assert results_in(folder) == whole[3]
 
 
 def test_two_nodes_have_the_same_results(whole, tmp_path):
@@ -128,10 +135,10 @@ def test_two_nodes_have_the_same_results(whole, tmp_path):
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(GIVEN))
     words = [sys.executable, script, tmp_path / "study.yaml", tmp_path / "out"]
     subprocess.run(words, check=True, timeout=300, capture_output=True)
-    assert results_in(tmp_path / "out") == results_in(whole[0])
+    assert results_in(tmp_path / "out") == whole[3]
 
 
-def test_a_search_writes_its_best_settings_and_a_command_for_them(tmp_path):
+def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path):
     parameters = {
         "hyperparameters.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
         "hyperparameters.batch_size": [16, 32],

@@ -365,6 +365,8 @@ def _search(
         trials=check_whole("trials", trials, 1),
         first=tuple(first or ()),
     )
+    if not parameters:
+        raise ValueError("parameters must hold at least one list or range")
     if not search.trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
     for path in [path for each in search.first for path in each if path not in parameters]:
