@@ -43,7 +43,7 @@ versions: $(READY) ## the suite with the oldest versions that are allowed, in an
 	@$(BIN)/python benchmarks/versions.py oldest
 
 bench: $(READY)  ## throughput as ratios
-	@$(BIN)/viapoint bench
+	@$(BIN)/python benchmarks/throughput.py
 
 clean:           ## remove the virtual environment, caches and runs
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from viapoint.training.algorithms.agent import Agent, load_agent
     from viapoint.training.algorithms.extractors import SceneExtractor
-    from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback, time_discount
     from viapoint.training.algorithms.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
-    from viapoint.training.rollouts.ray_vec_env import LostEpisodesCallback, RayVecEnv
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
@@ -25,12 +23,9 @@ if TYPE_CHECKING:
 else:
     _MODULES = {
         "Agent": "viapoint.training.algorithms.agent",
-        "ElapsedTimeCallback": "viapoint.training.algorithms.smdp_buffers",
         "EvaluationResult": "viapoint.training.evaluation.evaluator",
         "GeometrySearch": "viapoint.training.search.geometry_search",
-        "LostEpisodesCallback": "viapoint.training.rollouts.ray_vec_env",
         "ObserveCandidates": "viapoint.training.search.observe_candidates",
-        "RayVecEnv": "viapoint.training.rollouts.ray_vec_env",
         "LivePage": "viapoint.training.live.page",
         "Run": "viapoint.training.runs.run_dir",
         "SceneExtractor": "viapoint.training.algorithms.extractors",
@@ -42,7 +37,6 @@ else:
         "evaluate": "viapoint.training.evaluation.evaluator",
         "load_agent": "viapoint.training.algorithms.agent",
         "run_study": "viapoint.training.study.run",
-        "time_discount": "viapoint.training.algorithms.smdp_buffers",
         "train": "viapoint.training.runs.trainer",
     }
 
@@ -62,13 +56,10 @@ else:
 
 __all__ = [
     "Agent",
-    "ElapsedTimeCallback",
     "EvaluationResult",
     "GeometrySearch",
     "LivePage",
-    "LostEpisodesCallback",
     "ObserveCandidates",
-    "RayVecEnv",
     "Run",
     "SceneExtractor",
     "Study",
@@ -79,6 +70,5 @@ __all__ = [
     "evaluate",
     "load_agent",
     "run_study",
-    "time_discount",
     "train",
 ]

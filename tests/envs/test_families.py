@@ -27,7 +27,7 @@ from viapoint.envs.scenes.sampler import SHARED_GROUPS, SceneSampler
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.envs.scenes.spatial_families import THICKNESS
 
-PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
 HAND, WHOLE_ARM = "viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"
 SPACE = "viapoint/PandaObstacles-v0"
 FAMILIES = tuple(scene_families(2))

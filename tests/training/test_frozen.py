@@ -30,7 +30,7 @@ from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, bands, l
 from viapoint.training.search.geometry_search import GeometrySearch
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "environments.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "scenes.md").read_text(encoding="utf-8")
 ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 
 

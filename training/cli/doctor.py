@@ -36,7 +36,7 @@ OPTIONAL = {
 """Packages that only some features need, and these features."""
 MODULES = {"pyyaml": "yaml"}
 """Modules of packages with other names."""
-EXTRAS = {"mjviser": "live", "optuna": "tuning", "ray": "cluster", "viser": "live"}
+EXTRAS = {"mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
 """Extras of packages that a command imports when it needs them."""
 BROWSERS = ("chromium", "google-chrome", "chromium-browser", "microsoft-edge", "firefox")
 """Programs that show the live page."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
 
 import tyro
 
@@ -20,16 +22,13 @@ from viapoint.training.config.checks import (
     check_file,
     check_folder,
     check_has_scenes,
-    check_hyperparameters,
     check_observed,
-    check_rollout_workers,
     check_stalling,
     check_whole,
     check_whole_movements,
 )
-from viapoint.training.config.discount import check_discount_unit
-from viapoint.training.config.key_values import NamedValues, to_words
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
+from viapoint.training.io.files import parse_yaml
 
 ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
@@ -44,6 +43,42 @@ if TYPE_CHECKING:
     AnyPath = str | Path
 else:
     AnyPath = Path  # the command line makes paths of words
+
+
+def _from_words(words: list[str]) -> dict[str, Any]:
+    """Return NAME=VALUE words as a dictionary; values are YAML, so that lists and settings by name have a form."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name:
+            raise ValueError(f"must be NAME=VALUE, got {word!r}")
+        if name in values:
+            raise ValueError(f"{name} is there twice")
+        values[name] = parse_yaml(text)
+    return values
+
+
+def _to_words(values: Mapping[str, Any]) -> list[str]:
+    """Return a dictionary as NAME=VALUE words; :func:`_from_words` is the inverse."""
+    words = []
+    for name, value in values.items():
+        plain = isinstance(value, str) and parse_yaml(value) == value
+        words.append(f"{name}={value if plain else json.dumps(value)}")
+    return words
+
+
+# tyro reads a dictionary of one type of values only.
+NamedValues = Annotated[
+    dict[str, Any],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME=VALUE",
+        instance_from_str=_from_words,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=_to_words,
+    ),
+]
+"""Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +97,9 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 40000)
     """
 
-    least: ClassVar = dict.fromkeys(
-        ("seed", "eval_every", "observe_candidates", "rollout_workers"), 0
-    ) | dict.fromkeys(("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1)
+    least: ClassVar = dict.fromkeys(("seed", "eval_every", "observe_candidates"), 0) | dict.fromkeys(
+        ("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
+    )
 
     env: EnvId = DEFAULT_ENV
     """Id of the environment."""
@@ -93,17 +128,11 @@ class TrainConfig(Config):
     observe_candidates: int = 0
     """Plans whose clearance is observed; not for viaq."""
     env_kwargs: NamedValues = field(default_factory=dict)
-    """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
+    """Arguments of the environment, values in YAML: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
     """Hyperparameters that replace those of the preset, in the same form: batch_size=256."""
-    discount_unit: float | None = None
-    """Time that gamma discounts once, [s]; default: that of the preset."""
     progress: bool = True
     """Show a progress bar."""
-    rollout_workers: int = 0
-    """Processes that share the environments, 0 for none."""
-    on: str = "local"
-    """Place of rollout workers: local, ray or ray://HOST:PORT."""
 
     def _check(self) -> None:
         check_env(self.env)
@@ -116,10 +145,8 @@ class TrainConfig(Config):
             )
         check_observed(self.observe_candidates, self.algo, self.env)
         check_env_kwargs(self.env_kwargs)
-        check_rollout_workers(self.rollout_workers, self.on, None if self.resume else self.copies)
-        check_hyperparameters(self.algo, self.hyperparameters)
-        if self.discount_unit is not None:
-            check_discount_unit(self.algo, self.discount_unit, self.env)
+        if not isinstance(self.hyperparameters, Mapping):
+            raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
         limits = self.least_timesteps, self.total_timesteps
         check_stalling(self.stop_when_stalled, self.min_timesteps, self.evaluation_interval, limits)
 
@@ -154,22 +181,17 @@ class TrainConfig(Config):
         return self.checkpoint_every or self.preset.checkpoint_every
 
     @property
-    def time_unit(self) -> float | None:
-        """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
-        return self.preset.discount_unit if self.discount_unit is None else self.discount_unit
-
-    @property
     def command(self) -> str:
         """Command that trains with this configuration, apart from where it is written and what is shown."""
         words = ["viapoint", "train"]
-        for name in ("env", "algo", "seed", "n_timesteps", "n_envs", "discount_unit"):
+        for name in ("env", "algo", "seed", "n_timesteps", "n_envs"):
             value = getattr(self, name)
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", f"{value}"]
         for name in ("env_kwargs", "hyperparameters"):
             values = getattr(self, name)
             if values:
-                words += [f"--{name.replace('_', '-')}", *to_words(values)]
+                words += [f"--{name.replace('_', '-')}", *_to_words(values)]
         return shlex.join(words)
 
     @property
@@ -206,9 +228,9 @@ class EvaluateConfig(AgentConfig):
     """
 
     baselines: tuple[str, ...] = ("straight", "random", "planner")
-    """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
-    search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
-    with replanning, unrevised (the first plan alone)."""
+    """Some of straight, constant, random, random16, random80, planner, ompl, search512 or another number (the best of
+    that many computed plans), sobol512 (of fixed plans), random_order512; with an agent, untrained (its network before
+    training); in tasks with replanning, unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
@@ -217,8 +239,6 @@ class EvaluateConfig(AgentConfig):
     """Number of scenes, evenly spread over the set; all if not given."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
-    failures: Path | None = None
-    """Folder for counts and pictures of the agent's failures by kind, those of its last row in the table."""
     env: Annotated[str | None, ENV] = None
     """Id of the environment; default: that of the agent."""
 
@@ -236,10 +256,8 @@ class EvaluateConfig(AgentConfig):
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         check_file("json", self.json)
-        check_folder("failures", self.failures)
-        for name, asked in (("checks", any(self.checks)), ("failures", self.failures is not None)):
-            if asked and self.agent is None:
-                raise ValueError(f"{name} concerns an agent, and none is given")
+        if any(self.checks) and self.agent is None:
+            raise ValueError("checks concerns an agent, and none is given")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,36 +307,6 @@ class LiveConfig(AgentConfig):
         super()._check()
         if self.env is not None:
             check_env(self.env)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchConfig(Config):
-    """Measure throughput relative to the physics engine alone and to a plain array copy.
-
-    Example: viapoint bench --json bench.json
-    """
-
-    env: EnvId = DEFAULT_ENV
-    """Id of the environment."""
-    num_envs: int = 512
-    """Environments in the batch."""
-    repeats: int = 9
-    """Alternating measurements of each side; environments count with their mean, primitives with the fastest."""
-    workers: int = 0
-    """Worker processes to compare with as many threads; 0 leaves the comparison out."""
-    json: Path | None = None
-    """JSON file for the figures."""
-
-    least: ClassVar = {"num_envs": 1, "repeats": 1, "workers": 0}
-
-    def _check(self) -> None:
-        check_env(self.env)
-        if self.workers > self.num_envs:
-            raise ValueError(
-                f"workers must be at most num_envs, which is {self.num_envs}, got {self.workers}"
-            )
-        check_whole_movements(self.env)
-        check_file("json", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -388,98 +376,24 @@ class DoctorConfig(Config):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportConfig(Config):
-    """Convert an archive of Stable-Baselines3 into a model folder. Opening such an archive runs its code.
-
-    Example: viapoint import-sb3 model.zip --env viapoint/PlanarObstacles-v0 --out models/mine --trust
-    """
-
-    file: tyro.conf.Positional[Path]
-    """Archive that `model.save` of Stable-Baselines3 wrote."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment that the model was trained on, with default arguments; default: the one that an archive by
-    `viapoint export` names, otherwise viapoint/PlanarObstacles-v0."""
-    out: Path
-    """Folder for the model, which must be new."""
-    algo: Algorithm | None = None
-    """Algorithm; recognised from the archive if not given."""
-    trust: bool = False
-    """Open the archive without asking, because you trust its source."""
-
-    def _check(self) -> None:
-        if self.env is not None:
-            check_env(self.env)
-        check_folder("out", self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TuneConfig(Config):
-    """Search for hyperparameters with Optuna. The same command continues a search; several may work on one folder.
-
-    Example: viapoint tune benchmarks/tuning/sac_obstacles.yaml --workers 2 --out runs/tune
-    """
-
-    file: tyro.conf.Positional[Path]
-    """YAML file that describes the search: environment, algorithm, budget, parameters with ranges (docs/tuning.md)."""
-    out: Path | None = None
-    """Folder of the search; default: runs/tune-<name of the file>."""
-    trials: int | None = None
-    """Number of trials in total, over all calls and processes; default: that of the file."""
-    workers: int | None = None
-    """Number of trainings at the same time; default: 1, or on Ray as many as fit."""
-    on: str = "local"
-    """Place of the trainings: local, ray, or ray://HOST:PORT."""
-
-    least: ClassVar = {"trials": 1, "workers": 1}
-
-    def _check(self) -> None:
-        check_folder("out", self.out)
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the search."""
-        return self.out or Path("runs") / f"tune-{self.file.stem}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportConfig(Config):
-    """Write an agent as an archive of Stable-Baselines3 with a model card, for example to share it on Hugging Face.
-
-    Example: viapoint export viapoint/PlanarObstacles-v0 --out shared/planar-obstacles --scenes test
-    """
-
-    agent: Annotated[tyro.conf.Positional[str], AGENT]
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    out: Path
-    """Folder for the archive and its card README.md, or a file that ends in .zip, with the card beside it."""
-    scenes: tuple[str, ...] = ()
-    """Scene sets in which the agent is measured for the card, such as test hard; measurements that a run folder holds
-    are there already."""
-    license: str | None = None
-    """Licence of the model in its card, such as mit; default: mit for shipped agents, none for others."""
-
-    def _check(self) -> None:
-        check_folder("out", self.out.parent if self.out.suffix == ".zip" else self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
 class StudyConfig(Config):
-    """Run a study: trainings, evaluations, baselines and pages that a YAML file describes. A second call continues.
+    """Run a study: trainings, baselines and searches for hyperparameters that a YAML file describes.
+
+    The same command continues a study that was stopped, and does what was added to its file.
 
     Example: viapoint study benchmarks/results.yaml --workers 2
     """
 
     file: tyro.conf.Positional[Path]
     """YAML file that describes the study (docs/studies.md)."""
-    on: str = "local"
-    """Place of the jobs: local, ray, or ray://HOST:PORT."""
+    out: Path | None = None
+    """Folder of runs and results; default: the one in the file, or runs/<name of the file>."""
+    address: str | None = None
+    """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
-    """Number of jobs at the same time; default: 1, or on Ray as many as fit."""
-    only: tuple[Literal["train", "evaluate", "baselines", "time", "page"], ...] = (
-        "train", "evaluate", "baselines", "time", "page",
-    )  # fmt: skip
-    """Steps to run."""
-    redo: tuple[str, ...] = ()
-    """Patterns of rows whose measurements these steps make again, such as viaq, 'viaq/*' or 'PandaReach-v0/*'."""
+    """Number of trials at the same time; default: as many as the cores allow."""
 
-    least: ClassVar = {"workers": 0}
+    least: ClassVar = {"workers": 1}
+
+    def _check(self) -> None:
+        check_folder("out", self.out)

@@ -27,6 +27,8 @@ LARGEST_YAML = 1 << 20
 """Greatest size of a YAML file, [bytes]."""
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 """Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
+MARK = b"viapoint"
+"""Text that every file and folder of this package contains where a user names its place."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 
@@ -37,6 +39,21 @@ class BadFileError(ValueError):
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
         self.path = path
+
+
+def check_ours(path: Path) -> None:
+    """Check that a file may be written: there is none yet, or one that this package wrote.
+
+    Raises:
+        BadFileError: There is something else.
+    """
+    if path.is_symlink() or path.exists():
+        if not path.is_file():
+            raise BadFileError(path, "exists and is no file; name another one")
+        if MARK not in path.read_bytes():
+            raise BadFileError(
+                path, "exists and was not written by viapoint; name another file, or move it away"
+            )
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -62,13 +79,19 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
-    """Create or replace a folder atomically; `fill` writes its content."""
+    """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
+
+    Raises:
+        BadFileError: There is something else, which stays as it is.
+    """
+    path = Path(os.path.realpath(path))  # a link to a folder stays a link
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     temporary.mkdir(parents=True)
     try:
         fill(temporary)
         _sync_folder(temporary)
         if path.exists():
+            _check_replaceable(path, {each.name for each in temporary.iterdir()})
             outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
             temporary.rename(path)
@@ -79,6 +102,24 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def _check_replaceable(path: Path, names: set[str]) -> None:
+    """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
+    if not path.is_dir():
+        raise BadFileError(path, "exists and is no folder; name another one")
+    there = {each.name for each in path.iterdir()}
+    for name in sorted(there - names):
+        raise BadFileError(
+            path, f"holds {name}, which is not part of what is written; name a new or empty folder"
+        )
+    for name in sorted(there):
+        if not (path / name).is_file():
+            raise BadFileError(path / name, "exists and is no file; name a new or empty folder")
+        if name.endswith(".json"):
+            check_ours(path / name)
+    if there and not any(name.endswith(".json") for name in there):
+        raise BadFileError(path, f"holds {min(there)}, not written by viapoint; name a new or empty folder")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -143,17 +184,30 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
 
 
+def parse_yaml(text: str | bytes) -> Any:
+    """Return the plain values that a YAML text holds.
+
+    Raises:
+        ValueError: The text is no YAML, or a name is there twice.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"cannot be read as YAML ({' '.join(str(error).split())})") from None
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds values by name.
 
     Raises:
         BadFileError: It is missing, too large, no YAML, or holds something else.
     """
-    content = read_bytes(path, LARGEST_YAML)
     try:
-        value = yaml.load(content, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadFileError(path, f"cannot be read as YAML ({' '.join(str(error).split())})") from None
+        value = parse_yaml(read_bytes(path, LARGEST_YAML))
+    except BadFileError:
+        raise
+    except ValueError as error:
+        raise BadFileError(path, str(error)) from None
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise BadFileError(path, "must hold values by name, such as env: viapoint/PlanarObstacles-v0")
     return value

@@ -9,6 +9,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from viapoint.envs.common.types import Frame
+from viapoint.training.io.files import MARK
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
@@ -20,8 +21,8 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
                 height, width = frame.shape[:2]
                 writer = imageio_ffmpeg.write_frames(
                     str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
-                    output_params=["-crf", "20", "-movflags", "+faststart"], macro_block_size=1,
-                    ffmpeg_log_level="error",
+                    output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
+                    macro_block_size=1, ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)
             writer.send(np.ascontiguousarray(frame))

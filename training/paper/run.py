@@ -11,11 +11,12 @@ from typing import NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.io.files import MARK, check_ours, write_bytes, write_json
 from viapoint.training.io.template import load_template, packaged
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
@@ -119,7 +120,9 @@ def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None])
 STEPS = len(ROWS) + 1 + len(DRAWINGS)
 
 
-TITLE = "Flash & Hogan 1985, reproduced"
+TITLE = "Flash & Hogan 1985, reproduced with viapoint"
+PAGES = ("table.md", "table.json", "index.html")
+"""Files besides the figures."""
 HEADINGS = (
     "row", "claim", "paper's figure", "paper", "model", "expected", "simulated arm", "expected", "hand off plan [mm]",
     "verdict",
@@ -133,8 +136,8 @@ NOTE = (
 
 
 def write(reproduction: Reproduction, out: Path) -> list[Path]:
-    """Write table.md, table.json and index.html to a folder."""
-    paths = [out / name for name in ("table.md", "table.json", "index.html")]
+    """Write the tables and the page to a folder."""
+    paths = [out / name for name in PAGES]
     write_bytes(paths[0], markdown(reproduction.claims).encode())
     record = {"title": TITLE, "holds": not reproduction.failed}
     write_json(paths[1], {**record, "claims": [claim.as_json() for claim in reproduction.claims]})
@@ -212,6 +215,12 @@ def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
     if config.agent is not None:
         check_agent(config.agent)
+    figures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
+    for name in (*PAGES, *figures):
+        check_ours(config.out / name)
+    if config.guide is not None:
+        for name in GUIDE_FIGURES:
+            check_ours(config.guide / f"paper_{name}.png")
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():
 
         def report_step(name: str) -> None:
@@ -231,7 +240,9 @@ def run(config: PaperConfig) -> None:
 def write_guide(result: Reproduction, folder: Path) -> None:
     """Write small versions of the figures for the guide, paper_*.png with few colours."""
     folder.mkdir(parents=True, exist_ok=True)
+    written_by = PngInfo()
+    written_by.add_text("Software", MARK.decode())
     for path, _ in result.pictures:
         if path.stem in GUIDE_FIGURES:
             small = Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE)
-            small.save(folder / f"paper_{path.name}", optimize=True)
+            small.save(folder / f"paper_{path.name}", optimize=True, pnginfo=written_by)

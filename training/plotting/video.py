@@ -19,6 +19,7 @@ from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame, Observation
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.io.files import check_ours
 from viapoint.training.io.mp4 import write_mp4
 from viapoint.training.plotting.top_view import draw_movement
 
@@ -51,9 +52,11 @@ def record_video(
         name: Name of the method, for the caption.
 
     Raises:
-        ValueError: The path has another suffix, the environment has another render mode, or there is no scene.
+        ValueError: The path has another suffix or is a file of something else, the environment has another render
+            mode, or there is no scene.
     """
     path = Path(path)
+    check_ours(path)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"path must end in .mp4, got {path}")
     if env.render_mode != "rgb_array_list":

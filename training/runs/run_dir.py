@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import (
     UNFINISHED,
     BadFileError,
+    check_ours,
     read_json,
     tidy,
     write_bytes,
@@ -40,7 +42,7 @@ from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
 
-MAY_CHANGE = {"n_timesteps", "out", "resume", "progress", "rollout_workers", "on"}
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """Fields that may differ when a run is resumed."""
 
 
@@ -166,7 +168,8 @@ class Run:
 
     def checkpoints(self) -> list[Path]:
         """Folders of the checkpoints, oldest first."""
-        return sorted(path for path in self._checkpoints.glob("[0-9]*") if path.is_dir())
+        found = (path for path in self._checkpoints.glob("[0-9]*") if re.fullmatch(r"\d{10}", path.name))
+        return sorted(path for path in found if path.is_dir())
 
     def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
         """Set a model to the state of the newest intact checkpoint.
@@ -256,6 +259,7 @@ def check_free(folder: Path) -> None:
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
     if names - begun - {"versions.json", "lock", "lock.pid"}:
         raise BadFileError(folder, "is not empty and is no run folder")
+    check_ours(folder / "versions.json")
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

@@ -14,6 +14,7 @@ from matplotlib.patheffects import withStroke
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import TARGETS
+from viapoint.training.io.files import MARK
 
 WIDTH = 8.5 / 2.54
 """Width of a column, [inch]."""
@@ -64,9 +65,9 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and SVG."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
-    figure.savefig(paths[0], dpi=DOTS_PER_INCH, metadata={"Software": None})
+    figure.savefig(paths[0], dpi=DOTS_PER_INCH, metadata={"Software": MARK.decode()})
     figure.set_layout_engine("none")  # the same layout for both files, computed once
-    figure.savefig(paths[1], metadata={"Date": None, "Creator": None})
+    figure.savefig(paths[1], metadata={"Date": None, "Creator": MARK.decode()})
     return paths
 
 

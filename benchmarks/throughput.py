@@ -9,10 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -26,7 +28,6 @@ from viapoint.envs.scenes.sampler import AHEAD
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Executor
 from viapoint.envs.sim.simulator import Simulator
-from viapoint.training.config.configs import BenchConfig
 from viapoint.training.io.files import write_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
@@ -52,27 +53,31 @@ class Ratio(NamedTuple):
     """Measured value divided by the bound."""
 
 
-def bench(config: BenchConfig) -> list[Ratio]:
-    """Return all ratios; takes about half a minute."""
-    return [
-        _simulation(config.env, config.num_envs, config.repeats),
-        _single(config.env, config.repeats, resets=False),
-        _single(config.env, config.repeats, resets=True),
-        *(_sampling(shared, config.repeats) for shared in (True, False)),
-        _make_vec_env(config.env, min(config.num_envs, 64), config.repeats),
-        *([_workers(config.env, config.num_envs, config.workers, config.repeats)] if config.workers else []),
+def main(
+    env: str = "viapoint/PlanarObstacles-v0", num_envs: int = 512, repeats: int = 9, json: Path | None = None
+) -> None:
+    """Measure and print all ratios; takes about half a minute.
+
+    Args:
+        env: Id of an environment in which an action is a whole movement.
+        num_envs: Environments in the batch.
+        repeats: Alternating measurements of each side; environments count with their mean, primitives with the fastest.
+        json: JSON file for the figures.
+    """
+    ratios = [
+        _simulation(env, num_envs, repeats),
+        _single(env, repeats, resets=False),
+        _single(env, repeats, resets=True),
+        _sampling(True, repeats),
+        _sampling(False, repeats),
+        _make_vec_env(env, min(num_envs, 64), repeats),
     ]
-
-
-def run(config: BenchConfig, console: Console | None = None) -> None:
-    """Measure and print all ratios, and write them to a file if asked to."""
-    ratios = bench(config)
     table = Table("what", "measured", "floor", "unit", "ratio")
     for name, measured, floor, unit, ratio in ratios:
         table.add_row(name, _shown(measured), _shown(floor), unit, f"{ratio:.2f}")
-    (console or Console()).print(table)
-    if config.json is not None:
-        write_json(config.json, {each.name: each._asdict() for each in ratios})
+    Console().print(table)
+    if json is not None:
+        write_json(json, {each.name: each._asdict() for each in ratios})
 
 
 def timed(repeats: int, *calls: Callable[[], Any]) -> list[list[float]]:
@@ -213,17 +218,6 @@ def _make_vec_env(env_id: str, num_envs: int, repeats: int) -> Ratio:
     return _decisions(f"make_vec_env against ViaVecEnv, {num_envs} environments", envs, actions, repeats)
 
 
-def _workers(env_id: str, num_envs: int, workers: int, repeats: int) -> Ratio:
-    """Return decisions per second of worker processes and of as many threads."""
-    envs = [
-        gym.make_vec(env_id, num_envs=num_envs, workers=workers, threads=1),
-        gym.make_vec(env_id, num_envs=num_envs, threads=workers),
-    ]
-    actions = _actions(envs[0].single_action_space, num_envs)
-    name = f"make_vec, {num_envs} environments, {workers} workers against {workers} threads"
-    return _decisions(name, envs, actions, repeats)
-
-
 def _decisions(name: str, envs: Sequence[Any], actions: NDArray[np.float32], repeats: int) -> Ratio:
     """Return decisions per second of two vector environments."""
     for env in envs:
@@ -239,3 +233,7 @@ def _decisions(name: str, envs: Sequence[Any], actions: NDArray[np.float32], rep
 
 def _shown(value: float) -> str:
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.2f}"
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
