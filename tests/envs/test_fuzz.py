@@ -1,14 +1,8 @@
 """Whatever is asked, an environment does it or says why not; and broken physics ends an episode and no more."""
 
-import sys
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
 import reliability_fuzz as fuzz
 
 
