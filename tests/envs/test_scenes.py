@@ -11,7 +11,6 @@ from viapoint.envs.geometry.rows import CAPSULES, shape_columns, shape_number
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.draws import Uniforms
-from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
 from viapoint.envs.scenes.scene import TARGETS, check_scenes, rest_clearance, rows_of_lights
 from viapoint.envs.scenes.uniform import UniformScenes
@@ -22,7 +21,6 @@ HAND, WHOLE_ARM, SPACE = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")
 )
 WHOLE_PANDA = CollisionModel(PANDA, whole_arm=True)
-FAMILIES = scene_families(3)
 
 
 def seeded(number=NUMBER):
@@ -144,27 +142,6 @@ def test_in_space_ends_are_as_far_apart_and_as_level_as_stated_and_obstacles_of_
     upright = (axis[:, :2] == 0.0).all(axis=-1)
     spheres, posts = upright & (axis[:, 2] == 0.0), upright & (axis[:, 2] > 0.0)
     assert min(spheres.mean(), posts.mean(), (~upright).mean()) > 0.05
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_every_family_of_space_can_begin_and_end_and_is_in_the_way(family):
-    boxes = {} if FAMILIES[family].shapes == CAPSULES else {"shapes": ("box",), "n_obstacles": (1, 8)}
-    scenes = SceneSampler(WHOLE_PANDA, SpaceDistribution(families=(family,), **boxes))(seeded(24))
-    check_scenes(scenes, WHOLE_PANDA)
-    assert (scenes.present.sum(axis=-1) >= FAMILIES[family].n_obstacles).all()
-    assert (WHOLE_PANDA.least_clearance(lines(scenes), scenes.obstacles, scenes.present) < -0.003).all()
-
-
-@pytest.mark.parametrize("family", ["slot", "window", "tunnel"])
-def test_a_beam_is_above_the_hand_on_its_way_and_a_board_or_sill_below(family):
-    number = FAMILIES[family].n_obstacles
-    distribution = SpaceDistribution(families=(family,), n_obstacles=(number, number))
-    scenes = SceneSampler(WHOLE_PANDA, distribution)(seeded(8))
-    level = np.abs(scenes.obstacles[..., 5]) < 1e-9
-    bars = scenes.present & level & (scenes.obstacles[..., 3:5] != 0.0).any(axis=-1)
-    height = np.where(bars, scenes.obstacles[..., 2], np.nan)
-    # The beam leaves room for what is above the hand, from the wrist down.
-    assert (np.nanmax(height, axis=-1) - np.nanmin(height, axis=-1) > 0.2).all()
 
 
 def test_ends_and_obstacles_of_uniform_scenes_are_anywhere_in_the_workspace(env):

@@ -331,17 +331,6 @@ def test_random_scenes_have_no_registered_meshes(mesh):
     envs.close()
 
 
-def test_workers_know_registered_meshes(mesh):
-    named = {"shape": "lump", "position": (0.45, 0.0, 0.4)}
-    found = []
-    for workers in ({}, {"workers": 2}):
-        envs = gym.make_vec(PANDA, num_envs=2, shapes=("box", "lump"), **workers)
-        envs.reset(seed=0, options={**ENDS, "obstacles": [named]})
-        found.append(envs.step(np.zeros((2, 4)))[4]["min_clearance"])
-        envs.close()
-    np.testing.assert_array_equal(*found)
-
-
 def test_rows_of_a_mesh_have_its_size(mesh):
     env = gym.make(PANDA, shapes=("box", "lump")).unwrapped
     rows = obstacle_rows([mesh(position=(0.45, 0.0, 0.4))], 3, ("box", "lump"))
