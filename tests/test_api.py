@@ -1,5 +1,6 @@
 """Public names of the three packages: complete, documented, typed, with examples that run; and the tour of them."""
 
+import ast
 import contextlib
 import doctest
 import enum
@@ -63,6 +64,18 @@ def test_the_exports_are_sorted_and_exist(package):
         assert getattr(package, name) is not None
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         package.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("package", [envs, training])
+def test_type_checkers_see_what_is_imported_on_first_use(package):
+    tree = ast.parse(Path(package.__file__).read_text())
+    (typing,) = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {alias.name: node.module for node in typing.body for alias in node.names}
+    assert seen == package._MODULES
+    eager = {alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert set(package.__all__) - eager == set(seen)
+    for name, module in ((name, module) for name, module in seen.items() if name not in ABSENT):
+        assert getattr(package, name) is getattr(importlib.import_module(module), name)
 
 
 @pytest.fixture
