@@ -70,8 +70,9 @@ class Canvas:
         # MuJoCo's renderer leaves its context current, and then no other thread could render or close. Here, what was
         # current before becomes current again.
         with self._context.as_current():
-            pixels = self._renderer.render()
-        rows, columns, factor = *pixels.shape[:2], self._factor
+            pixels: Frame = self._renderer.render()
+        rows, columns = pixels.shape[:2]
+        factor = self._factor
         parts = pixels.reshape(rows // factor, factor, columns // factor, factor, 3)
         total = parts.sum(axis=(1, 3), dtype=np.uint16)
         return np.asarray(total // factor**2, dtype=np.uint8)
@@ -101,7 +102,7 @@ class Window:
         _import_triton()
         import glfw
 
-        self._glfw = glfw
+        self._glfw: Any = glfw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if not glfw.init():
@@ -113,9 +114,11 @@ class Window:
             self._window = glfw.create_window(width, height, title, None, None)
         if not self._window:
             raise GLUnavailableError(f"render_mode='human' cannot open a window: no OpenGL there; {INSTALL}")
-        glfw.make_context_current(self._window)
+        self._glfw.make_context_current(self._window)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        glfw.make_context_current(None)  # a thread may have the context of one platform alone, GLFW or EGL
+        self._glfw.make_context_current(
+            None
+        )  # a thread may have the context of one platform alone, GLFW or EGL
         self.scene = mujoco.MjvScene(model, MAX_GEOMS)
         """Scene that is shown."""
 
