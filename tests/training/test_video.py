@@ -27,11 +27,10 @@ def env():
 
 @pytest.fixture
 def _no_opengl(monkeypatch):
-    def missing(platform, model):
+    def missing(*arguments):
         raise OSError("no such library")
 
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "_open_on", missing)
+    monkeypatch.setattr(gl.mujoco, "Renderer", missing)
 
 
 def scenes_of(env, number, seed=0):

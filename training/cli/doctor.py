@@ -55,7 +55,7 @@ import gymnasium as gym, numpy as np, viapoint.envs
 env = gym.make("viapoint/PlanarObstacles-v0", render_mode="rgb_array", width=64, height=64)
 env.reset(seed=0)
 assert np.ptp(env.render()) > 0, "the frame is blank"
-context = env.unwrapped.batch._renderer._canvas._context
+context = env.unwrapped.batch._renderer._screen._context
 print("a frame rendered by", type(context).__module__.rpartition(".")[2])
 env.close()
 """
