@@ -7,8 +7,8 @@ long.
 from typing import TYPE_CHECKING
 
 from viapoint.envs.common import mujoco_check as mujoco_check
-from viapoint.envs.common.lazy import lazy_imports
 from viapoint.envs.registration import ENV_IDS, TASKS, register_all
+from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
     from viapoint.envs.actions.via_points import Plan

@@ -5,7 +5,7 @@ Names are imported when they are first used, so that importing this package alon
 
 from typing import TYPE_CHECKING
 
-from viapoint.envs.common.lazy import lazy_imports
+from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
     from viapoint.training.algorithms.agent import Agent, load_agent

@@ -16,7 +16,7 @@ def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     there is one list of them.
 
     Example:
-        >>> from viapoint.envs.common.lazy import lazy_imports
+        >>> from viapoint.primitives._lazy import lazy_imports
         >>> get, names = lazy_imports("viapoint.envs")
         >>> get("Sphere").__module__
         'viapoint.envs.geometry.round_shapes'
