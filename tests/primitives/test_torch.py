@@ -21,6 +21,9 @@ from viapoint.primitives import (
 )
 
 
+torch.set_num_threads(1)
+
+
 @pytest.fixture
 def tensor(rng):
     def draw(*shape, scale=1.0):
