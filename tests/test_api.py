@@ -122,7 +122,7 @@ def planned(env_id, **arguments):
     ],
 )
 def test_bad_input_is_refused(call):
-    with pytest.raises(ValueError):  # noqa: PT011
+    with pytest.raises(ValueError):
         call()
 
 
