@@ -70,7 +70,9 @@ def test_words_are_values_in_yaml(text, value):
     assert _from_words([f"x={text}"]) == {"x": value}
 
 
-@pytest.mark.parametrize("value", [2, 1e-7, True, None, [1, 8], {"a": [16]}, "learned", "2", "true", "", "a: b"])
+@pytest.mark.parametrize(
+    "value", [2, 1e-7, True, None, [1, 8], {"a": [16]}, "learned", "2", "true", "", "a: b"]
+)
 def test_values_survive_the_way_to_words_and_back(value):
     assert _from_words(_to_words({"x": value})) == {"x": value}
 
