@@ -78,8 +78,14 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
+def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = True) -> None:
     """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
+
+    Args:
+        path: Folder to write.
+        fill: Function that writes the content to a temporary folder.
+        marked: Replace only folders whose JSON has the mark of this package; False where the name of the folder
+            suffices. Folders with further files are never replaced.
 
     Raises:
         BadFileError: There is something else, which stays as it is.
@@ -91,7 +97,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         fill(temporary)
         _sync_folder(temporary)
         if path.exists():
-            _check_replaceable(path, {each.name for each in temporary.iterdir()})
+            _check_replaceable(path, {each.name for each in temporary.iterdir()}, marked)
             outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
             temporary.rename(path)
@@ -104,7 +110,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         raise
 
 
-def _check_replaceable(path: Path, names: set[str]) -> None:
+def _check_replaceable(path: Path, names: set[str], marked: bool) -> None:
     """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
     if not path.is_dir():
         raise BadFileError(path, "exists and is no folder; name another one")
@@ -116,9 +122,9 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
     for name in sorted(there):
         if not (path / name).is_file():
             raise BadFileError(path / name, "exists and is no file; name a new or empty folder")
-        if name.endswith(".json"):
+        if marked and name.endswith(".json"):
             check_ours(path / name)
-    if there and not any(name.endswith(".json") for name in there):
+    if marked and there and not any(name.endswith(".json") for name in there):
         raise BadFileError(path, f"holds {min(there)}, not written by viapoint; name a new or empty folder")
 
 
