@@ -20,7 +20,8 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 
 REACH = "viapoint/PlanarReach-v0"
-NOTES = b"years of work \xff"
+NOTES = b"years of work with viapoint \xff"
+FOREIGN_JSON = b'{"env": "viapoint/PlanarReach-v0", "layers": [8, 8]}'
 
 
 def content_of(folder):
@@ -67,7 +68,7 @@ SAVES = {
     "folder beside a model": (True, "model", "model/thesis/notes.txt"),
     "folder in place of weights": (False, "model", "model/weights.safetensors/notes.txt"),
     "file of another name": (False, "model", "model/notes.txt"),
-    "record of another program": (True, "model", "model/model.json", b'{"layers": [8, 8]}'),
+    "record of another program": (True, "model", "model/model.json", FOREIGN_JSON),
     "weights of another program": (False, "model", "model/weights.safetensors"),
     "file in place of the folder": (False, "model", "model"),
     "file in place of the folder, named as SB3 names it": (False, "model.zip", "model"),
@@ -102,7 +103,7 @@ def test_an_own_model_is_replaced_also_behind_a_link(tmp_path):
     assert load_agent(tmp_path / "new").env_id == "viapoint/PlanarObstacles-v0"
 
 
-@pytest.mark.parametrize("content", [NOTES, b"", b'{"methods": {}}'])
+@pytest.mark.parametrize("content", [NOTES, b"", FOREIGN_JSON])
 def test_an_evaluation_replaces_an_evaluation_alone(content, tmp_path):
     evaluate(tmp_path / "own.json")
     evaluate(tmp_path / "own.json")

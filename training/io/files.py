@@ -27,8 +27,10 @@ LARGEST_YAML = 1 << 20
 """Greatest size of a YAML file, [bytes]."""
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 """Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
-MARK = b"viapoint"
-"""Text that every file and folder of this package contains where a user names its place."""
+MARK = b"written by viapoint"
+"""Text that every file of this package contains where a user names its place, apart from JSON."""
+JSON_MARK = b'"viapoint":'
+"""Name of the version in JSON files of this package."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 
@@ -50,7 +52,8 @@ def check_ours(path: Path) -> None:
     if path.is_symlink() or path.exists():
         if not path.is_file():
             raise BadFileError(path, "exists and is no file; name another one")
-        if MARK not in path.read_bytes():
+        content = path.read_bytes()
+        if MARK not in content and JSON_MARK not in content:
             raise BadFileError(
                 path, "exists and was not written by viapoint; name another file, or move it away"
             )
