@@ -130,12 +130,17 @@ def test_a_film_replaces_a_film_alone(tmp_path):
     assert content_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("name", [*demo.FILES, "notes.txt", "best/model.json", "checkpoints/2024-notes/a"])
-def test_a_demo_begins_in_no_folder_of_something_else(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "begun"), [*((each, True) for each in demo.FILES), ("table.md", False), ("notes.txt", False)]
+)
+def test_a_demo_writes_over_no_file_of_something_else(name, begun, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "train", pytest.fail if begun else train)
+    if begun:
+        Run.create(tiny(tmp_path))
     put(tmp_path, name)
     before = content_of(tmp_path)
     with pytest.raises(BadFileError):
-        demo.run(DemoConfig(out=tmp_path))
+        demo.run(DemoConfig(out=tmp_path, env=REACH))
     assert content_of(tmp_path) == before
 
 
