@@ -182,9 +182,18 @@ def test_a_training_begins_in_no_folder_of_something_else(name, tmp_path):
 def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
     folder = tmp_path / "run"
     train(tiny(folder, n_timesteps=32))
-    foreign = ("notes.txt", "checkpoints/2024-notes/a.txt", "checkpoints/12345/a.txt", "checkpoints/0000000016/notes.txt",
-               "checkpoints/0000000001/a.txt", "checkpoints/1700000000/a.txt", "evaluations/notes.md",
-               ".backup.part", ".cache/a.old", "tensorboard/mine.txt")  # fmt: skip
+    foreign = [
+        "notes.txt",
+        "checkpoints/2024-notes/a.txt",
+        "checkpoints/12345/a.txt",
+        "checkpoints/0000000016/notes.txt",  # beside a checkpoint
+        "checkpoints/0000000001/a.txt",
+        "checkpoints/1700000000/a.txt",
+        "evaluations/notes.md",
+        ".backup.part",
+        ".cache/a.old",
+        "tensorboard/mine.txt",
+    ]
     for name in foreign:
         put(folder, name)
     run = train(TrainConfig(out=folder, resume=True, n_timesteps=128, progress=False))
