@@ -45,8 +45,3 @@ def test_scenes_go_where_one_says(tmp_path, monkeypatch):
     monkeypatch.setattr(generate, "shipped_path", lambda name, _: tmp_path / f"{name}.npz")
     assert not generate.compare_with_shipped([changed(frozen)], parsed("--write"))
     assert load(tmp_path / "test.npz", ENV).sha256 == changed(frozen).sha256
-
-
-def test_there_is_one_place_to_write_to():
-    with pytest.raises(SystemExit):
-        parsed("--write", "--out", "elsewhere")

@@ -7,9 +7,8 @@ from scene_sets.replanning import SIZES, solution_shares
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.io.files import read_json
 from viapoint.training.planners.baselines import make_method
-from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
+from viapoint.training.rollouts.rollout import EpisodeSimulation
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import FrozenScenes, load
@@ -22,11 +21,6 @@ def results(env_id, *names, number=12):
     methods = [make_method(name, env_id) for name in names]
     found = evaluate_methods(methods, frozen, env_id, time_decisions=False).results
     return {name: each.summary()["success"]["rate"] for name, each in zip(names, found, strict=True)}
-
-
-def test_the_trial_is_of_the_kind_that_an_environment_needs():
-    assert isinstance(new_simulation(MOVING, 2), EpisodeSimulation)
-    assert type(new_simulation("viapoint/PlanarReach-v0", 2)) is SceneSimulation
 
 
 def test_the_planner_solves_frozen_scenes_and_straight_movements_do_not():
@@ -82,7 +76,7 @@ def settings(folder, n_timesteps, **changes):
     hyperparameters = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "gamma": 0.99}
     return TrainConfig(
         env=MOVING, n_timesteps=n_timesteps, n_envs=16, out=folder, eval_every=0, checkpoint_every=48,
-        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, discount_unit=0.1, progress=False, **changes,
+        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, progress=False, **changes,
     )  # fmt: skip
 
 
@@ -94,4 +88,3 @@ def test_training_that_is_taken_up_ends_where_it_would_have(tmp_path):
         load_model(run.folder / "final").policy.state_dict() for run in (whole, Run(parts.folder))
     )
     assert all((first[name] == second[name]).all() for name in first)
-    assert read_json(whole.folder / "final" / "model.json")["discount_unit"] == 0.1

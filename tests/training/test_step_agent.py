@@ -1,7 +1,5 @@
 """Agents that act in every control step, beside those that decide once."""
 
-import dataclasses
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from viapoint.training.planners.baselines import Straight, agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import validation_scenes
-from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import load
 
@@ -96,14 +93,3 @@ def test_a_run_is_validated_on_the_scenes_of_the_twin_and_resumes_exactly(tmp_pa
     one, other = (load_model(run.folder / "final").policy.state_dict() for run in (whole, parts))
     for name, tensor in one.items():
         np.testing.assert_array_equal(tensor.numpy(), other[name].numpy(), err_msg=name)
-
-
-def test_presets_say_how_often_to_look(tmp_path):
-    for algo, preset in STEP_PRESETS.items():
-        asked = TrainConfig(env=STEP, algo=algo)
-        assert asked.total_timesteps == preset.n_timesteps
-        assert asked.evaluation_interval == preset.eval_every
-        assert asked.checkpoint_interval == preset.checkpoint_every
-        assert dataclasses.replace(asked, eval_every=0).evaluation_interval == 0
-    run = train(config(tmp_path / "run", n_timesteps=16, eval_every=0))
-    assert Run(run.folder).config.checkpoint_every == STEP_PRESETS["sac"].checkpoint_every

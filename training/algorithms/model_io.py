@@ -267,7 +267,10 @@ def _decode(value: Any, size: int) -> Any:
         if kind == "linear":
             return LinearSchedule(float(value["start"]), float(value["end"]), float(value["end_fraction"]))
         if kind == "normal":
-            return NormalActionNoise(np.zeros(size), np.full(size, float(value["sigma"])))
+            sigma = float(value["sigma"])
+            if not sigma >= 0.0:
+                raise ValueError(f"sigma of action_noise must be 0 or more, got {sigma}")
+            return NormalActionNoise(np.zeros(size), np.full(size, sigma))
         if kind == "activation":
             return ACTIVATIONS[value["name"]]
         if kind == "extractor":

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
@@ -84,7 +85,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         self,
         policy: str | type[ViaQPolicy],
         env: Any,
-        learning_rate: Any = 3e-3,
+        learning_rate: float | Schedule = 3e-3,
         *,
         buffer_size: int = 50_000,
         learning_starts: int = 4_096,

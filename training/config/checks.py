@@ -195,11 +195,17 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
     hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
     for name, value in values.items():
-        number = value.item() if isinstance(value, np.generic) else value
+        number, hint = value.item() if isinstance(value, np.generic) else value, hints.get(name, Any)
         try:
-            check_type(number, hints.get(name, Any))
+            check_type(number, hint)
         except TypeCheckError as error:
             raise ValueError(f"{name} has a wrong type: {error}, got {value!r}") from None
+        if isinstance(number, bool) and bool not in (hint, *typing.get_args(hint)):
+            raise ValueError(f"{name} must be a number, got {value!r}")  # a bool counts as an int for Python
+        if name == "train_freq" and isinstance(number, tuple):
+            number, unit = number
+            if unit != "step":  # episodes end at different times in several environments
+                raise ValueError(f"{name} must count steps, got {value!r}")
         if not is_number(number):
             continue
         if not math.isfinite(number):

@@ -23,6 +23,7 @@ from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
+from viapoint.training.io.installed import versions
 from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task
@@ -151,6 +152,7 @@ class EvaluationResult:
     def to_dict(self) -> dict[str, Any]:
         """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
         return {
+            "viapoint": versions()["viapoint"],
             "env": self.env_id,
             "scenes": self.scenes,
             "sha256": self.sha256,

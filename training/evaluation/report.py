@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.io.files import MARK, write_bytes, write_json
 from viapoint.training.scene_sets.scene_set import BANDS
 
 Summary = Mapping[str, Any]
@@ -146,7 +146,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 def write(record: Record, folder: Path) -> tuple[Path, Path]:
     """Write the table as Markdown, and with the outcomes of every scene as JSON."""
     document, data = folder / "table.md", folder / "table.json"
-    write_bytes(document, markdown(record).encode())
+    write_bytes(document, f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
     write_json(data, dict(record))
     return document, data
 

@@ -27,8 +27,10 @@ LARGEST_YAML = 1 << 20
 """Greatest size of a YAML file, [bytes]."""
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 """Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
-MARK = b"viapoint"
-"""Text that every file and folder of this package contains where a user names its place."""
+MARK = b"written by viapoint"
+"""Text that every file of this package contains where a user names its place, apart from JSON."""
+JSON_MARK = b'"viapoint":'
+"""Name of the version in JSON files of this package."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 
@@ -50,7 +52,8 @@ def check_ours(path: Path) -> None:
     if path.is_symlink() or path.exists():
         if not path.is_file():
             raise BadFileError(path, "exists and is no file; name another one")
-        if MARK not in path.read_bytes():
+        content = path.read_bytes()
+        if MARK not in content and JSON_MARK not in content:
             raise BadFileError(
                 path, "exists and was not written by viapoint; name another file, or move it away"
             )
@@ -78,8 +81,14 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
+def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = True) -> None:
     """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
+
+    Args:
+        path: Folder to write.
+        fill: Function that writes the content to a temporary folder.
+        marked: Replace only folders whose JSON has the mark of this package; False where the name of the folder
+            suffices. Folders with further files are never replaced.
 
     Raises:
         BadFileError: There is something else, which stays as it is.
@@ -91,7 +100,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         fill(temporary)
         _sync_folder(temporary)
         if path.exists():
-            _check_replaceable(path, {each.name for each in temporary.iterdir()})
+            _check_replaceable(path, {each.name for each in temporary.iterdir()}, marked)
             outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
             temporary.rename(path)
@@ -104,7 +113,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         raise
 
 
-def _check_replaceable(path: Path, names: set[str]) -> None:
+def _check_replaceable(path: Path, names: set[str], marked: bool) -> None:
     """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
     if not path.is_dir():
         raise BadFileError(path, "exists and is no folder; name another one")
@@ -116,9 +125,9 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
     for name in sorted(there):
         if not (path / name).is_file():
             raise BadFileError(path / name, "exists and is no file; name a new or empty folder")
-        if name.endswith(".json"):
+        if marked and name.endswith(".json"):
             check_ours(path / name)
-    if there and not any(name.endswith(".json") for name in there):
+    if marked and there and not any(name.endswith(".json") for name in there):
         raise BadFileError(path, f"holds {min(there)}, not written by viapoint; name a new or empty folder")
 
 

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, write_bytes, write_json
+from viapoint.training.io.installed import versions
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
 from viapoint.training.paper.figures import double, other
@@ -140,7 +141,7 @@ def write(reproduction: Reproduction, out: Path) -> list[Path]:
     """Write the tables and the page to a folder."""
     paths = [out / name for name in PAGES]
     write_bytes(paths[0], markdown(reproduction.claims).encode())
-    record = {"title": TITLE, "holds": not reproduction.failed}
+    record = {"viapoint": versions()["viapoint"], "title": TITLE, "holds": not reproduction.failed}
     write_json(paths[1], {**record, "claims": [claim.as_json() for claim in reproduction.claims]})
     write_bytes(paths[2], page(reproduction).encode())
     return paths
@@ -167,7 +168,7 @@ def markdown(claims: list[Claim]) -> str:
     lines = [list(HEADINGS), ["---"] * 4 + ["---:"] * 5 + ["---"]]
     lines += [[cell.replace("|", "\\|") for cell in cells(claim)] for claim in claims]
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"# {TITLE}\n\n{summary(claims)} {NOTE}\n\n{table}\n"
+    return f"# {TITLE}\n\n{summary(claims)} {NOTE}\n\n{table}\n\n<!-- {MARK.decode()} -->\n"
 
 
 def summary(claims: list[Claim]) -> str:

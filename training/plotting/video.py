@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ def record_video(
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
     camera = Camera(env)
-    part = path.with_name(f".{path.stem}.part.mp4")
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     try:
         count = write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
         os.replace(part, path)

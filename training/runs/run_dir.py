@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,7 +37,12 @@ from viapoint.training.io.files import (
     write_json,
 )
 from viapoint.training.io.installed import versions
-from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
+from viapoint.training.runs.checkpoints import (
+    is_checkpoint,
+    read_checkpoint,
+    remove_checkpoint,
+    write_checkpoint,
+)
 
 KEPT_CHECKPOINTS = 2
 
@@ -164,12 +168,12 @@ class Run:
         """Write a checkpoint and remove outdated ones."""
         write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
-            shutil.rmtree(outdated)
+            remove_checkpoint(outdated)
 
     def checkpoints(self) -> list[Path]:
         """Folders of the checkpoints, oldest first."""
         found = (path for path in self._checkpoints.glob("[0-9]*") if re.fullmatch(r"\d{10}", path.name))
-        return sorted(path for path in found if path.is_dir())
+        return sorted(path for path in found if is_checkpoint(path))
 
     def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
         """Set a model to the state of the newest intact checkpoint.
