@@ -72,7 +72,7 @@ class Trial:
     method: str = ""
     """Name of a baseline; empty for an agent."""
     resources: Values = field(default_factory=lambda: {"cpu": 1})
-    """What the trial takes of a node, such as {"cpu": 2, "GPU": 1}."""
+    """Resources of a node that the trial takes, such as {"cpu": 2, "GPU": 1}."""
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -244,8 +244,7 @@ def _study(
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
     trials = sorted((each for each in found if isinstance(each, Trial)), key=lambda each: each.seed)
     every = tuple(each for each in found if isinstance(each, Search))
-    place = Path(out or Path("runs") / default)
-    return Study(name=default, out=place, trials=tuple(trials), searches=every)
+    return Study(name=default, out=Path(out or f"runs/{default}"), trials=tuple(trials), searches=every)
 
 
 def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +32,6 @@ SETTINGS = {
 }
 """Environment variables of Ray, which reads them when it is imported."""
 Told = Callable[[str], None]
-"""Function of a line for a person."""
 
 
 class StudyFailedError(Exception):
@@ -143,11 +144,8 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
             socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address=address or "local", **settings)
     except (OSError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"no Ray cluster can be used at {address} ({reason}); `ray start --head` starts one, and one that has a "
-            "token needs RAY_AUTH_MODE=token"
-        ) from None
+        advice = "`ray start --head` starts one, and one that has a token needs RAY_AUTH_MODE=token"
+        raise ValueError(f"no Ray cluster at {address} ({_one_line(error)}); {advice}") from None
     try:
         yield
     finally:
@@ -174,7 +172,7 @@ def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> 
         tune_config=tune.TuneConfig(max_concurrent_trials=workers),
         run_config=_run_config(tune, "trials", folder, told),
     )
-    return _failures(tuner.fit(), len(trials))
+    return _fitted(tuner, len(trials))[1]
 
 
 def _search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
@@ -221,8 +219,7 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
             ),
             run_config=config,
         )
-    results = tuner.fit()
-    failed = _failures(results, search.trials)
+    results, failed = _fitted(tuner, search.trials)
     if len(failed) == search.trials:
         return failed
     told(_write_search(search, results, folder))  # settings that cannot be trained do not end a search
@@ -249,15 +246,19 @@ def _run_config(tune: Any, name: str, folder: Path, told: Told) -> Any:
     )
 
 
-def _failures(results: Any, expected: int) -> list[str]:
-    """Return a line for each trial that failed; Ctrl-C, after which Ray Tune returns, goes on as such."""
+def _fitted(tuner: Any, expected: int) -> tuple[Any, list[str]]:
+    """Run trials, and return their results and a line for each that failed."""
+    handler = signal.getsignal(signal.SIGINT)
+    results = tuner.fit()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
     if results.num_terminated + results.num_errors < expected:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt  # after Ctrl-C, Ray Tune returns
     failed = [_one_line(error) for error in results.errors]
     for each in results:
         if each.error is None and "error" in each.metrics:
             failed.append(f"{each.metrics['label']}: {each.metrics['error']}")
-    return failed
+    return results, failed
 
 
 def _domain(tune: Any, given: Any) -> Any:
