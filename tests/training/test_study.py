@@ -28,7 +28,7 @@ GIVEN = {
     "n_scenes": 12,
     "seeds": [0, 1],
     "agents": {"viaq": TRAINING, "sac": {"algo": "sac", **TRAINING}},
-    "baselines": ["straight", "search16", "stored"],
+    "baselines": ["straight", "stored"],
 }
 
 
@@ -67,10 +67,10 @@ def whole(ray, tmp_path_factory):
 def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     folder, table, told, before = whole
     assert list(table.columns) == COLUMNS
-    assert len(told) == 7  # two agents with two seeds each, and three baselines
+    assert len(told) == 6  # two agents with two seeds each, and two baselines
     rows = table.set_index("method")
-    assert set(rows.index) == {"viaq", "sac", "straight", "search16", "stored"}
-    assert rows.seeds.to_dict() == {"viaq": 2, "sac": 2, "straight": 1, "search16": 1, "stored": 1}
+    assert set(rows.index) == {"viaq", "sac", "straight", "stored"}
+    assert rows.seeds.to_dict() == {"viaq": 2, "sac": 2, "straight": 1, "stored": 1}
     assert (rows.scenes == 12).all()
     assert ((rows.low <= rows.success) & (rows.success <= rows.high)).all()
     assert rows.success["stored"] == 1.0
@@ -110,10 +110,10 @@ def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     complete = len(results_in(folder))
-    assert complete < 7
+    assert complete < 6
     lines = []
     run_study(Study.from_dict(GIVEN), out=folder, told=lines.append)
-    assert len(lines) == 7 - complete
+    assert len(lines) == 6 - complete
     assert results_in(folder) == whole[3]
 
 

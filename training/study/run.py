@@ -169,7 +169,7 @@ def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> 
     tuner = tune.Tuner(
         tune.with_resources(work, lambda config: config["trial"].resources),
         param_space={"trial": tune.grid_search(trials)},
-        tune_config=tune.TuneConfig(max_concurrent_trials=workers),
+        tune_config=tune.TuneConfig(max_concurrent_trials=workers, reuse_actors=True),
         run_config=_run_config(tune, "trials", folder, told),
     )
     return _fitted(tuner, len(trials))[1]
