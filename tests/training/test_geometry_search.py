@@ -75,18 +75,6 @@ def test_planned_movements_are_those_of_the_environment(env_id, n_via, timing):
     np.testing.assert_allclose(found.log_jerk, np.log(jerk), atol=1e-4)
 
 
-@pytest.mark.parametrize("at_end", [-1.0, 1.0])
-def test_a_via_point_on_an_end_is_a_straight_movement(at_end):
-    env, observation = made(PLANE, 8)
-    distance = np.linalg.norm(env.scenes.goal - env.scenes.start, axis=-1)
-    actions = np.zeros((8, 1, 3), dtype=np.float32)
-    actions[:, 0, 0] = at_end * 0.5 * distance / env.task.action.via_scale[0]
-    straight = plan_movements(observation, np.zeros_like(actions), env.task, SHARES)
-    found = plan_movements(observation, actions, env.task, SHARES)
-    assert np.isfinite(found.path).all()
-    np.testing.assert_allclose(found.path, straight.path, atol=1e-3)
-
-
 @pytest.mark.parametrize("env_id", REPLANNING_TASKS)
 @pytest.mark.parametrize("decisions", [0, 2])
 def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, decisions):

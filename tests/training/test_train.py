@@ -22,10 +22,7 @@ from viapoint.training.runs.trainer import train
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
 TINY = {
-    "viaq": {
-        **OFF_POLICY,
-        "policy_kwargs": {"candidates": 32, "refinements": 1, "per_refinement": 16},
-    },
+    "viaq": {**OFF_POLICY, "policy_kwargs": {"candidates": 32, "refinements": 1, "per_refinement": 16}},
     "sac": {**OFF_POLICY, "buffer_size": 96},
     "td3": {**OFF_POLICY, "buffer_size": 400},
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
