@@ -37,7 +37,6 @@ class EnvConfig:
     whole_arm: bool = False
     n_obstacles: int | tuple[int, int] = (1, 5)
     shapes: str | Sequence[str] = CAPSULES
-    uniform_share: float = 0.0
     duration_range: tuple[float, float] = (0.6, 1.2)
     reward_weights: RewardWeights | Mapping[str, float] | None = None
     render_mode: str | None = None
@@ -64,8 +63,7 @@ class EnvConfig:
         """Return the signature of a vector environment with these keyword arguments."""
         named = inspect.signature(cls).parameters.values()
         number = inspect.Parameter("num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1)
-        workers = inspect.Parameter("workers", inspect.Parameter.KEYWORD_ONLY, default=0, annotation="int")
-        return inspect.Signature([number, *named, workers])
+        return inspect.Signature([number, *named])
 
     def task(self) -> Task:
         """Return the task that these arguments describe.
@@ -85,7 +83,6 @@ class EnvConfig:
             weights=self.weights_kind.of(self.reward_weights),
             scenes=distribution(
                 n_obstacles=fewest_and_most(self.n_obstacles),
-                uniform_share=self.uniform_share,
                 **distribution.for_shapes(check_shapes(self.shapes)),
             ),
             replanning=self.replanning,

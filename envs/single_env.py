@@ -36,9 +36,6 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
     """Vector environment class that this environment wraps."""
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
-        for name in ("num_envs", "workers"):
-            if name in kwargs:
-                raise TypeError(f"{name} is an argument of gym.make_vec; gym.make makes one environment")
         EzPickle.__init__(self, threads=threads, **as_given(kwargs))
         self.batch = self.batch_kind(1, threads=threads, **kwargs)
         """Vector environment with one environment."""

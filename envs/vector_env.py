@@ -25,10 +25,9 @@ from viapoint.envs.common.validation import (
     whole_number,
 )
 from viapoint.envs.config import EnvConfig, ViaPointConfig
-from viapoint.envs.geometry.rows import row_size
 from viapoint.envs.mdp.rewards import reward_terms
 from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
-from viapoint.envs.scenes.options import draw_given, given_scenes
+from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.sampler import SceneQueue
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, join_groups
@@ -51,51 +50,6 @@ class Decision(NamedTuple):
     info: dict[str, Any]
 
 
-class Transition(NamedTuple):
-    """One step of N environments with same-step autoreset."""
-
-    observation: Observation
-    """Observations after the step: where an episode ended, the first ones of the next."""
-    reward: Float
-    """Shape (N,)."""
-    terminated: Bool
-    """Shape (N,)."""
-    truncated: Bool
-    """Shape (N,)."""
-    info: dict[str, Any]
-    """Metrics of the step, shape (N,) each."""
-    last_observation: Observation | None
-    """Observations before autoreset; None if no episode ended."""
-
-    def as_step(self) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Return the result of `step` in the form of Gymnasium's vector environments."""
-        observation, reward, terminated, truncated, info, last = self
-        ended, everyone = terminated | truncated, np.ones(len(reward), dtype=bool)
-        infos = {**info, **{f"_{name}": everyone.copy() for name in info}}
-        if last is not None:
-            final = np.full(len(reward), None, dtype=object)
-            for i in np.flatnonzero(ended):
-                final[i] = {name: part[i] for name, part in last.items()}
-            kept = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
-            masks = {f"_{name}": ended.copy() for name in info}
-            infos |= {"final_obs": final, "_final_obs": ended.copy()}
-            infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
-        return observation, reward, terminated.copy(), truncated.copy(), infos
-
-
-class NextEpisodes(NamedTuple):
-    """Episodes that were drawn and have not begun."""
-
-    rows: Int
-    """Environments that they belong to."""
-    scenes: Any
-    """Scenes, one for each row."""
-    generators: list[np.random.Generator]
-    """Random generators of all environments after the draw."""
-    first_seed: int | None
-    """Seed of the first generator."""
-
-
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Reaching around obstacles by via-points, `num_envs` times.
 
@@ -111,7 +65,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         n_via: Number of via-points of an action.
         n_obstacles: Number of obstacles, or the fewest and the most.
         shapes: Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length.
-        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.RewardWeights`.
@@ -119,8 +72,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
-        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
-            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -136,16 +87,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Class of the keyword arguments, with their defaults."""
     __signature__ = ViaPointConfig.signature()
 
-    def __new__(cls, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> Any:
-        """Return environments in this process, or in worker processes."""
-        if not whole_number("workers", workers, 0):
-            return super().__new__(cls)
-        from viapoint.envs.worker_env import WorkerVectorEnv
-
-        return WorkerVectorEnv(cls, num_envs, workers, **kwargs)
-
-    def __init__(self, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> None:
-        assert not workers, "__new__ makes the others"
+    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
         self.config = config = self.config_kind.of(kwargs)
         EzPickle.__init__(self, num_envs, **as_given(kwargs))
         self.task = config.task()
@@ -224,38 +166,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
-        self.begin_episodes(self.draw_episodes(seed, rows, options))
-        return self.observe(), {}
-
-    def draw_episodes(
-        self, seed: int | Sequence[int | None] | None, rows: Int, options: Mapping[str, Any]
-    ) -> NextEpisodes:
-        """Draw the next episodes of the environments `rows`; the running ones go on.
-
-        Seeds and options are those of :meth:`reset`, without `reset_mask`; batched options have an entry for each row.
-        """
-        seeded, first_seed = self._seeded(seed, rows)
-        return NextEpisodes(rows, self._draw(seeded, rows, options), seeded, first_seed)
-
-    def begin_episodes(self, episodes: NextEpisodes) -> None:
-        """Begin episodes that :meth:`draw_episodes` returned."""
-        rows, scenes, self.generators, first_seed = episodes
-        self.use_generator(self.generators[0], first_seed)
-        self._last = self._last if len(rows) < self.num_envs else None
+        generators, first_seed = self._seeded(seed, rows)
+        # Nothing changes before all scenes are there: impossible ones raise an error.
+        scenes = self._draw(generators, rows, options)
+        self.generators = generators
+        self.use_generator(generators[0], first_seed)
+        if len(rows) == self.num_envs:
+            self._last = None
         self._start(rows, scenes)
-
-    def parse_options(self, options: Mapping[str, Any], number: int) -> dict[str, Float]:
-        """Return the options of a reset of `number` environments with one entry for each.
-
-        Raises:
-            ValueError: An option is unknown, or has another shape or type.
-        """
-        d, n = self.arm.dimension, self.task.observation.n_rows
-        shapes = self.task.scenes.shapes
-        points = np.zeros((number, d))
-        empty = Scenes(points, points, np.zeros((number, n, row_size(d, shapes))))
-        given = given_scenes(options, empty, self.arm, shapes)._asdict()
-        return {name: given[name] for name in options}
+        return self.observe(), {}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
         """Draw the scenes of the first environment from a generator, which was made from `seed`."""
@@ -267,20 +186,32 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        return self.transition(actions).as_step()
-
-    def transition(self, actions: Any) -> Transition:
-        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
         rows = np.arange(self.num_envs)
         # The next scenes depend on no outcome, so they are drawn during the physics.
-        (observation, reward, info), following = self._execute(
-            self._decode(actions), lambda: self._draw_next(rows)
-        )
+        decision, following = self._execute(self._decode(actions), lambda: self._draw_next(rows))
         assert following is not None
         self._start(rows, following.result())
-        return Transition(
-            self.observe(), reward, self.terminated.copy(), self.truncated.copy(), info, observation
-        )
+        return self._as_step(decision)
+
+    def _as_step(self, decision: Decision) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
+        """Return the result of `step`: that of a decision, after which the next episodes have begun where one ended."""
+        observation, reward, info = decision
+        ended = self.terminated | self.truncated
+        infos = dict(info)
+        for name in info:
+            infos[f"_{name}"] = np.ones(self.num_envs, dtype=bool)
+        if ended.any():
+            last = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                last[i] = {name: part[i] for name, part in observation.items()}
+            final_info = {}
+            for name, value in info.items():
+                final_info[name] = np.where(ended, value, np.zeros_like(value))
+                final_info[f"_{name}"] = ended.copy()
+            infos |= {"final_obs": last, "_final_obs": ended.copy()}
+            infos |= {"final_info": final_info, "_final_info": ended.copy()}
+            observation = self.observe()
+        return observation, reward, self.terminated.copy(), self.truncated.copy(), infos
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and counters as values and arrays for :meth:`restore`.
@@ -299,12 +230,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "generators": [generator.bit_generator.state for generator in self.generators],
             "scenes": self._check_running().as_options(),
             "physics_steps": self.physics_steps,
-            "episodes": self.episodes_state(),
         }
-
-    def episodes_state(self) -> dict[str, Any] | None:
-        """Return the state of episodes of several steps, without their scenes; None for episodes of one."""
-        return None
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same kind and number."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import ORDERS
-from .array_api import FREE, Array, Boundary, Namespace, as_floats, broadcast_batch, is_given, refuse_free
+from .array_api import FREE, Array, Boundary, Namespace, as_floats, is_given, leading_shape
 
 Ends = dict[str, Boundary]
 """The four boundary values by name, in the order of END_NAMES."""
@@ -24,16 +24,10 @@ def read_arguments(
 ) -> tuple[Namespace, list[Any], Ends]:
     """Convert the arguments of a movement to one library and dtype, see `as_floats`.
 
-    `ends` are the values of END_NAMES, of which only the goal's may be FREE. They are returned by name, after the
-    namespace and the other arrays.
+    `ends` are the values of END_NAMES. They are returned by name, after the namespace and the other arrays.
     """
     named = dict(zip(END_NAMES, ends, strict=True))
-    optional = optional or {}
-    given = {**optional, **dict(zip(END_NAMES[:2], ends[:2], strict=True))}
-    for value in given.values():
-        if value is FREE:
-            refuse_free(**given)
-    xp, arrays = as_floats({**optional, **named}, **required)
+    xp, arrays = as_floats({**(optional or {}), **named}, **required)
     return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
 
 
@@ -47,37 +41,17 @@ def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Bou
             raise ValueError(f"{name} cannot be given for order 2: least acceleration leaves it open")
 
 
-def check_end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
+def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
     """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
-    shapes = {}
-    for name, value in ends.items():
-        if value is None or value is FREE:
-            continue
-        if value.ndim < 1 or value.shape[-1] != dimension:
-            raise ValueError(f"{name} must have shape (..., {dimension}), got shape {tuple(value.shape)}")
-        shapes[name] = tuple(value.shape[:-1])
-    return shapes
+    return {name: leading_shape(name, value, dimension) for name, value in ends.items() if is_given(value)}
 
 
-def check_waypoints(
-    waypoints: Array, ends: Ends, *, durations: Array | None = None, duration: Array | None = None
-) -> tuple[int, ...]:
-    """Return the common leading shape of all arguments, or raise ValueError."""
-    if waypoints.ndim < 2 or waypoints.shape[-2] < 2 or waypoints.shape[-1] < 1:
-        raise ValueError(
-            f"waypoints must have shape (..., K + 2, D), K >= 0, got shape {tuple(waypoints.shape)}"
-        )
-    segments, shapes = waypoints.shape[-2] - 1, {"waypoints": tuple(waypoints.shape[:-2])}
-    if durations is not None:
-        if durations.ndim < 1 or durations.shape[-1] != segments:
-            raise ValueError(
-                f"durations must have shape (..., {segments}), one for each segment of waypoints "
-                f"{tuple(waypoints.shape)}, got shape {tuple(durations.shape)}"
-            )
-        shapes["durations"] = tuple(durations.shape[:-1])
-    if duration is not None:
-        shapes["duration"] = tuple(duration.shape)
-    return broadcast_batch(**shapes, **check_end_shapes(ends, waypoints.shape[-1]))
+def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of waypoints and of boundary values, or raise ValueError."""
+    shape = leading_shape("waypoints", waypoints, None, None)
+    if waypoints.shape[-2] < 2:
+        raise ValueError("waypoints must hold start and goal, got one point")
+    return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
 
 
 def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
@@ -96,7 +70,7 @@ def unit_time_ends(ends: Ends, duration: Array) -> list[Any]:
     """Return the boundary values in unit time, V = v T and A = a T^2; None and FREE stay."""
     values, time = list(ends.values()), duration[..., None]
     for i, (name, value) in enumerate(ends.items()):
-        if value is not None and value is not FREE:
+        if is_given(value):
             values[i] = value * (time if "velocity" in name else time * time)
     return values
 

@@ -54,6 +54,8 @@ Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 
 _PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
 
+_MAY_BE_FREE = ("goal_velocity", "goal_acceleration")
+
 
 def is_given(value: Boundary) -> TypeGuard[Array]:
     """Return True for a boundary value that is an array, neither None nor FREE."""
@@ -64,7 +66,8 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
     """Convert all arguments to one array library and one floating dtype.
 
     Args:
-        optional: further arguments by name; None and FREE among these are returned unchanged.
+        optional: further arguments by name; None among these, and FREE for the goal's velocity and acceleration,
+            is returned unchanged.
         **required: arrays, numbers or nested lists by argument name.
 
     Returns:
@@ -80,7 +83,7 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
     plain = True
     for name, value in named.items():
         if value is None or value is FREE:
-            if name in required:
+            if name in required or (value is FREE and name not in _MAY_BE_FREE):
                 raise ValueError(f"{name} must be an array of real numbers, got {value!r}")
         elif not isinstance(value, _PLAIN):
             plain = False
@@ -162,12 +165,20 @@ def require(holds: Array, name: str, array: Array, requirement: str) -> None:
     raise ValueError(f"{name} {requirement}, got {value}{place} (shape {tuple(array.shape)})")
 
 
-def require_vectors(name: str, array: Array, dimension: int | None = None) -> None:
-    """Raise ValueError unless `array` has shape (..., D), with D = `dimension` if that is given."""
-    if array.ndim < 1 or array.shape[-1] < 1:
-        raise ValueError(f"{name} must have shape (..., D) with D >= 1, got shape {tuple(array.shape)}")
-    if dimension is not None and array.shape[-1] != dimension:
-        raise ValueError(f"{name} must have shape (..., {dimension}), got shape {tuple(array.shape)}")
+def leading_shape(name: str, array: Array, *sizes: int | None) -> tuple[int, ...]:
+    """Return the shape of an array before its last axes; raise ValueError unless these have the sizes.
+
+    None stands for any size of at least 1.
+    """
+    shape = tuple(array.shape)
+    first = len(shape) - len(sizes)
+    fits = first >= 0
+    for size, found in zip(sizes, shape[max(first, 0) :], strict=False):
+        fits = fits and (found >= 1 if size is None else found == size)
+    if not fits:
+        wanted = ", ".join(["...", *("n" if size is None else str(size) for size in sizes)])
+        raise ValueError(f"{name} must have shape ({wanted}), got shape {shape}")
+    return shape[:first]
 
 
 def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
@@ -180,15 +191,6 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     except ValueError:
         listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
         raise ValueError(f"leading dimensions do not broadcast: {listed}") from None
-
-
-def refuse_free(**named: Any) -> None:
-    """Raise ValueError for an argument that is FREE but must be given."""
-    for name, value in named.items():
-        if value is FREE:
-            raise ValueError(
-                f"{name} cannot be FREE: only the goal's velocity and acceleration may be left open"
-            )
 
 
 def is_whole(value: Any) -> bool:
@@ -204,15 +206,14 @@ def whole_order(nu: int) -> int:
 
 
 def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
-    """Return orders of derivative as a tuple, or raise ValueError."""
+    """Return one order of derivative, or a sequence of them, as a tuple, or raise ValueError."""
     try:
-        given = (nu,) if isinstance(nu, int | np.integer) else tuple(nu)
-        orders = tuple(map(operator.index, given))
+        orders = (nu,) if is_whole(nu) else tuple(nu)  # type: ignore[arg-type]
     except TypeError:
-        given = orders = ()
-    if not orders or min(orders) < 0 or bool in map(type, given):
+        orders = ()
+    if not orders or not all(map(is_whole, orders)):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
-    return orders
+    return tuple(map(int, orders))
 
 
 def as_number(value: Any) -> float:
@@ -226,21 +227,23 @@ def as_number(value: Any) -> float:
 
 def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: Namespace) -> None:
     """Raise ValueError unless `out` holds `count` writeable floating arrays of the given library and shape."""
+
+    def fits(buffer: Array) -> bool:
+        if namespace_of(buffer) is not xp or tuple(buffer.shape) != shape:
+            return False
+        if xp is np:
+            return bool(buffer.dtype.kind == "f" and buffer.flags.writeable)
+        return bool(xp.isdtype(buffer.dtype, "real floating"))
+
     try:
-        is_own = all(namespace_of(buffer) is xp for buffer in out)
+        fitting = [fits(buffer) for buffer in out]
     except TypeError:
-        is_own = False
-    if not is_own:
-        raise ValueError(f"out must be {count} arrays of the trajectory's own kind, got {type(out).__name__}")
-    shapes = [tuple(buffer.shape) for buffer in out]
-    if shapes != [shape] * count:
-        raise ValueError(f"out must be {count} arrays of shape {shape}, got shapes {shapes}")
-    for buffer in out:
-        is_floating = buffer.dtype.kind == "f" if xp is np else xp.isdtype(buffer.dtype, "real floating")
-        if not is_floating:
-            raise ValueError(f"out must be of a floating dtype, got {buffer.dtype}")
-        if xp is np and not buffer.flags.writeable:
-            raise ValueError(f"out must be writeable, got a read-only array of shape {shape}")
+        fitting = []
+    if fitting != [True] * count:
+        raise ValueError(
+            f"out must hold {count} writeable floating arrays of shape {shape} of the trajectory's own kind, "
+            f"got {[getattr(buffer, 'shape', buffer) for buffer in out] if fitting else type(out).__name__}"
+        )
 
 
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from ._boundary import END_NAMES, check_end_shapes, check_order, check_waypoints, knot_states, read_arguments
+from ._boundary import check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
 from .array_api import (
     Array,
     Boundary,
@@ -13,8 +12,8 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
+    leading_shape,
     require,
-    require_vectors,
 )
 from .trajectory import Trajectory, connect
 
@@ -65,14 +64,11 @@ def point_to_point(
         goal=goal,
         duration=duration,
     )
-    require_vectors("start", start)
-    require_vectors("goal", goal, start.shape[-1])
+    shapes = {"start": leading_shape("start", start, None), "duration": tuple(duration.shape)}
+    dimension = start.shape[-1]
+    goal_shape = leading_shape("goal", goal, dimension)
     require(duration > 0, "duration", duration, "must be positive")
-    shapes = {"start": tuple(start.shape[:-1]), "goal": tuple(goal.shape[:-1])}
-    batch = broadcast_batch(
-        **shapes, duration=tuple(duration.shape), **check_end_shapes(ends, start.shape[-1])
-    )
-    shape = (*batch, start.shape[-1])
+    shape = (*broadcast_batch(**shapes, goal=goal_shape, **end_shapes(ends, dimension)), dimension)
     waypoints = xp.stack([broadcast_to(xp, start, shape), broadcast_to(xp, goal, shape)], axis=-2)
     return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends))
 
@@ -125,25 +121,19 @@ def through(
         waypoints=waypoints,
         durations=durations,
     )
-    batch = check_waypoints(waypoints, ends, durations=durations)
+    shapes = waypoint_shapes(waypoints, ends)
+    knots, dimension = waypoints.shape[-2:]
+    shapes["durations"] = leading_shape("durations", durations, knots - 1)
     if via_velocities is not None:
-        batch = _check_via_velocities(batch, waypoints, via_velocities)
+        shapes["via_velocities"] = leading_shape("via_velocities", via_velocities, knots - 2, dimension)
+    batch = broadcast_batch(**shapes)
     waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
     _check_durations(xp, waypoints, durations)
-    states = knot_states(order, ends, waypoints.shape[-2] - 2)
+    states = knot_states(order, ends, knots - 2)
     if via_velocities is not None:
-        for k in range(via_velocities.shape[-2]):
+        for k in range(knots - 2):
             states[k + 1][0] = via_velocities[..., k, :]
     return connect(xp, order, waypoints, durations, states)
-
-
-def _check_via_velocities(batch: tuple[int, ...], waypoints: Array, velocities: Array) -> tuple[int, ...]:
-    """Return the common leading shape, or raise ValueError."""
-    expected = (waypoints.shape[-2] - 2, waypoints.shape[-1])
-    if velocities.ndim < 2 or tuple(velocities.shape[-2:]) != expected:
-        wanted = f"(..., {expected[0]}, {expected[1]})"
-        raise ValueError(f"via_velocities must have shape {wanted}, got shape {tuple(velocities.shape)}")
-    return broadcast_batch(waypoints=batch, via_velocities=tuple(velocities.shape[:-2]))
 
 
 def _check_durations(xp: Namespace, waypoints: Array, durations: Array) -> None:
@@ -195,8 +185,7 @@ def minimum_jerk_coefficients(
     require(arrays[-1] > 0, "T", arrays[-1], "must be positive")
     shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(names, arrays, strict=True)})
     x0, dx0, ddx0, xT, dxT, ddxT, T = (broadcast_to(xp, a, shape)[..., None] for a in arrays)
-    ends: Any = dict(zip(END_NAMES, (dx0, ddx0, dxT, ddxT), strict=True))
-    movement = point_to_point(x0, xT, T[..., 0], **ends)
+    movement = connect(xp, 3, xp.stack([x0, xT], axis=-2), T, [[dx0, ddx0], [dxT, ddxT]])
     unit = movement.coefficients[..., 0, :]
     rate = 1.0 / T
     upper = [unit[..., k, :] * math.prod([rate] * k) for k in range(3, 6)]

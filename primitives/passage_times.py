@@ -7,12 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ._boundary import check_waypoints, chosen_items, read_arguments, unit_time_ends
+from ._boundary import chosen_items, read_arguments, unit_time_ends, waypoint_shapes
 from ._passage.cost import PassageCost
 from ._passage.moving_ends import fractions_moving
 from ._passage.newton import attach_gradient, fractions_by_newton
 from ._passage.rest_to_rest import fractions_at_rest
-from .array_api import FREE, Array, Boundary, broadcast_to, follows_gradient, like, require, to_numpy
+from .array_api import (
+    FREE,
+    Array,
+    Boundary,
+    broadcast_batch,
+    broadcast_to,
+    follows_gradient,
+    is_given,
+    like,
+    require,
+    to_numpy,
+)
 
 
 def passage_durations(
@@ -62,11 +73,11 @@ def passage_durations(
         waypoints=waypoints,
         duration=duration,
     )
-    batch = check_waypoints(waypoints, ends, duration=duration)
+    batch = broadcast_batch(**waypoint_shapes(waypoints, ends), duration=tuple(duration.shape))
     require(duration > 0, "duration", duration, "must be positive")
     flat_ends = dict(ends)
     for name, value in ends.items():
-        if value is not None and value is not FREE:
+        if is_given(value):
             flat_ends[name] = _flat(value, batch, 1)
     unit_ends = unit_time_ends(flat_ends, _flat(duration, batch, 0))
     numbers = _fractions(_flat(waypoints, batch, 2), unit_ends)

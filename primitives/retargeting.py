@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 from typing import Any
 
-from ._boundary import END_NAMES, check_end_shapes
+from ._boundary import END_NAMES, end_shapes
 from .array_api import (
     FREE,
     Array,
@@ -13,9 +13,7 @@ from .array_api import (
     as_number,
     broadcast_batch,
     broadcast_to,
-    refuse_free,
     require,
-    require_vectors,
 )
 from .minimum_jerk import through
 from .passage_times import passage_durations
@@ -73,7 +71,6 @@ def retarget(
     named = {"goal_velocity": goal_velocity, "goal_acceleration": goal_acceleration}
     if trajectory.order != 3:
         raise ValueError(f"trajectory must have order 3 to be continued, got order {trajectory.order}")
-    refuse_free(via=via)
     if not 0 <= as_number(freeze) < inf:
         raise ValueError(f"freeze must be a finite number of at least 0, got {freeze!r}")
     arrays = trajectory.floats({"via": via, **named}, widest=True, time=time, goal=goal, arrival=arrival)
@@ -96,16 +93,13 @@ def _common_batch(
     trajectory: Trajectory, time: Array, arrival: Array, targets: dict[str, Any], via: Array | None
 ) -> tuple[int, ...]:
     """Return the common leading shape of all arguments, or raise ValueError."""
-    require_vectors("goal", targets["goal"], trajectory.dimension)
-    shapes = {
-        "trajectory": trajectory.batch_shape,
-        "time": tuple(time.shape),
-        "arrival": tuple(arrival.shape),
-    }
-    if via is not None:
-        require_vectors("via", via, trajectory.dimension)
-        shapes["via"] = tuple(via.shape[:-1])
-    return broadcast_batch(**shapes, **check_end_shapes(targets, trajectory.dimension))
+    points = targets if via is None else {**targets, "via": via}
+    return broadcast_batch(
+        trajectory=trajectory.batch_shape,
+        time=tuple(time.shape),
+        arrival=tuple(arrival.shape),
+        **end_shapes(points, trajectory.dimension),
+    )
 
 
 def _plan(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .array_api import Array, broadcast_batch, refuse_free, require
+from .array_api import Array, broadcast_batch, require
 from .trajectory import Trajectory, require_trajectory
 
 
@@ -44,7 +44,6 @@ def minimum_duration(
     named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
     if all(limit is None for limit in named.values()):
         raise ValueError("give at least one limit: velocity, acceleration or jerk")
-    refuse_free(**named)
     xp, limits = trajectory.namespace, trajectory.floats(named, widest=True)
     factor = 0.0 * trajectory.duration
     for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):

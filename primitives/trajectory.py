@@ -22,11 +22,10 @@ from .array_api import (
     check_buffers,
     constant,
     error_state,
+    leading_shape,
     namespace_of,
     own,
-    refuse_free,
     require,
-    require_vectors,
     to_numpy,
     whole_order,
     whole_orders,
@@ -317,24 +316,18 @@ class Trajectory:
             ValueError: an argument is not finite or has a wrong shape.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
-        refuse_free(**named)
         xp, moved = self.namespace, self.coefficients
         rotation, translation, scale = self.floats(named)
         if rotation is not None:
-            if rotation.ndim < 2 or rotation.shape[-1] != self.dimension or rotation.shape[-2] < 1:
-                raise ValueError(
-                    f"rotation must have shape (..., D, {self.dimension}), got {tuple(rotation.shape)}"
-                )
-            broadcast_batch(trajectory=self.batch_shape, rotation=tuple(rotation.shape[:-2]))
+            shape = leading_shape("rotation", rotation, None, self.dimension)
+            broadcast_batch(trajectory=self.batch_shape, rotation=shape)
             moved = xp.matmul(moved, rotation[..., None, :, :].mT)
         if scale is not None:
             broadcast_batch(trajectory=self.batch_shape, scale=tuple(scale.shape))
             moved = moved * scale[..., None, None, None]
         if translation is not None:
-            require_vectors("translation", translation, moved.shape[-1])
-            batch = broadcast_batch(
-                trajectory=tuple(moved.shape[:-3]), translation=tuple(translation.shape[:-1])
-            )
+            shape = leading_shape("translation", translation, moved.shape[-1])
+            batch = broadcast_batch(trajectory=tuple(moved.shape[:-3]), translation=shape)
             moved = broadcast_to(xp, moved, (*batch, *moved.shape[-3:]))
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)

@@ -1,72 +1,102 @@
-"""Pages of the documentation: links, imports and examples."""
+"""Pages and code agree: links lead somewhere, examples run, and commands are understood."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from viapoint.training.cli import main as cli
+
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+}
 PUBLIC = ("viapoint.primitives", "viapoint.envs", "viapoint.training")
+OWN_TESTS = {"docs/bring-your-arm.md", "docs/live.md"}
+"""Pages whose examples train for long or need files; tests of their subject run them."""
+every_page = pytest.mark.parametrize("name", sorted(PAGES))
 
 
-def examples(path):
-    return re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+def text(name):
+    return PAGES[name].read_text(encoding="utf-8")
 
 
-def anchors(path):
+def examples(name):
+    return re.findall(r"```python\n(.*?)```", text(name), re.DOTALL)
+
+
+def prose(name):
+    return re.sub(r"```.*?```", "", text(name), flags=re.DOTALL)
+
+
+def anchors(name):
     """Anchors of the headings of a page, as GitHub makes them."""
-    prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-    heads = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    heads = re.findall(r"^#+ (.*)$", prose(name), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
-@pytest.mark.parametrize("path", PAGES, ids=NAMES)
-def test_links_lead_somewhere(path):
-    prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for link in re.findall(r"\]\(([^)\s]+)\)", prose):
-        if link.startswith(("https://", "http://")):
-            continue
+@every_page
+def test_links_lead_somewhere(name):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(name)):
         file, _, anchor = link.partition("#")
-        target = (path.parent / file).resolve() if file else path
+        if file.startswith(("https:", "http:")):
+            continue
+        target = (PAGES[name].parent / file).resolve() if file else PAGES[name]
         assert target.exists(), link
-        assert not anchor or anchor in anchors(target), link
+        assert not anchor or anchor in anchors(target.relative_to(ROOT).as_posix()), link
 
 
-def test_files_named_to_contributors_hold_what_they_are_named_for():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.split("## Where things are")[1].split("##")[0]
-    for files in re.findall(r"`(\w+/[\w/]+\.py)`", text):
-        assert (ROOT / files).is_file() or "NAME" in files, files
-    for row in table.splitlines()[4:]:
-        for names, file in re.findall(r"((?:`\w+`(?: and )?)+) in `([\w/]+\.py)`", row):
-            source = (ROOT / file).read_text(encoding="utf-8")
-            for name in re.findall(r"\w+", names.replace(" and ", " ")):
-                assert re.search(rf"(?:class|def) {name}\b", source), (name, file)
+@every_page
+def test_files_of_the_project_that_a_page_names_exist(name):
+    for file in re.findall(r"`((?:primitives|envs|training|tests|benchmarks)/[\w/]+\.\w+)`", text(name)):
+        assert name == "CHANGELOG.md" or "NAME" in file or (ROOT / file).exists(), file
 
 
-@pytest.mark.parametrize("path", PAGES, ids=NAMES)
-def test_examples_import_public_packages_only(path):
-    for example in examples(path):
-        for module in re.findall(r"^\s*(?:from|import) (viapoint[\w.]*)", example, re.MULTILINE):
-            assert module in PUBLIC, module
-
-
-def test_the_index_lists_every_page():
-    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    for path in (ROOT / "docs").glob("*.md"):
-        assert path.name == "index.md" or f"]({path.name}" in index, path.name
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["CONTRIBUTING.md", "docs/baselines.md", "docs/choosing.md", "docs/geometry.md", "docs/studies.md"],
-)
-def test_the_examples_of_a_page_run(name):
+@every_page
+def test_examples_run(name):
     """Each page runs in a process of its own, as some examples register arms, tasks and families."""
-    script = "\n".join(examples(ROOT / name))
+    script = "\n".join(examples(name))
+    for module in re.findall(r"^\s*(?:from|import) (viapoint[\w.]*)", script, re.MULTILINE):
+        assert module in PUBLIC, module
+    if not script or name in OWN_TESTS:
+        return
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def commands(name):
+    """Command lines of `viapoint` and `make` on a page, as a reader would type them."""
+    blocks = re.findall(r"```\w*\n(.*?)```", text(name), re.DOTALL)
+    lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines()]
+    lines += re.findall(r"`((?:viapoint|make) [^`\n]+)`", text(name))
+    return [line for line in lines if re.match(r"(viapoint|make) ", line)]
+
+
+def understand(words):
+    try:
+        cli.parse(words)
+    except SystemExit:
+        return  # help was asked for
+    except cli.UsageError as error:
+        pytest.fail(f"{shlex.join(words)}: {error}")
+
+
+@pytest.mark.parametrize("name", sorted(set(PAGES) - {"CHANGELOG.md"}))  # which names what is gone, too
+def test_commands_are_known(name):
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for line in commands(name):
+        program, *words = shlex.split(line, comments=True)
+        if program == "make":
+            assert {word for word in words if "=" not in word} <= targets, line
+        elif len(words) > 1 and "COMMAND" not in line:
+            understand(words)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_the_example_of_each_command_is_understood(name):
+    config = cli.COMMANDS[name].config
+    example = re.search(r"Example: viapoint (.+)", config.__doc__).group(1)
+    assert type(cli.parse(shlex.split(example))) is config

@@ -145,7 +145,6 @@ def load_arm(
         hand_site="hand",
         ik=table,
         workspace=as_box(corners),
-        may_touch_itself=False,  # the whole reach was checked
     )
     shape = (written._replace(excess=each.excess) for written, each in zip(arm.shape, capsules, strict=True))
     arm = replace(arm, shape=tuple(shape))

@@ -221,7 +221,7 @@ def check_strength(parsed: ParsedMjcf, chain: Chain, joints: Float, places: Sequ
     weight = np.abs(chain.torques(joints, 0.0 * joints, 0.0 * joints)[1])
     lacking = weight - LIMIT_SHARE * parsed.torque_limit
     if (lacking >= 0.0).any():
-        where, joint = np.unravel_index(lacking.argmax(), lacking.shape)
+        where, joint = (int(i) for i in np.unravel_index(lacking.argmax(), lacking.shape))
         raise ValueError(
             f"torque_limit of {parsed.joints[joint]} is {parsed.torque_limit[joint]:g} N m, of which {LIMIT_SHARE:.0%} "
             f"are used, but to hold the arm {places[where]} against gravity takes {weight[where, joint]:.4g} N m"

@@ -96,7 +96,11 @@ def as_real_array(values: Any) -> NDArray[Any] | None:
     """Return real numbers as an array, or None for anything else."""
     try:
         array = np.asarray(values)
-    except (TypeError, ValueError):  # for example rows of different lengths
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ):  # rows of different lengths; tensors that require a gradient
         return None
     return array if array.dtype.kind in "fiu" else None
 
@@ -137,8 +141,19 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     return seeds
 
 
-def as_constants(name: str, values: Any, wanted: str, fits: Callable[..., bool]) -> Float:
-    """Return real numbers as a new array, without a gradient.
+def finite_array(name: str, values: Any) -> Float:
+    """Return finite real numbers as an array of double precision; an array that is one already is not copied."""
+    array = as_real_array(values)
+    if array is None:
+        raise ValueError(f"{name} must be an array of real numbers, got {values!r:.60}")
+    finite = np.isfinite(array)
+    if not finite.all():
+        raise ValueError(f"{name} must be finite, got {array[~finite][0]}")
+    return array.astype(np.float64, copy=False)
+
+
+def array_of_shape(name: str, values: Any, wanted: str, fits: Callable[..., bool]) -> Float:
+    """Return real numbers as a new array.
 
     Args:
         name: Name of the argument for errors.
@@ -146,10 +161,7 @@ def as_constants(name: str, values: Any, wanted: str, fits: Callable[..., bool])
         wanted: Description of the shape for errors.
         fits: Function that returns True for an allowed shape, given as its lengths.
     """
-    try:
-        array = as_real_array(values)
-    except RuntimeError:  # of torch, which converts no tensors with a gradient
-        raise ValueError(f"{name} must not require a gradient, use {name}.detach()") from None
+    array = as_real_array(values)
     if array is None or not fits(*array.shape):
         got = "no real numbers" if array is None else f"shape {array.shape}"
         raise ValueError(f"{name} must have shape {wanted}, got {got}")

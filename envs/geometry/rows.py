@@ -18,14 +18,13 @@ import numpy as np
 
 from viapoint.envs.common.arrays import frame_axes, in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import as_real_array, whole_number
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.geometry.shapes import LISTS, MESH_HINT, SHAPES, as_obstacles, refuse_single
-from viapoint.primitives.array_api import Array, to_numpy
 
 CAPSULES = ("capsule",)
 """Shapes of scenes whose rows are capsules; spheres are capsules without a length."""
@@ -58,12 +57,12 @@ def row_size(dimension: int, shapes: Sequence[str] = CAPSULES) -> int:
     return 2 * dimension + 1 + (0 if tuple(shapes) == CAPSULES else SHAPE_SIZE)
 
 
-def has_shapes(rows: Array) -> bool:
+def has_shapes(rows: Numbers) -> bool:
     """Return True for rows with other shapes than capsules."""
     return int(rows.shape[-1]) > 2 * 3 + 1
 
 
-def dimension_of(rows: Array) -> int:
+def dimension_of(rows: Numbers) -> int:
     """Return the dimension D of rows."""
     return (int(rows.shape[-1]) - 1 - SHAPE_SIZE * has_shapes(rows)) // 2
 
@@ -241,12 +240,8 @@ def _checked_numbers(obstacles: Any) -> Any:
     Raises:
         ValueError: The obstacles are something else, or a row that is not zero has no positive radius.
     """
-    try:
-        array = np.asarray(obstacles)
-        real = array.dtype.kind in "fiu"
-    except (TypeError, ValueError, RuntimeError):  # torch: a tensor that follows a gradient
-        real = False
-    if not real:
+    array = as_real_array(obstacles)
+    if array is None:
         raise ValueError(f"obstacles must be {LISTS}, got {obstacles!r:.80}")
     if array.ndim > 1 and array.size:
         wrong = ~np.isfinite(array).all(axis=-1) | ((array != 0.0).any(axis=-1) & ~(array[..., -1] > 0.0))
@@ -468,8 +463,7 @@ def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -
         centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()
     except ValueError as error:
         raise ValueError(f"{_numbered(index, obstacle)}: {error}") from None
-    quaternion = to_numpy(obstacle.quaternion).astype(np.float64)
     if shapes == CAPSULES:
-        axis = to_numpy(obstacle.half_axis) if isinstance(obstacle, Capsule) else np.zeros(3)
+        axis = obstacle.half_axis if isinstance(obstacle, Capsule) else np.zeros(3)
         return np.concatenate((centre[:dimension], axis[:dimension], half[:1]))
-    return shape_rows(kind, centre[:dimension], quaternion, half)
+    return shape_rows(kind, centre[:dimension], obstacle.quaternion, half)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -20,8 +19,7 @@ from viapoint.envs.geometry.cylinder import Cylinder
 from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape, checked_radius
-from viapoint.primitives.array_api import Array, as_floats, like, namespace_of, to_numpy
+from viapoint.envs.geometry.shape import Shape, as_points, checked_radius
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -178,11 +176,8 @@ def refuse_single(obstacles: Any) -> None:
 
 
 def signed_distances(
-    obstacles: Sequence[Shape | Mapping[str, Any]],
-    first: Array,
-    second: Array | None = None,
-    radius: Array = 0.0,
-) -> Array:
+    obstacles: Sequence[Shape | Mapping[str, Any]], first: Any, second: Any = None, radius: Any = 0.0
+) -> Float:
     """Return the signed distance of spheres or capsules from each of n obstacles, shape (..., n), [m].
 
     Args:
@@ -198,40 +193,39 @@ def signed_distances(
         [0.02, 0.12]
     """
     obstacles = as_obstacles(obstacles)
-    start, end = _like_tensors(obstacles, first, second)
-    xp = namespace_of(start)
+    ends = _checked_ends(first, second)
     if not obstacles:
-        return xp.zeros_like(start[..., :0])
-    each = [
-        o.distance(start, radius) if end is None else o.segment_distance(start, end, radius)
-        for o in obstacles
-    ]
-    shape = np.broadcast_shapes(*(tuple(one.shape) for one in each))
-    return xp.stack([xp.broadcast_to(one, shape) for one in each], -1)
+        return np.zeros((*ends[0].shape[:-1], 0))
+    each = [_distance(obstacle, ends, radius) for obstacle in obstacles]
+    return np.stack(np.broadcast_arrays(*each), axis=-1)
 
 
-def _like_tensors(obstacles: Sequence[Shape], first: Array, second: Array | None) -> list[Any]:
-    """Return points in one array library: that of torch tensors among them or among the obstacles, else NumPy."""
-    given = {"first": first} if second is None else {"first": first, "second": second}
-    xp, arrays = as_floats(**given)
-    tensors = [each for o in obstacles if hasattr(each := o.position, "requires_grad")]
-    if xp is np and tensors:
-        arrays = [like(namespace_of(tensors[0]), each, tensors[0]) for each in arrays]
-    return [*arrays, None][:2]
+def _checked_ends(first: Any, second: Any) -> list[Float]:
+    """Return the ends of segments, or points alone where there is no second end."""
+    ends = [as_points("first", first)]
+    if second is not None:
+        ends.append(as_points("second", second))
+    return ends
+
+
+def _distance(obstacle: Shape, ends: Sequence[Float], radius: Any) -> Any:
+    """Return the distance of spheres or capsules from one obstacle."""
+    if len(ends) == 1:
+        return obstacle.distance(ends[0], radius)
+    return obstacle.segment_distance(ends[0], ends[1], radius)
 
 
 def nearest_distance(
     obstacles: Sequence[Shape | Mapping[str, Any]],
-    first: Array,
-    second: Array | None = None,
+    first: Any,
+    second: Any = None,
     radius: Any = 0.0,
     most: float = np.inf,
-) -> Array:
+) -> Any:
     """Return the least signed distance of spheres or capsules from all obstacles, shape (...,), at most `most`, [m].
 
     Broad phase: bounding spheres bound every distance from below. Narrow phase: obstacles in the order of their bounds;
-    distances are only computed where the bound is below the least distance so far. With torch tensors, all distances
-    are computed, and the result is a tensor with their gradient.
+    distances are only computed where the bound is below the least distance so far.
 
     Args:
         obstacles: Shapes or dictionaries.
@@ -248,17 +242,7 @@ def nearest_distance(
     obstacles = as_obstacles(obstacles)
     if isinstance(most, bool) or not isinstance(most, Real) or most != most:
         raise ValueError(f"most must be a number, got {most!r:.60}")
-    ends = [end for end in _like_tensors(obstacles, first, second) if end is not None]
-    xp = namespace_of(ends[0])
-    radius = checked_radius(radius, ends[0])
-    if xp is not np:
-        each = signed_distances(obstacles, first, second, radius)
-        nearest = xp.full(each.shape[:-1], float(most), dtype=each.dtype, device=each.device)
-        return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
-    ends = [end.astype(np.float64, copy=False) for end in ends]
-    for end in ends:
-        if end.shape[-1:] != (3,):
-            raise ValueError(f"points must have shape (..., 3), got shape {end.shape}")
+    ends, radius = _checked_ends(first, second), checked_radius(radius)
     for i, each in enumerate(obstacles):
         try:
             each.require_single()
@@ -271,19 +255,17 @@ def nearest_distance(
         raise ValueError(f"points and radius must broadcast, got the shapes {sizes}") from None
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
-    middle = flat[0] if second is None else 0.5 * (flat[0] + flat[1])
-    reach = size + (0.0 if second is None else _length(flat[1] - middle))
+    middle = 0.5 * (flat[0] + flat[-1])
+    reach = size + _length(flat[-1] - middle)
     least = np.full(len(middle), float(most))
     if not obstacles or not len(middle):
         return least.reshape(shape)
-    spheres = [(to_numpy(c), float(to_numpy(r))) for c, r in (o.bounding_sphere for o in obstacles)]
+    spheres = [each.bounding_sphere for each in obstacles]
     bounds = np.stack([_length(middle - centre) - wide - reach for centre, wide in spheres])
     for which in np.argsort(bounds.min(axis=1), kind="stable"):
         some = np.flatnonzero(bounds[which] < least)
         if some.size:
-            found = signed_distances(
-                [obstacles[which]], flat[0][some], None if second is None else flat[1][some], size[some]
-            )[:, 0]
+            found = _distance(obstacles[which], [end[some] for end in flat], size[some])
             least[some] = np.minimum(least[some], found)
     return least.reshape(shape)
 

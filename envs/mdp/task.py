@@ -14,7 +14,7 @@ from viapoint.envs.arms.base import Arm, CollisionModel
 from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import RewardWeights
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.sampler import SceneSampler, sampler_of_family, scene_sampler
+from viapoint.envs.scenes.sampler import SceneSampler, sampler_of_family
 
 AnyDistribution = SceneDistribution | SpaceDistribution
 
@@ -50,7 +50,7 @@ class Task:
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        return scene_sampler(self.collision_model, self.scenes)
+        return SceneSampler(self.collision_model, self.scenes)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON."""

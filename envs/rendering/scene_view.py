@@ -33,12 +33,13 @@ FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.ta
 """Colour of a replaced plan."""
 FADED_RADIUS = 0.0045
 """Radius of the path of a replaced plan, [m]."""
-MAX_GEOMS = 2000
-"""Greatest number of shapes in a scene."""
 
 
 class SceneView:
-    """MuJoCo scene with the arm, its surroundings and a movement."""
+    """Writer of MuJoCo scenes with the arm, its surroundings and a movement."""
+
+    scene: mujoco.MjvScene
+    """Scene to write, which belongs to the screen that shows it."""
 
     def __init__(self, simulator: Simulator, width: int, height: int) -> None:
         """Copy the simulator's model, so that changes of appearance do not affect the simulation."""
@@ -54,8 +55,6 @@ class SceneView:
         self._aim(width, height)
         if self.arm.dimension == 2:
             self.model.geom_rgba[self._links, 3] = AMONG if self.whole_arm else OVERHEAD
-        self.scene = mujoco.MjvScene(self.model, MAX_GEOMS)
-        """Scene to render, after :meth:`set`."""
 
     def set(
         self, scene: Scenes, joints: Float, movement: Movement | None, step: int, replaced: Sequence[Float]

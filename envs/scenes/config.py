@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from viapoint.envs.common.validation import check_increasing_pair, is_number
+from viapoint.envs.common.validation import check_increasing_pair
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.scenes.families import MOST_DRAWN, MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
@@ -26,9 +26,6 @@ class SceneDistribution:
     """Fewest and most obstacles."""
     shapes: tuple[str, ...] = CAPSULES
     """Names of the shapes that obstacles may have; spheres are capsules without a length."""
-    uniform_share: float = 0.0
-    """Share of scenes with ends and obstacles that are uniform in the workspace, see
-    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     distance: tuple[float, float] = (0.25, 0.45)
     """Distance from start to goal, [m]."""
     post_radius: tuple[float, float] = (0.012, 0.045)
@@ -63,7 +60,6 @@ class SceneDistribution:
         """Check the ranges."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
         check_shapes(self.shapes, self.dimension)
-        check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
 
@@ -78,9 +74,6 @@ class SpaceDistribution(SpatialSizes):
     """Fewest and most obstacles; a scene has at least as many as its family needs."""
     shapes: tuple[str, ...] = CAPSULES
     """Names of the shapes that obstacles may have; spheres are capsules without a length."""
-    uniform_share: float = 0.0
-    """Share of scenes with ends and obstacles that are uniform in the workspace, see
-    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     families: tuple[str, ...] = TRAINED
     """Names of families, drawn with equal chances; a repeated name is drawn more often. Families that need more than
     the greatest number of obstacles are left out."""
@@ -101,7 +94,6 @@ class SpaceDistribution(SpatialSizes):
         """Check the ranges and the families."""
         check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
         check_shapes(self.shapes, self.dimension)
-        check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:
             raise ValueError(
@@ -150,13 +142,3 @@ def check_count(pair: Sequence[int], name: str, limit: int, fewest_limit: int | 
     if not 0 <= fewest <= most <= limit or fewest > least:
         also = f" and fewest <= {least}" if least < limit else ""
         raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}{also}, got {pair}")
-
-
-def check_share(share: float, name: str) -> None:
-    """Check a share.
-
-    Raises:
-        ValueError: The value is no number from 0 to 1.
-    """
-    if not is_number(share) or not 0.0 <= share <= 1.0:
-        raise ValueError(f"{name} must be a number from 0 to 1, got {share!r}")

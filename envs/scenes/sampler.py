@@ -12,7 +12,7 @@ import copy
 import dataclasses
 import functools
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -91,9 +91,9 @@ class SceneSampler:
             for begin in range(0, len(pending), TOGETHER):
                 some = pending[begin : begin + TOGETHER]
                 given = None if ends is None else (ends[0][some], ends[1][some])
-                for which, found, _ in next_attempts([attempts[k] for k in some], given, apart=apart):
-                    scenes.put(some[which], found)
-                    left[begin + which] = False
+                which, found, _ = next_attempts([attempts[k] for k in some], given, apart=apart)
+                scenes.put(some[which], found)
+                left[begin + which] = False
             pending = pending[left]
         return self.with_spare_rows(scenes)
 
@@ -107,10 +107,6 @@ class SceneSampler:
         if not self._spare:
             return scenes
         return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0))))
-
-    def part(self, generator: np.random.Generator) -> SceneSampler:
-        """Return the sampler of a generator's next scene, which the generator may draw among several."""
-        return self
 
     def not_found(self, attempts: int, ends: Ends) -> str:
         """Return the message for a scene, with given ends or not, of which no attempt was good."""
@@ -205,30 +201,15 @@ class UniformSampler(SceneSampler):
         return self._reshaped(uniforms.at(rows), rows, scenes)
 
 
-class MixedSampler(SceneSampler):
-    """Sampler of scenes of which a share is uniform in the workspace.
-
-    The first random number of each scene says from which of the two samplers it comes.
-    """
-
-    def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
-        super().__init__(collision_model, distribution)
-        self._uniform = UniformSampler(collision_model, distribution)
-
-    def part(self, generator: np.random.Generator) -> SceneSampler:
-        """Return the sampler of a generator's next scene, as its first number says."""
-        return self._uniform if generator.random() < self.distribution.uniform_share else self
-
-
 class Attempts:
     """Attempts at the next scene of one random generator, until one is good."""
 
     def __init__(self, sampler: SceneSampler, generator: np.random.Generator) -> None:
-        self.generator, self.sampler = generator, sampler.part(generator)
-        self._shared = 0.0 if self.sampler.fixed is None else generator.random()
+        self.generator, self.sampler = generator, sampler
+        self._shared = 0.0 if sampler.fixed is None else generator.random()
         self.made = 0
         """Attempts that were taken."""
-        self._rest = np.empty((0, self.sampler.size))
+        self._rest = np.empty((0, sampler.size))
         # Attempts up to the end of each group that was drawn, and the generator's state there.
         self._groups: list[tuple[int, Any]] = []
 
@@ -261,42 +242,40 @@ class Attempts:
 
 def next_attempts(
     attempts: Sequence[Attempts], ends: Ends = None, *, apart: bool = True
-) -> Iterator[tuple[Int, Scenes, list[Any]]]:
+) -> tuple[Int, Scenes, list[Any]]:
     """Compute the next attempts at several scenes.
 
     Args:
-        attempts: Attempts at N scenes, at most TOGETHER.
+        attempts: Attempts of one sampler at N scenes, at most TOGETHER.
         ends: Starts and goals of the N scenes, see :meth:`SceneSampler.__call__`.
         apart: False if scenes share a generator: whole groups are then drawn in turn.
 
-    Yields:
+    Returns:
         Indices of scenes with a good attempt, the scenes, and the states of their generators.
 
     Raises:
         RuntimeError: There are no further attempts at a scene.
     """
-    number, order = len(attempts), attempts[0].sampler.order
+    number, sampler = len(attempts), attempts[0].sampler
+    order = sampler.order
     least = min(max(order.ahead // number, 1), MOST) if apart else 1
     most = max(TOGETHER // number, least) if apart else max(order.groups)
     taken = [each.take(least, most) for each in attempts]
     for k, each in enumerate(attempts):
         if not len(taken[k]):
-            raise RuntimeError(
-                each.sampler.not_found(each.made, None if ends is None else (ends[0][k], ends[1][k]))
-            )
-    for sampler in dict.fromkeys(each.sampler for each in attempts):
-        some = np.array([k for k, each in enumerate(attempts) if each.sampler is sampler])
-        counts = np.array([len(taken[k]) for k in some])
-        owner, begin = np.repeat(some, counts), np.repeat(np.cumsum(counts) - counts, counts)
-        given = None if ends is None else (ends[0][owner], ends[1][owner])
-        found, scenes = sampler.attempt(Uniforms(np.concatenate([taken[k] for k in some])), given)
-        first = np.flatnonzero(np.diff(owner[found], prepend=-1))
-        which, place = owner[found[first]], found[first] - begin[found[first]]
-        states = [
-            attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
-            for k, at in zip(which, place, strict=True)
-        ]
-        yield which, scenes.take(first), states
+            given = None if ends is None else (ends[0][k], ends[1][k])
+            raise RuntimeError(sampler.not_found(each.made, given))
+    counts = np.array([len(each) for each in taken])
+    owner, begin = np.repeat(np.arange(number), counts), np.repeat(np.cumsum(counts) - counts, counts)
+    given = None if ends is None else (ends[0][owner], ends[1][owner])
+    found, scenes = sampler.attempt(Uniforms(np.concatenate(taken)), given)
+    first = np.flatnonzero(np.diff(owner[found], prepend=-1))
+    which, place = owner[found[first]], found[first] - begin[found[first]]
+    states = [
+        attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
+        for k, at in zip(which, place, strict=True)
+    ]
+    return which, scenes.take(first), states
 
 
 class SceneQueue:
@@ -341,13 +320,13 @@ class SceneQueue:
         """Compute attempts for the generators with the fewest scenes waiting."""
         some = np.array([k for k in self._attempts if self._waiting[k] < AHEAD])
         some = some[np.argsort(self._waiting[some], kind="stable")[:TOGETHER]]
-        for which, scenes, states in next_attempts([self._attempts[k] for k in some]):
-            rows = some[which]
-            self._scenes.put(rows * AHEAD + (self._first[rows] + self._waiting[rows]) % AHEAD, scenes)
-            self._waiting[rows] += 1
-            for k, state in zip(rows, states, strict=True):
-                self._after[k].append(state)
-                self._attempts[k] = Attempts(self._sampler, self._attempts[k].generator)
+        which, scenes, states = next_attempts([self._attempts[k] for k in some])
+        rows = some[which]
+        self._scenes.put(rows * AHEAD + (self._first[rows] + self._waiting[rows]) % AHEAD, scenes)
+        self._waiting[rows] += 1
+        for k, state in zip(rows, states, strict=True):
+            self._after[k].append(state)
+            self._attempts[k] = Attempts(self._sampler, self._attempts[k].generator)
 
 
 def _same(first: Any, second: Any) -> bool:
@@ -356,12 +335,6 @@ def _same(first: Any, second: Any) -> bool:
         return bool(first == second)
     except ValueError:
         return False
-
-
-def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -> SceneSampler:
-    """Return the sampler of a distribution."""
-    kind = MixedSampler if distribution.uniform_share else SceneSampler
-    return kind(collision_model, distribution)
 
 
 def _has_boxes(obstacles: Float) -> Bool:

@@ -17,16 +17,6 @@ from viapoint.primitives import (
     through,
 )
 
-RNG = np.random.default_rng(70)
-START = RNG.bit_generator.state
-
-
-@pytest.fixture(autouse=True)
-def same_draws():
-    """Every test begins with the same random numbers, whatever ran before it."""
-    RNG.bit_generator.state = START
-
-
 MEASURES = [dimensionless_jerk, log_dimensionless_jerk, spectral_arc_length]
 
 
@@ -37,9 +27,8 @@ def via_movement(along, across, duration=1.0):
 
 
 @pytest.mark.parametrize("duration", [0.5, 1.0, 3.0])
-@pytest.mark.parametrize("order", [3])
-def test_the_straight_reach_has_its_closed_forms(duration, order):
-    reach = point_to_point([0.0, 0.0], [0.3, 0.4], duration, order=order)
+def test_the_straight_reach_has_its_closed_forms(duration):
+    reach = point_to_point([0.0, 0.0], [0.3, 0.4], duration)
     np.testing.assert_allclose(reach.energy(3), 720 * 0.25 / duration**5, rtol=1e-13)
     np.testing.assert_allclose(reach.cost(), 360 * 0.25 / duration**5, rtol=1e-13)
     np.testing.assert_allclose(dimensionless_jerk(reach), 204.8, rtol=1e-12)
@@ -47,20 +36,14 @@ def test_the_straight_reach_has_its_closed_forms(duration, order):
     np.testing.assert_allclose(spectral_arc_length(reach), -1.4024, atol=5e-5)
 
 
-@pytest.mark.parametrize("measure", MEASURES, ids=lambda f: f.__name__)
-def test_measures_do_not_depend_on_place_size_or_orientation(measure):
-    waypoints = RNG.normal(size=(6, 4, 2))
+@pytest.mark.parametrize("measure", MEASURES)
+def test_measures_do_not_depend_on_place_size_or_orientation_nor_jerk_on_duration(measure, rng):
+    waypoints = rng.normal(size=(6, 4, 2))
     movement = through(waypoints, passage_durations(waypoints, 1.0))
-    rotation = np.array([[0.6, -0.8], [0.8, 0.6]])
-    elsewhere = movement.transformed(rotation, np.array([5.0, 6.0]), 3.0)
-    np.testing.assert_allclose(measure(elsewhere), measure(movement), rtol=1e-9)
-
-
-@pytest.mark.parametrize("measure", [dimensionless_jerk, log_dimensionless_jerk])
-def test_jerk_measures_do_not_depend_on_duration(measure):
-    waypoints = RNG.normal(size=(6, 4, 2))
-    movement = through(waypoints, passage_durations(waypoints, 1.0))
-    np.testing.assert_allclose(measure(movement.stretched(7.0)), measure(movement), rtol=1e-11)
+    moved = movement.transformed(np.array([[0.6, -0.8], [0.8, 0.6]]), np.array([5.0, 6.0]), 3.0)
+    if measure is not spectral_arc_length:
+        moved = moved.stretched(7.0)
+    np.testing.assert_allclose(measure(moved), measure(movement), rtol=1e-9)
 
 
 def test_detours_are_less_smooth():
@@ -79,19 +62,13 @@ def test_curvature_is_that_of_the_path():
     np.testing.assert_allclose(curvature(movement, time), turning / speed(movement, time), rtol=1e-6)
 
 
-def test_signed_curvature_changes_sign_in_the_mirror_and_space_has_its_size():
+def test_signed_curvature_changes_sign_in_the_mirror_and_space_has_its_size(rng):
     movement = via_movement(0.3, 0.4)
     time = np.linspace(0.1, 0.9, 9)
     mirrored = movement.transformed(np.diag([1.0, -1.0]))
     np.testing.assert_allclose(curvature(mirrored, time), -curvature(movement, time), rtol=1e-12)
-    lifted = movement.transformed(RNG.normal(size=(3, 2)) @ np.zeros((2, 2)) + np.eye(3)[:, :2])
+    lifted = movement.transformed(rng.normal(size=(3, 2)) @ np.zeros((2, 2)) + np.eye(3)[:, :2])
     np.testing.assert_allclose(curvature(lifted, time), np.abs(curvature(movement, time)), rtol=1e-12)
-    with pytest.raises(ValueError, match="dimension"):
-        curvature(movement.transformed(np.ones((1, 2))), time)
-
-
-def test_curvature_is_undefined_at_rest():
-    assert np.isnan(curvature(via_movement(0.5, 0.3), [0.0])).all()
 
 
 @pytest.mark.parametrize(("height", "valleys"), [(0.28, 0), (9 / 32 - 1e-4, 0), (9 / 32 + 1e-4, 1), (1.0, 1)])
@@ -113,8 +90,8 @@ def test_valley_curvature_peak_and_passage_are_three_instants_in_general():
     np.testing.assert_allclose(time[np.argmax(bend)], 0.44866, atol=5e-6)
 
 
-def test_speed_events_are_local_extremes_and_pad_with_nan():
-    waypoints = RNG.normal(size=(12, 5, 2))
+def test_speed_events_are_local_extremes_and_pad_with_nan(rng):
+    waypoints = rng.normal(size=(12, 5, 2))
     waypoints[0] = np.linspace([0, 0], [1, 1], 5)
     movement = through(waypoints, passage_durations(waypoints, 2.0))
     for events, sign in ((speed_valleys(movement), 1), (speed_peaks(movement), -1)):
@@ -128,10 +105,14 @@ def test_speed_events_are_local_extremes_and_pad_with_nan():
     assert (~np.isnan(speed_peaks(movement).time[0])).sum() == 1
 
 
-def test_standing_still_has_no_measure():
+def test_limits_of_the_measures():
     still = point_to_point([1.0, 1.0], [1.0, 1.0], 1.0)
     assert np.isnan(dimensionless_jerk(still))
     assert speed_valleys(still).time.shape == (0,)
+    assert np.isnan(curvature(via_movement(0.5, 0.3), [0.0])).all()
+    steady = point_to_point([0.0], [1.0], 0.5, start_velocity=[2.0], goal_velocity=[2.0])
+    assert dimensionless_jerk(steady) == 0
+    assert log_dimensionless_jerk(steady) == np.inf
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-110, 1e110, 1e200, 1e300])
@@ -149,8 +130,8 @@ def test_measures_hold_for_any_size(size):
 @pytest.mark.parametrize("kind", [np, torch])
 @pytest.mark.parametrize("duration", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_measures_of_single_precision_are_those_of_double_precision(kind, size, duration):
-    waypoints = size * np.concatenate([RNG.normal(size=(40, 3, 2)), [[[0, 0], [0.3, 0.5], [1, 0]]]])
+def test_measures_of_single_precision_are_those_of_double_precision(kind, size, duration, rng):
+    waypoints = size * np.concatenate([rng.normal(size=(40, 3, 2)), [[[0, 0], [0.3, 0.5], [1, 0]]]])
     parts = kind.asarray(waypoints, dtype=kind.float32), kind.asarray(duration, dtype=kind.float32)
     single = through(parts[0], passage_durations(*parts))
     double = through(waypoints, np.asarray(passage_durations(*parts), float))
@@ -160,10 +141,3 @@ def test_measures_of_single_precision_are_those_of_double_precision(kind, size, 
         found, expected = events(single).time, events(double).time
         assert found.shape == expected.shape
         np.testing.assert_allclose(found / duration, expected / duration, atol=2e-3)
-
-
-def test_a_movement_without_jerk_is_infinitely_smooth():
-    ends = {"start_velocity": [2.0, 0.0], "goal_velocity": [2.0, 0.0]}
-    steady = point_to_point([0.0, 0.0], [1.0, 0.0], 0.5, **ends)
-    assert dimensionless_jerk(steady) == 0
-    assert log_dimensionless_jerk(steady) == np.inf

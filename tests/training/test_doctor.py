@@ -10,7 +10,7 @@ import pytest
 from viapoint.training.cli import doctor
 from viapoint.training.cli import main as cli
 
-GOOD, GONE = "print('fine')", "import no_such_module"
+GOOD, GONE = "print('fine')\n", "import no_such_module\n"
 EXTRA = (
     "torch",
     "stable_baselines3",
@@ -19,7 +19,6 @@ EXTRA = (
     "rich",
     "tqdm",
     "matplotlib",
-    "scipy",
     "safetensors",
 )
 
@@ -27,7 +26,7 @@ EXTRA = (
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """The checks in processes of their own are tried once, below."""
-    for name in ("STEP", "FRAME", "RENDER_THEN_TRAIN", "AGENT"):
+    for name in ("STEP", "FRAME", "LEARN"):
         monkeypatch.setattr(doctor, name, GOOD)
 
 
@@ -46,23 +45,40 @@ def test_all_is_well_here(capsys, tmp_path, monkeypatch):
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("check", "code", "remedy"), [("STEP", 1, "--force-reinstall 'mujoco>=4'"), ("FRAME", 0, "libegl1")]
-)
-def test_what_is_missing_is_named_with_the_remedy_and_fails_if_it_is_needed(
-    check, code, remedy, capsys, monkeypatch
-):
-    monkeypatch.setattr(doctor, check, GONE)
-    found, printed = report(capsys)
-    assert found == code
+def test_what_is_missing_is_named_with_the_remedy(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "STEP", GONE)
+    code, printed = report(capsys)
+    assert code == 1
     assert "no_such_module" in printed
-    assert remedy in printed
+    assert "--force-reinstall 'mujoco>=4'" in printed
+
+
+def test_what_is_not_needed_is_no_failure(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "FRAME", GONE)
+    monkeypatch.setattr(doctor, "missing_packages", lambda: ["torch"])  # agents are not tried then
+    code, printed = report(capsys)
+    assert code == 0
+    assert "libegl1" in printed
 
 
 def test_a_crash_and_a_hang_end_no_report(monkeypatch):
     assert not doctor.in_a_process("it", "import os; os.abort()", "do this").works
     monkeypatch.setattr(doctor, "PATIENCE", 0.2)
     assert not doctor.in_a_process("it", "import time; time.sleep(60)", "").works
+
+
+@pytest.mark.parametrize(
+    ("version", "least", "enough"),
+    [
+        ("2.10", "2.9", True),
+        ("2.9", "2.10", False),
+        ("2.13.0+cpu", "2.13", True),
+        ("4.0.0", "4", True),
+        ("3.9", "4.0", False),
+    ],
+)
+def test_versions_are_numbers(version, least, enough):
+    assert doctor.at_least(version, least) is enough
 
 
 def test_bounds_are_those_of_the_installed_package():
@@ -73,20 +89,15 @@ def test_bounds_are_those_of_the_installed_package():
         "moviepy>=99; extra == 'dev'",
         "no-such-package>=1",
     ]
-    found = {each.name: (each.works, each.needed) for each in doctor.packages(lines)}
-    assert found == {
-        "numpy": (False, True),
-        "gymnasium": (True, True),
-        "moviepy": (False, False),
-        "no-such-package": (False, True),
-    }
+    found = {each.name: each.works for each in doctor.packages(lines)}
+    assert found == {"Python": True, "numpy": False, "gymnasium": True, "no-such-package": False}
 
 
-def test_a_disk_that_cannot_be_written_or_is_full(monkeypatch, tmp_path):
+def test_runs_need_a_folder_that_can_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(doctor, "SPACE", 1 << 60)
-    for place in ("a/b", "file", "file/runs"):
-        assert not doctor.attempt("disk", lambda place=place: doctor.disk(tmp_path / place), "").works
+    assert doctor.disk(tmp_path / "a" / "b").works
+    assert not doctor.disk(tmp_path / "file").works
+    assert not doctor.disk(tmp_path / "file" / "runs").works
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
@@ -114,7 +125,7 @@ def test_an_upgrade_in_place_is_recognised_even_if_nothing_can_be_imported(tmp_p
     assert doctors.returncode == 1, doctors.stderr
     findings = {each["name"]: each for each in json.loads(doctors.stdout)["findings"]}
     assert not findings["MuJoCo engine"]["works"]
-    assert "--force-reinstall 'mujoco>=4'" in findings["MuJoCo's files"]["remedy"]
+    assert "--force-reinstall 'mujoco>=4'" in findings["MuJoCo engine"]["remedy"]
     trainings = told(["train"], tmp_path)
     assert trainings.returncode == 2
     (line,) = trainings.stderr.splitlines()
@@ -147,8 +158,8 @@ def test_without_the_extra_the_report_advises_the_extra_alone(without_extra):
     report = told(["doctor", "--json"], without_extra)
     assert report.returncode == 1, report.stderr
     findings = json.loads(report.stdout)["findings"]
-    remedies = [each["remedy"] for each in findings if each["needed"] and not each["works"]]
-    assert remedies == ["pip install 'viapoint[training]'"]
+    remedies = {each["remedy"] for each in findings if each["needed"] and not each["works"]}
+    assert remedies == {"pip install 'viapoint[training]'"}
 
 
 def test_without_the_extra_a_public_name_says_what_to_install(without_extra):

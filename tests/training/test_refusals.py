@@ -216,10 +216,8 @@ def scenes(number):
 
 
 def draws(*scores, samples=10):
-    """Both statistics that draw."""
     generator = np.random.default_rng(0)
     statistics.across_seeds([scores], np.zeros(len(scores)), generator, samples=samples)
-    statistics.probability_of_improvement(scores, scores, generator, samples=samples)
 
 
 def film(path="film.mp4", number=1, mode="rgb_array_list"):
@@ -298,7 +296,6 @@ CALLS = [
     lambda: statistics.interquartile_mean([math.nan]),
     lambda: statistics.across_seeds([1.0], [0], np.random.default_rng(0)),
     lambda: statistics.across_seeds([[1.0, 0.0]], [0], np.random.default_rng(0)),
-    lambda: statistics.probability_of_improvement([[1.0]], [1.0, 2.0], np.random.default_rng(0)),
     lambda: statistics.success_weighted_path_length([1], [0.0], [1.0]),
     lambda: statistics.success_weighted_path_length([1], [1.0, 2.0], [1.0]),
     lambda: statistics.success_weighted_path_length([1.0], [math.inf], [1.0]),

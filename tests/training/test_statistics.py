@@ -108,41 +108,6 @@ def test_across_seeds_without_any_spread_is_wilsons():
     assert interval == statistics.wilson(5, 20)
 
 
-def test_probability_of_improvement_is_mann_and_whitneys():
-    from scipy.stats import mannwhitneyu
-
-    generator = np.random.default_rng(6)
-    first, second = generator.integers(0, 6, 5), generator.integers(0, 5, 4)
-    expected = mannwhitneyu(first, second).statistic / 20
-    result = statistics.probability_of_improvement(first, second, np.random.default_rng(0), samples=500)
-    assert result.estimate == pytest.approx(expected)
-    assert result.low < result.estimate < result.high
-    other = statistics.probability_of_improvement(second, first, np.random.default_rng(0), samples=10)
-    assert other.estimate == pytest.approx(1.0 - expected)
-    better = statistics.probability_of_improvement(second + 9, second, np.random.default_rng(0), samples=10)
-    assert better == (1.0, 1.0, 1.0)
-
-
-def test_probability_of_improvement_draws_runs_of_both_methods(monkeypatch):
-    """With two runs each, all 16 draws can be written down."""
-    first, second = np.array([1.0, 3.0]), np.array([2.0, 4.0])
-    draws = sorted(
-        np.mean([[a > b for a in x] for b in y])
-        for x in itertools.product(first, repeat=2)
-        for y in itertools.product(second, repeat=2)
-    )
-    for confidence in (0.5, 0.8):
-        monkeypatch.setattr(statistics, "CONFIDENCE", confidence)
-        _, low, high = statistics.probability_of_improvement(
-            first, second, np.random.default_rng(0), samples=20_000
-        )
-        tail = 0.5 - confidence / 2
-        assert (low, high) == tuple(np.quantile(draws, (tail, 1 - tail), method="inverted_cdf"))
-    monkeypatch.undo()
-    single = statistics.probability_of_improvement([2.0], [1.0, 3.0], np.random.default_rng(0))
-    assert single == (0.5, 0.0, 1.0)
-
-
 def test_spl_by_its_formula():
     assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
         2.5 / 4

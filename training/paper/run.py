@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import sys
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib as mpl
+from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -18,7 +20,6 @@ from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, write_bytes, write_json
 from viapoint.training.io.installed import versions
-from viapoint.training.io.template import load_template, packaged
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
 from viapoint.training.paper.figures import double, other
@@ -177,12 +178,15 @@ def summary(claims: list[Claim]) -> str:
 
 def page(reproduction: Reproduction) -> str:
     """Return an HTML page with embedded pictures."""
-    template = load_template(packaged("paper/templates/page.html.j2"), escape=True)
+    source = files("viapoint.training") / "paper" / "templates" / "page.html.j2"
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     figures = [
         (base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in reproduction.pictures
     ]
     claims = reproduction.claims
-    return template.render(
+    return environment.from_string(source.read_text(encoding="utf-8")).render(
         title=TITLE, note=NOTE, summary=summary(claims), headings=HEADINGS[1:], claims=claims, cells=cells,
         subjects=SUBJECTS, figures=figures,
     )  # fmt: skip

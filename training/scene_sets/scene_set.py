@@ -179,7 +179,7 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
 
 
 OTHER_ARGUMENTS = frozenset(
-    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height", "uniform_share"}
+    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
 )
 """Arguments of an environment with which frozen scenes remain scenes of it; without replanning, `duration_range` is
 another."""

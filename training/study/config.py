@@ -72,7 +72,7 @@ class Trial:
     method: str = ""
     """Name of a baseline; empty for an agent."""
     resources: Values = field(default_factory=lambda: {"cpu": 1})
-    """What the trial takes of a node, such as {"cpu": 2, "GPU": 1}."""
+    """Resources of a node that the trial takes, such as {"cpu": 2, "GPU": 1}."""
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -233,9 +233,7 @@ def _study(
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
         for name, fields in _points(given or {}):
             if name in rows:
-                raise ValueError(
-                    f"agents, baselines and searches must have different names, {name} is there twice"
-                )
+                raise ValueError(f"rows must have different names, {name} is there twice")
             rows.add(name)
             for env in fields.pop("environments", list(known)):
                 if env not in known:
@@ -246,8 +244,7 @@ def _study(
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
     trials = sorted((each for each in found if isinstance(each, Trial)), key=lambda each: each.seed)
     every = tuple(each for each in found if isinstance(each, Search))
-    place = Path(out or Path("runs") / default)
-    return Study(name=default, out=place, trials=tuple(trials), searches=every)
+    return Study(name=default, out=Path(out or f"runs/{default}"), trials=tuple(trials), searches=every)
 
 
 def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -260,9 +257,7 @@ def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[st
             raise ValueError(f"{pattern} must be values by name, got {fields!r}")
         grid = (fields or {}).get("grid", {})
         if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
-            raise ValueError(
-                f"grid of {pattern} must be lists of values by the path of a field, got {grid!r}"
-            )
+            raise ValueError(f"grid of {pattern} must be lists by the path of a field, got {grid!r}")
         for values in itertools.product(*grid.values()):
             point, name = {key: value for key, value in (fields or {}).items() if key != "grid"}, str(pattern)
             for path, value in zip(grid, values, strict=True):
@@ -369,6 +364,8 @@ def _search(
         trials=check_whole("trials", trials, 1),
         first=tuple(first or ()),
     )
+    if not parameters:
+        raise ValueError("parameters must hold at least one list or range")
     if not search.trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
     for path in [path for each in search.first for path in each if path not in parameters]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
+import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,13 +26,12 @@ RETRIES = 2
 """Number of times that a trial whose worker died is begun again."""
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # otherwise Ray replaces 127.0.0.1 by another address
+    "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
 """Environment variables of Ray, which reads them when it is imported."""
 Told = Callable[[str], None]
-"""Function of a line for a person."""
 
 
 class StudyFailedError(Exception):
@@ -40,7 +42,8 @@ def run(config: StudyConfig) -> None:
     """Run a study from its file, and print where its tables are."""
     study = Study.from_yaml(config.file)
     table = run_study(study, out=config.out, address=config.address, workers=config.workers, told=print)
-    print(markdown(table, study.name))
+    if len(table):
+        print(markdown(table, study.name))
     print(f"tables and figures: {config.out or study.out}")
 
 
@@ -125,6 +128,9 @@ def _import_libraries() -> tuple[Any, Any]:
 @contextmanager
 def _connected(address: str | None, workers: int | None) -> Iterator[None]:
     """Connect to a cluster, or start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study."""
+    loopback = address is None or address.startswith(("127.0.0.1:", "localhost:"))
+    if loopback:  # otherwise Ray replaces 127.0.0.1 by another address of the machine
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     ray, _ = _import_libraries()
     if ray.is_initialized():
         yield
@@ -133,12 +139,13 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
     if address is None:
         settings |= {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
+        if address is not None:  # Ray itself tries for minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address=address or "local", **settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"no Ray cluster can be used at {address} ({reason}); start one with: ray start --head"
-        ) from None
+    except (OSError, RuntimeError, ValueError) as error:
+        advice = "`ray start --head` starts one, and one that has a token needs RAY_AUTH_MODE=token"
+        raise ValueError(f"no Ray cluster at {address} ({_one_line(error)}); {advice}") from None
     try:
         yield
     finally:
@@ -150,14 +157,14 @@ def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> 
     _, tune = _import_libraries()
 
     def work(config: Values) -> None:
-        label = config["trial"].folder(Path()).as_posix()
+        metrics = {"label": config["trial"].folder(Path()).as_posix()}
         try:
             first = run_trial(config["trial"], folder)["rows"][0]
-        except Exception as error:  # worth no second try, unlike a worker that died
-            tune.report({"label": label, "error": _one_line(error)})
-        else:
             rate = 100.0 * first["solved"].count("1") / len(first["solved"])
-            tune.report({"label": f"{label}: {rate:.1f} % of {first['set']}"})
+            metrics["label"] += f": {rate:.1f} % of {first['set']}"
+        except Exception as error:  # worth no second try, unlike a worker that died
+            metrics["error"] = _one_line(error)
+        tune.report(metrics)
 
     tuner = tune.Tuner(
         tune.with_resources(work, lambda config: config["trial"].resources),
@@ -165,7 +172,7 @@ def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> 
         tune_config=tune.TuneConfig(max_concurrent_trials=workers),
         run_config=_run_config(tune, "trials", folder, told),
     )
-    return _failures(tuner.fit(), len(trials))
+    return _fitted(tuner, len(trials))[1]
 
 
 def _search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
@@ -212,11 +219,10 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
             ),
             run_config=config,
         )
-    results = tuner.fit()
-    failed = _failures(results, search.trials)
+    results, failed = _fitted(tuner, search.trials)
     if len(failed) == search.trials:
         return failed
-    _write_search(search, results, folder)  # settings that cannot be trained do not end a search
+    told(_write_search(search, results, folder))  # settings that cannot be trained do not end a search
     return []
 
 
@@ -240,15 +246,19 @@ def _run_config(tune: Any, name: str, folder: Path, told: Told) -> Any:
     )
 
 
-def _failures(results: Any, expected: int) -> list[str]:
-    """Return a line for each trial that failed; Ctrl-C, after which Ray Tune returns, goes on as such."""
+def _fitted(tuner: Any, expected: int) -> tuple[Any, list[str]]:
+    """Run trials, and return their results and a line for each that failed."""
+    handler = signal.getsignal(signal.SIGINT)
+    results = tuner.fit()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
     if results.num_terminated + results.num_errors < expected:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt  # after Ctrl-C, Ray Tune returns
     failed = [_one_line(error) for error in results.errors]
     for each in results:
         if each.error is None and "error" in each.metrics:
             failed.append(f"{each.metrics['label']}: {each.metrics['error']}")
-    return failed
+    return results, failed
 
 
 def _domain(tune: Any, given: Any) -> Any:
@@ -261,19 +271,19 @@ def _domain(tune: Any, given: Any) -> Any:
     return (tune.loguniform if log else tune.uniform)(low, high)
 
 
-def _write_search(search: Search, results: Any, folder: Path) -> None:
-    """Write all trials of a search as CSV, and the best one as JSON with the command that trains it."""
-    paths = {f"config/{path}": path for path in search.parameters}
-    table = results.get_dataframe().rename(columns=paths)[[*search.parameters, "success", "decisions"]]
+def _write_search(search: Search, results: Any, folder: Path) -> str:
+    """Write all trials of a search as CSV and the best one as JSON, and return a line about it."""
+    lines = [{**each.config, **each.metrics} for each in results if each.error is None]
+    table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
     # A training that was stopped early had less success than others with as many decisions.
     table = table.sort_values(["decisions", "success"], ascending=False)
-    place = search.folder(folder)
-    write_bytes(place / "trials.csv", table.to_csv(index=False).encode())
+    write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
     chosen = search.with_parameters({path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen.config(folder), out=None)
-    record = {"viapoint": "search", "key": search.key, "success": best["success"]}
-    write_json(place / "best.json", {**record, "training": config.as_json(), "command": config.command})
+    record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
+    write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
+    return f"best of {search.name}, {100.0 * best['success']:.1f} %: {config.command}"
 
 
 def _one_line(error: BaseException) -> str:

@@ -32,8 +32,7 @@ Report = Callable[[Record], None]
 def run_trial(trial: Trial, out: Path, report: Report | None = None) -> Record:
     """Train if needed, measure, and return the record of a trial.
 
-    A trial whose record is there already is not repeated, and a training that was interrupted goes on from its last
-    checkpoint.
+    A training that is complete is not repeated, and one that was interrupted goes on from its last checkpoint.
 
     Args:
         trial: Trial of a study.
@@ -43,9 +42,6 @@ def run_trial(trial: Trial, out: Path, report: Report | None = None) -> Record:
     Raises:
         ValueError: The folder holds a training with other settings, or the training cannot be made.
     """
-    finished = finished_record(trial, out)
-    if finished is not None:
-        return finished
     record: Record = {"viapoint": "study", "asked": asked(trial)}
     if trial.method:
         stored = trial.method == "stored"

@@ -1,0 +1,243 @@
+"""Studies: what a file means, what is refused, and that a study which was killed or runs on two nodes ends alike."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from viapoint.training import Study, run_study
+from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
+from viapoint.training.study.tables import COLUMNS, markdown
+
+ENV = "viapoint/PlanarObstacles-v0"
+FEW = {"learning_starts": 64, "gradient_steps": 1}
+TRAINING = {
+    "n_timesteps": 256, "n_envs": 32, "eval_every": 64, "eval_scenes": 8, "checkpoint_every": 64,
+    "hyperparameters": FEW, "env_kwargs": {"threads": 1},
+}  # fmt: skip
+GIVEN = {
+    "environments": [ENV],
+    "scenes": ["test"],
+    "n_scenes": 12,
+    "seeds": [0, 1],
+    "agents": {"viaq": TRAINING, "sac": {"algo": "sac", **TRAINING}},
+    "baselines": ["straight", "search16", "stored"],
+}
+
+
+def results_in(folder):
+    """Return what may not depend on where and in how many pieces a study ran: weights, successes and curves."""
+    found = {}
+    for path in sorted(folder.glob("PlanarObstacles-v0/*/*/result.json")):
+        record = json.loads(path.read_text())
+        weights = path.parent / "best" / "weights.safetensors"
+        successes = [line["solved"] for line in record["rows"]]
+        found[path.relative_to(folder).as_posix()] = (
+            successes,
+            record.get("curve"),
+            weights.read_bytes() if weights.is_file() else b"",
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def ray():
+    """One Ray for all studies of this process, as each start takes seconds."""
+    ray, _ = _import_libraries()
+    with _connected(None, 2):
+        yield ray
+
+
+@pytest.fixture(scope="module")
+def whole(ray, tmp_path_factory):
+    """A study that ran through: its folder, table, lines and results."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    told = []
+    table = run_study(Study.from_dict(GIVEN), out=folder, told=told.append)
+    return folder, table, told, results_in(folder)
+
+
+def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
+    folder, table, told, before = whole
+    assert list(table.columns) == COLUMNS
+    assert len(told) == 7  # two agents with two seeds each, and three baselines
+    rows = table.set_index("method")
+    assert set(rows.index) == {"viaq", "sac", "straight", "search16", "stored"}
+    assert rows.seeds.to_dict() == {"viaq": 2, "sac": 2, "straight": 1, "search16": 1, "stored": 1}
+    assert (rows.scenes == 12).all()
+    assert ((rows.low <= rows.success) & (rows.success <= rows.high)).all()
+    assert rows.success["stored"] == 1.0
+    assert rows.success["straight"] == 0.0
+    assert rows.decisions["viaq"] == 256
+    pd.testing.assert_frame_equal(pd.read_csv(folder / "results.csv"), table, check_dtype=False)
+    assert "| straight" in (folder / "results.md").read_text()
+    assert (folder / "PlanarObstacles-v0.png").stat().st_size > 10_000
+    again, lines = run_study(Study.from_dict(GIVEN), out=folder), []
+    pd.testing.assert_frame_equal(again, table, check_dtype=False)
+    assert results_in(folder) == before
+    more = {**GIVEN, "baselines": [*GIVEN["baselines"], "random"]}
+    assert len(run_study(Study.from_dict(more), out=folder, told=lines.append)) == len(table) + 1
+    assert len(lines) == 1
+
+
+def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
+    folder = whole[0]
+    before = results_in(folder)
+    other = {**GIVEN, "agents": {"viaq": {**TRAINING, "hyperparameters": {**FEW, "batch_size": 8}}}}
+    with pytest.raises(StudyFailedError, match="other settings"):
+        run_study(Study.from_dict(other), out=folder)
+    assert results_in(folder) == before
+
+
+def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
+    """It is killed when its first training has a checkpoint and is not complete."""
+    folder = tmp_path / "out"
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(GIVEN))
+    command = "from viapoint.training.cli.entry import main; main()"
+    words = [sys.executable, "-c", command, "study", "study.yaml", "--out", str(folder)]
+    process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120.0
+    while not list(folder.glob("*/*/*/checkpoints/0*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    complete = len(results_in(folder))
+    assert complete < 7
+    lines = []
+    run_study(Study.from_dict(GIVEN), out=folder, told=lines.append)
+    assert len(lines) == 7 - complete
+    assert results_in(folder) == whole[3]
+
+
+def test_two_nodes_have_the_same_results(whole, tmp_path):
+    """Two nodes of one core each that listen on 127.0.0.1; a process of its own, as Ray reads settings once."""
+    script = tmp_path / "nodes.py"
+    script.write_text(
+        "import os, sys\n"
+        'os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"\n'
+        "import yaml\n"
+        "from ray.cluster_utils import Cluster\n"
+        "from viapoint.training import Study, run_study\n"
+        'node = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}\n'
+        "cluster = Cluster(initialize_head=True, head_node_args=node)\n"
+        'cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")\n'
+        "run_study(Study.from_yaml(sys.argv[1]), out=sys.argv[2], address=cluster.address)\n"
+        "cluster.shutdown()\n"
+    )
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(GIVEN))
+    words = [sys.executable, script, tmp_path / "study.yaml", tmp_path / "out"]
+    subprocess.run(words, check=True, timeout=300, capture_output=True)
+    assert results_in(tmp_path / "out") == whole[3]
+
+
+def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path):
+    parameters = {
+        "hyperparameters.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+        "hyperparameters.batch_size": [16, 32],
+    }
+    first = [{"hyperparameters.learning_rate": 1e-3, "hyperparameters.batch_size": 32}]
+    search = {**TRAINING, "algo": "sac", "trials": 3, "parameters": parameters, "first": first}
+    study = Study.from_dict({"environments": [ENV], "searches": {"tuned": search}})
+    told = []
+    assert run_study(study, out=tmp_path / "out", told=told.append).empty
+    place = tmp_path / "out" / "PlanarObstacles-v0" / "tuned"
+    trials = pd.read_csv(place / "trials.csv")
+    assert len(trials) == 3
+    assert trials["hyperparameters.learning_rate"].between(1e-4, 1e-2).all()
+    assert set(trials["hyperparameters.batch_size"]) <= {16, 32}
+    assert (trials["hyperparameters.learning_rate"] == 1e-3).any()
+    best = json.loads((place / "best.json").read_text())
+    assert best["success"] == trials.success[trials.decisions == trials.decisions.max()].max()
+    assert "batch_size=" in best["command"]
+    lines = []
+    run_study(study, out=tmp_path / "out", told=lines.append)
+    assert not lines
+
+
+def test_grids_and_checks_make_rows():
+    grid = {"hyperparameters.batch_size": [64, 128], "env_kwargs.n_via": [1, 2]}
+    given = {"environments": [ENV], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
+    trials = Study.from_dict(given).trials
+    assert [trial.row for trial in trials] == [
+        f"sac-batch_size={size}-n_via={number}" for size in (64, 128) for number in (1, 2)
+    ]
+    config = trials[-1].config(Path("out"))
+    assert config.folder == Path("out/PlanarObstacles-v0/sac-batch_size=128-n_via=2/seed-3")
+    assert config.hyperparameters == {"batch_size": 128}
+    assert config.env_kwargs == {"n_via": 2}
+    assert config.seed == 3
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="name another folder"):
+        run_study(Study.from_dict(GIVEN), out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"environments": []},
+        {"environments": ["viapoint/PlanarObstaclesStep-v0"]},
+        {"environments": {"a": {"id": "CartPole-v1"}}},
+        {"environments": {"a": {"id": ENV, "env_kwargs": {"num_envs": 3}}}},
+        {"environments": {"../a": {"id": ENV}}},
+        {"seed": [0]},
+        {"seeds": [0, 0]},
+        {"seeds": [-1]},
+        {"n_scenes": 0},
+        {"scenes": ["tset"]},
+        {"agents": {"viaq": {"checks": [-1]}}},
+        {"agents": {"viaq": {"checks": 16}}},
+        {"agents": {"sac": {"algo": "sac", "checks": [16]}}},
+        {"agents": {"viaq": {"algo": "dqn"}}},
+        {"agents": {"viaq": {"hyperparameters": {"batchsize": 3}}}},
+        {"agents": {"viaq": {"hyperparameters": {"batch_size": 0}}}},
+        {"agents": {"viaq": {"hyperparameters": {"batch_size": "many"}}}},
+        {"agents": {"viaq": {"seed": 3}}},
+        {"agents": {"viaq": {"environments": ["PandaReach"]}}},
+        {"agents": {"viaq": {"grid": {"hyperparameters.gamma": 0.9}}}},
+        {"agents": {"viaq": {"grid": {"hyperparameters.gamma": [2.0]}}}},
+        {"agents": {"straight": {}}},
+        {"agents": {"viaq": 3}},
+        {"baselines": ["serach64"]},
+        {"baselines": ["search"]},
+        {"baselines": ["search0"]},
+        {"baselines": {"a": {"method": "planer"}}},
+        {"baselines": {"straight": {"checks": 3}}},
+        {"searches": {"a": {}}},
+        {"searches": {"a": {"parameters": {}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 1.0, "high": 0.5}}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 1.5}}}}},
+        {"searches": {"a": {"parameters": {"speed": [1, 2]}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "trials": 0}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "eval_every": 0}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "first": [{"gamma": 0.9}]}}},
+        {"agents": {}, "baselines": []},
+    ],
+)
+def test_what_cannot_be_run_is_an_error_when_the_file_is_read(change, tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**GIVEN, **change}))
+    with pytest.raises(ValueError, match=r"study\.yaml"):
+        Study.from_yaml(path)
+
+
+def test_an_unknown_field_comes_with_the_closest_one():
+    with pytest.raises(ValueError, match="did you mean 'seeds'"):
+        Study.from_dict({**GIVEN, "seedz": [0]})
+
+
+def test_pages_show_intervals_in_percent(whole):
+    text = markdown(whole[1], "small")
+    assert text.startswith("# small")
+    assert "100.0 % (75." in text  # Wilson's interval of 12 of 12
