@@ -235,6 +235,9 @@ CALLS = [
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
+    lambda: evaluate(ENV, checks=-1),
+    lambda: evaluate(ENV, checks=[0, 1.5]),
+    lambda: evaluate(ENV, n_scenes=0),
     lambda: evaluate(ENV, scenes="nowhere.npz"),
     lambda: GeometrySearch("viapoint/Nothing-v0"),
     *(lambda name=name, value=value: GeometrySearch(ENV, **{name: value})
