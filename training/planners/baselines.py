@@ -14,6 +14,7 @@ from tqdm import tqdm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.config.checks import unknown_name
 from viapoint.training.planners.cma_planner import Planner
 from viapoint.training.planners.ompl_planner import MotionPlanner
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
@@ -232,7 +233,5 @@ def factory(name: str, env_id: str) -> Callable[[Any], Method]:
     if found is not None and found[1] in COUNTED and int(found[2]) >= FEWEST_CHECKS[found[1]]:
         make, checks = COUNTED[found[1]], int(found[2])
         return lambda simulation: make(simulation, checks)
-    raise ValueError(
-        f"baselines in {env_id} must be some of {', '.join(known)}, or {', '.join(f'{each}512' for each in COUNTED)} "
-        f"with any number of checks, or untrained with an agent, got {name!r}"
-    )
+    counted = [f"{each}N" for each in COUNTED]  # N plans are checked
+    raise ValueError(unknown_name(f"baseline in {env_id}", name, [*known, *counted, "untrained"]))

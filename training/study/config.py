@@ -214,12 +214,12 @@ def _study(
     default: str,
     folder: Path,
     *,
-    environments: list[str] | dict[str, Any],
+    environments: Any,
     out: str = "",
     seeds: list[int] | None = None,
-    agents: list[str] | dict[str, Any] | None = None,
-    baselines: list[str] | dict[str, Any] | None = None,
-    searches: list[str] | dict[str, Any] | None = None,
+    agents: Any = None,
+    baselines: Any = None,
+    searches: Any = None,
     scenes: list[str] | None = None,
     n_scenes: int | None = None,
 ) -> Study:
@@ -249,6 +249,10 @@ def _study(
 
 def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
+    if not isinstance(given, list | Mapping):
+        raise ValueError(
+            f"environments, agents and so on must be a list of names or values by name, got {given!r}"
+        )
     entries = dict.fromkeys(given) if isinstance(given, list) else given
     for pattern, fields in entries.items():
         if not str(pattern).strip("/. ") or ".." in str(pattern) or str(pattern).startswith("/"):
@@ -298,7 +302,12 @@ def _environment(
         elif (folder / each).is_file():
             places.append(str((folder / each).absolute()))
         else:
-            raise ValueError(unknown_name("scenes", each, SETS) + ", or a file of scenes")
+            raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
+    if not places:
+        there = [each for each in SETS if shipped_path(each, env_id).is_file()]
+        raise ValueError(
+            f"no set among {', '.join(scenes or SETS)} is shipped for {env_id}; there are {', '.join(there)}"
+        )
     return Environment(
         name=name, id=env_id, env_kwargs=env_kwargs or {}, scenes=tuple(places), n_scenes=n_scenes
     )

@@ -89,6 +89,9 @@ def run_study(
     searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
     if missing or searches:
+        told(
+            f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
+        )
         with _connected(address, workers):
             failed += _fit(missing, folder, workers, told) if missing else []
             for search in searches:
@@ -252,7 +255,7 @@ def _fitted(tuner: Any, expected: int) -> tuple[Any, list[str]]:
     results = tuner.fit()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
-    if results.num_terminated + results.num_errors < expected:
+    if sum(each.error is not None or each.metrics.get("done", False) for each in results) < expected:
         raise KeyboardInterrupt  # after Ctrl-C, Ray Tune returns
     failed = [_one_line(error) for error in results.errors]
     for each in results:

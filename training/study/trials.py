@@ -25,11 +25,9 @@ from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 from viapoint.training.study.config import Environment, Trial, Values
 
 Record = dict[str, Any]
-Report = Callable[[Record], None]
-"""Function of the metrics of a validation; it raises to end the training."""
 
 
-def run_trial(trial: Trial, out: Path, report: Report | None = None) -> Record:
+def run_trial(trial: Trial, out: Path) -> Record:
     """Train if needed, measure, and return the record of a trial.
 
     A training that is complete is not repeated, and one that was interrupted goes on from its last checkpoint.
@@ -37,7 +35,6 @@ def run_trial(trial: Trial, out: Path, report: Report | None = None) -> Record:
     Args:
         trial: Trial of a study.
         out: Folder of the study.
-        report: Function of the validations during training.
 
     Raises:
         ValueError: The folder holds a training with other settings, or the training cannot be made.
@@ -51,7 +48,7 @@ def run_trial(trial: Trial, out: Path, report: Report | None = None) -> Record:
         record["rows"] = measured(trial, {"": method}, trial.env.env_kwargs)
     else:
         config = trial.config(out)
-        run = train_or_resume(config, None if report is None else ReportCallback(config.folder, report))
+        run = train_or_resume(config)
         model: Any = load_model(run.best)
         methods = {_suffix(checks): agent_method("agent", model, checks) for checks in trial.checks}
         if trial.untrained:
@@ -86,9 +83,9 @@ def finished_record(trial: Trial, out: Path) -> Record | None:
 
 
 class ReportCallback(BaseCallback):
-    """Callback that reports the validations of a run, each once."""
+    """Callback that reports the validations of a run, each once, to a function that may raise to end the training."""
 
-    def __init__(self, folder: Path, report: Report) -> None:
+    def __init__(self, folder: Path, report: Callable[[Record], None]) -> None:
         super().__init__()
         self.folder, self.report = folder, report
         self._reported = 0
