@@ -23,7 +23,7 @@ from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import versions
 from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task

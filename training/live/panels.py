@@ -53,7 +53,6 @@ class Actions(NamedTuple):
     load: Callable[[bytes], None]
     code: Callable[[], None]
     picture: Callable[[], None]
-    film: Callable[[], None]
     view: Callable[[], None]
 
 
@@ -268,7 +267,6 @@ class Panels:
             upload.on_upload(lambda event: actions.load(event.target.value.content))
             gui.add_button("Copy as Python").on_click(lambda _: actions.code())
             gui.add_button("Save picture (PNG)").on_click(lambda _: actions.picture())
-            gui.add_button("Save film (MP4)").on_click(lambda _: actions.film())
         gui.add_button("Reset the view").on_click(lambda _: actions.view())
         drag = "Drag start, goal, via-point and obstacles with the mouse."
         drag += " Hold Shift to move them up and down." if facts.spatial else ""

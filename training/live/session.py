@@ -24,7 +24,7 @@ from viapoint.training.live.movements import (
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
 from viapoint.training.live.panels import BAD, GOOD, RESET, Actions, MethodResult, Panels
-from viapoint.training.live.playback import Playback, png
+from viapoint.training.live.playback import Playback
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
 
@@ -429,16 +429,7 @@ class Session:
         self._panels.show_code(to_python(self._fitted, setting.env_id, setting.env_kwargs, changing=changing))
 
     def _picture(self) -> None:
-        self._download("viapoint.png", png(self._playback.photograph("png")))
-
-    def _film(self) -> None:
-        """Render a film of the movement, picture by picture, in the browser."""
-        if self.proposal is None:
-            raise ValueError("there is no plan to film: move what stands in the way first")
-        self._stop()
-        film = self._playback.film(self._segments(), self._panels.speed, self._panels.tell)
-        self._download("viapoint.mp4", film)
-        self._finish()
+        self._download("viapoint.png", self._playback.png())
 
     def _download(self, name: str, content: bytes) -> None:
         self._client.send_file_download(name, content, save_immediately=True)
@@ -466,7 +457,6 @@ class Session:
             load=self.load,
             code=later("code", self._code),
             picture=later("picture", self._picture),
-            film=later("film", self._film),
             view=later("view", lambda: self._view.look_at_everything()),
         )
 

@@ -18,8 +18,7 @@ from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import MARK, check_ours, write_bytes, write_json
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.figures import curved as figures_curved
 from viapoint.training.paper.figures import double, other

@@ -32,11 +32,11 @@ from viapoint.training.io.files import (
     check_ours,
     read_json,
     tidy,
+    versions,
     write_bytes,
     write_folder,
     write_json,
 )
-from viapoint.training.io.installed import versions
 from viapoint.training.runs.checkpoints import (
     is_checkpoint,
     read_checkpoint,

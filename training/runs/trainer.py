@@ -15,8 +15,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from viapoint.training.algorithms.model_io import build
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import BadFileError
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStalledError
 from viapoint.training.runs.run_dir import MAY_CHANGE, Run, check_free, check_unchanged, write_config
