@@ -30,7 +30,7 @@ def made(tmp_path_factory):
     every = obstacles.light_scenes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(obstacles, "light_scenes", lambda: every.take(slice(None, None, FEWER)))
-        cli.main(["paper", "--out", str(out), "--guide", str(out / "guide")])
+        cli.main(["paper", "--out", str(out)])
     return out
 
 

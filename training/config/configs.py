@@ -368,12 +368,9 @@ class PaperConfig(Config):
     """Folder for the figures and the table."""
     agent: Path | None = None
     """Run folder or model folder of the agent that moves around the rows of lights; default: the shipped agent."""
-    guide: Path | None = None
-    """Folder for the small pictures of docs/flash-hogan.md."""
 
     def _check(self) -> None:
         check_folder("out", self.out)
-        check_folder("guide", self.guide)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
-from viapoint.envs.common.types import Float, Frame
+from viapoint.envs.common.types import Float
 from viapoint.training.live.job_thread import TICK
 
 if TYPE_CHECKING:

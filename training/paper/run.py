@@ -12,8 +12,6 @@ from typing import NamedTuple
 import matplotlib as mpl
 from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
@@ -202,13 +200,6 @@ def _or_dash(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-GUIDE_FIGURES = (
-    "fig01_model", "fig03_straight", "fig04_joints", "fig05_height", "fig06_place", "fig08_obstacles",
-    "fig10_isochrony", "valleys", "alternatives", "limits", "double_step", "double_step_jerk",
-)  # fmt: skip
-"""Figures of docs/flash-hogan.md."""
-
-
 class ClaimsFailedError(Exception):
     """Error after a run in which some claims do not hold; all results are written."""
 
@@ -222,9 +213,6 @@ def run(config: PaperConfig) -> None:
     figures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
     for name in (*PAGES, *figures):
         check_ours(config.out / name)
-    if config.guide is not None:
-        for name in GUIDE_FIGURES:
-            check_ours(config.guide / f"paper_{name}.png")
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():
 
         def report_step(name: str) -> None:
@@ -233,20 +221,7 @@ def run(config: PaperConfig) -> None:
 
         result = reproduce(config.out, config.agent, report_step)
     pages = write(result, config.out)
-    if config.guide is not None:
-        write_guide(result, config.guide)
     print(f"{summary(result.claims)} The page: {pages[-1]}")
     if result.failed:
         names = "; ".join(f"row {claim.row}, {claim.claim}" for claim in result.failed)
         raise ClaimsFailedError(f"{len(result.failed)} of {len(result.claims)} claims fail: {names}")
-
-
-def write_guide(result: Reproduction, folder: Path) -> None:
-    """Write small versions of the figures for the guide, paper_*.png with few colours."""
-    folder.mkdir(parents=True, exist_ok=True)
-    written_by = PngInfo()
-    written_by.add_text("Software", MARK.decode())
-    for path, _ in result.pictures:
-        if path.stem in GUIDE_FIGURES:
-            small = Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE)
-            small.save(folder / f"paper_{path.name}", optimize=True, pnginfo=written_by)

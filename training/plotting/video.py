@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,7 +21,7 @@ from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame, Observation
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.io.files import check_ours
+from viapoint.training.io.files import MARK, check_ours
 from viapoint.training.plotting.top_view import draw_movement
 
 Decide = Callable[[Observation, Scenes], Any]
