@@ -14,7 +14,7 @@ from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, PaperConfig, PlayConfig, TrainConfig
 from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper
-from viapoint.training.paper.figures.style import save as save_figure
+from viapoint.training.paper.figures import save as save_figure
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train

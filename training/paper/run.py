@@ -17,20 +17,9 @@ from tqdm import tqdm
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
+from viapoint.training.paper import figures
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
-from viapoint.training.paper.figures import curved as figures_curved
-from viapoint.training.paper.figures import double, other
-from viapoint.training.paper.figures import straight as figures_straight
-from viapoint.training.paper.figures.style import STYLE, save
-from viapoint.training.paper.rows import (
-    alternatives,
-    curved,
-    double_step,
-    limits,
-    obstacles,
-    straight,
-    timing,
-)
+from viapoint.training.paper.rows import alternatives, curved, double_step, obstacles, straight
 from viapoint.training.paper.rows.obstacles import ObstacleMovements, check_agent
 
 ROWS: dict[int, Callable[[], list[Claim]]] = {
@@ -40,10 +29,10 @@ ROWS: dict[int, Callable[[], list[Claim]]] = {
     4: curved.passage_claims,
     5: curved.valley_claims,
     6: curved.place_claims,
-    7: timing.isochrony_claims,
-    8: timing.scaling_claims,
+    7: curved.isochrony_claims,
+    8: curved.scaling_claims,
     9: alternatives.alternative_claims,
-    10: limits.limit_claims,
+    10: alternatives.limit_claims,
     11: double_step.replanning_claims,
     13: double_step.double_step_claims,
 }
@@ -65,34 +54,34 @@ def _plain(draw: Callable[[], Figure]) -> Callable[[ObstacleMovements], Figure]:
 DRAWINGS = (
     Drawing("fig01_model", "The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
             "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
-            _plain(figures_straight.model)),
+            _plain(figures.model)),
     Drawing("fig03_straight", "Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
-            "simulated arm, here and in the following figures.", _plain(figures_straight.straight_movements)),
+            "simulated arm, here and in the following figures.", _plain(figures.straight_movements)),
     Drawing("fig04_joints", "Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
-            "the same for the hand is not for the joints.", _plain(figures_straight.joints)),
+            "the same for the hand is not for the joints.", _plain(figures.joints)),
     Drawing("fig05_height", "A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
-            "relative to d1 + d2. Dotted: passage of the via-point.", _plain(figures_curved.height)),
-    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", _plain(figures_curved.place)),
-    Drawing("fig07_turned", "The same in other directions (Fig. 7).", _plain(figures_curved.turned)),
+            "relative to d1 + d2. Dotted: passage of the via-point.", _plain(figures.height)),
+    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", _plain(figures.place)),
+    Drawing("fig07_turned", "The same in other directions (Fig. 7).", _plain(figures.turned)),
     Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and the one "
             "with the median depth (B), each with the model through its point of greatest curvature.",
-            figures_curved.obstacles),
+            figures.obstacles),
     Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
             "B, D: difference from the model. Grey squares: movements around rows of lights.",
-            other.isochrony),
-    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", _plain(figures_curved.scaling)),
+            figures.isochrony),
+    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", _plain(figures.scaling)),
     Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
-            _plain(figures_curved.valleys)),
+            _plain(figures.valleys)),
     Drawing("alternatives", "Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
-            "(D).", _plain(other.alternatives)),
+            "(D).", _plain(figures.alternatives)),
     Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
-            "the torques of both (C, D; limits dotted).", _plain(other.limits)),
+            "the torques of both (C, D; limits dotted).", _plain(figures.limits)),
     Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
             "after its start: by a second movement that is added, or by one new plan with the same arrival.",
-            _plain(double.paths_and_speeds)),
+            _plain(figures.paths_and_speeds)),
     Drawing("double_step_jerk", "Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
             "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
-            _plain(double.comparison)),
+            _plain(figures.comparison)),
 )  # fmt: skip
 """Figures in the order of the paper."""
 
@@ -110,8 +99,8 @@ def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None])
     pictures = []
     for drawing in DRAWINGS:
         report_step(drawing.name)
-        with mpl.rc_context(STYLE):
-            picture, _ = save(drawing.draw(avoidance), out, drawing.name)
+        with mpl.rc_context(figures.STYLE):
+            picture, _ = figures.save(drawing.draw(avoidance), out, drawing.name)
         pictures.append((picture, drawing.caption))
     return Reproduction(claims, pictures)
 
@@ -179,13 +168,13 @@ def page(reproduction: Reproduction) -> str:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    figures = [
+    pictures = [
         (base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in reproduction.pictures
     ]
     claims = reproduction.claims
     return environment.from_string(source.read_text(encoding="utf-8")).render(
         title=TITLE, note=NOTE, summary=summary(claims), headings=HEADINGS[1:], claims=claims, cells=cells,
-        subjects=SUBJECTS, figures=figures,
+        subjects=SUBJECTS, figures=pictures,
     )  # fmt: skip
 
 
@@ -210,8 +199,8 @@ def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
     if config.agent is not None:
         check_agent(config.agent)
-    figures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
-    for name in (*PAGES, *figures):
+    pictures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
+    for name in (*PAGES, *pictures):
         check_ours(config.out / name)
     with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():
 

@@ -17,10 +17,17 @@ from viapoint.primitives import speed_valleys
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
-from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
-from viapoint.training.paper.reference_movements import construction, minimum_jerk_through, passage_share
-from viapoint.training.paper.rows.timing import FAST, SLOW
-from viapoint.training.paper.simulated import SimulatedMovements, simulate
+from viapoint.training.paper.movements import (
+    Profile,
+    SimulatedMovements,
+    arm_profile,
+    construction,
+    minimum_jerk_through,
+    model_profile,
+    passage_share,
+    simulate,
+)
+from viapoint.training.paper.rows.curved import FAST, SLOW
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 
