@@ -15,7 +15,7 @@ import numpy as np
 from typeguard import TypeCheckError, check_type
 
 from viapoint.envs.common.validation import is_number, whole_number
-from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -62,31 +62,9 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
 
 
-def check_whole_movements(env: str) -> None:
-    """Check that an action of the task is a whole movement."""
-    if env in STEP_TASKS or env in REPLANNING_TASKS:
-        like = STEP_TASKS.get(env, DEFAULT_ENV)
-        raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
-
-
-def check_has_scenes(env: str) -> None:
-    """Check that scenes are shipped for a task."""
-    if env in OWN_ARM_TASKS:
-        raise ValueError(f"env must be one with frozen scenes, {OWN_ARM_TASKS[env]} for one, got {env!r}")
-
-
 def check_whole(name: str, value: Any, least: int) -> int:
     """Return a whole number from `least` to its greatest value."""
     return whole_number(name, value, least, GREATEST.get(name))
-
-
-def check_observed(number: int, algo: str, env: str) -> None:
-    """Check that an algorithm can observe candidates in an environment."""
-    if number and (algo == "viaq" or env in STEP_TASKS):
-        raise ValueError(
-            "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
-            f"control step, got {number} for {algo} on {env}"
-        )
 
 
 def check_stalling(share: Any, asked: int | None, interval: int, limits: tuple[int, int]) -> None:
@@ -110,13 +88,6 @@ def check_stalling(share: Any, asked: int | None, interval: int, limits: tuple[i
         raise ValueError(
             f"n_timesteps must be over min_timesteps ({limits[0]}) with stop_when_stalled, got {limits[1]}"
         )
-
-
-def check_baselines(names: tuple[str, ...]) -> None:
-    """Check that baselines differ, as a table has one row for each."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"baselines must differ, {name} is there twice")
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:

@@ -12,20 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
 import tyro
 
-from viapoint.envs.registration import ENV_IDS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
-    check_baselines,
     check_env,
     check_env_kwargs,
     check_file,
     check_folder,
-    check_has_scenes,
-    check_observed,
     check_stalling,
     check_whole,
-    check_whole_movements,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 from viapoint.training.io.files import parse_yaml
@@ -191,7 +187,11 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        check_observed(self.observe_candidates, self.algo, self.env)
+        if self.observe_candidates and (self.algo == "viaq" or self.env in STEP_TASKS):
+            raise ValueError(
+                "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
+                f"control step, got {self.observe_candidates} for {self.algo} on {self.env}"
+            )
         check_env_kwargs(self.env_kwargs)
         if not isinstance(self.hyperparameters, Mapping):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
@@ -294,7 +294,8 @@ class EvaluateConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        check_baselines(self.baselines)
+        if len(set(self.baselines)) < len(self.baselines):
+            raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
         if self.env is not None:
             check_env(self.env)
         if self.agent is None and self.env is None:
@@ -397,8 +398,11 @@ class DemoConfig(Config):
 
     def _check(self) -> None:
         check_env(self.env)
-        check_whole_movements(self.env)
-        check_has_scenes(self.env)
+        if self.env in {*STEP_TASKS, *REPLANNING_TASKS, *OWN_ARM_TASKS}:
+            like = STEP_TASKS.get(self.env) or OWN_ARM_TASKS.get(self.env, DEFAULT_ENV)
+            raise ValueError(
+                f"env must have frozen scenes and whole movements as actions, {like} for one, got {self.env!r}"
+            )
         check_folder("out", self.out)
 
     @property
