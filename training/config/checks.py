@@ -96,10 +96,6 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
         return
     if suffix and path.suffix.lower() != suffix:
         raise ValueError(f"{name} must end in {suffix}, got {path}")
-    if os.path.isdir(path):
-        raise ValueError(f"{name} must be a file, and {path} is a folder")
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise ValueError(f"{name} must be a file, and {path} is something else")
     check_ours(path)
     _check_place(name, path, path.parent)
 

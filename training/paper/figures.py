@@ -20,6 +20,7 @@ from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.io.files import MARK
 from viapoint.training.paper.movements import (
     EDGE,
+    Profile,
     SimulatedMovements,
     arm_profile,
     curved,
@@ -149,6 +150,13 @@ def dot(ax: Axes, point: Float, **style: Any) -> None:
     """Draw a via-point, shape (2,), [m]."""
     usual = {"marker": "o", "color": PALETTE.via, "markersize": 3.6, "zorder": 5}
     ax.plot(*(100.0 * point), **{**usual, **style})
+
+
+def speed_and_curvature(axes: Any, profile: Profile, end: float = 1.0, **style: Any) -> None:
+    """Draw speed on the first and curvature on the second of two axes, the curvature without its unbounded ends."""
+    inner = (profile.time > EDGE) & (profile.time < 1.0 - EDGE)
+    axes[0].plot(end * profile.time, profile.speed, **style)
+    axes[1].plot(end * profile.time[inner], profile.curvature[inner], **{**style, "label": None})
 
 
 def letters(axes: Any, text: str = "ABCDEFGH") -> None:
@@ -318,9 +326,7 @@ def _profiles(ax: Float, movement: Trajectory, motion: SimulatedMovements) -> No
     model, arm = model_profile(movement), arm_profile(motion)
     planned, reached = np.asarray(movement.sample(len(model.time), 1)[0]), motion.velocity()[0]
     for profile, style, label in ((model, MODEL, "model"), (arm, ARM, "simulated arm")):
-        inner = (profile.time > EDGE) & (profile.time < 1.0 - EDGE)
-        ax[0].plot(end * profile.time, profile.speed, label=label, **style)
-        ax[1].plot(end * profile.time[inner], profile.curvature[inner], **style)
+        speed_and_curvature(ax, profile, end, label=label, **style)
     for i in (0, 1):
         ax[2 + i].plot(end * model.time, planned[:, i], **MODEL)
         ax[2 + i].plot(motion.time, reached[:, i], **ARM)
@@ -374,9 +380,7 @@ def _obstacle_column(ax: Float, avoidance: ObstacleMovements, row: int, bend: fl
     dot(ax[0], via)
     model = model_profile(movement)
     for each, style, label in ((model, MODEL, "model through $\\bullet$"), (profile, ARM, avoidance.name)):
-        inner = (each.time > EDGE) & (each.time < 1.0 - EDGE)
-        ax[1].plot(each.time, each.speed, label=label, **style)
-        ax[2].plot(each.time[inner], each.curvature[inner], **style)
+        speed_and_curvature(ax[1:], each, label=label, **style)
 
 
 def valleys() -> Figure:

@@ -275,24 +275,6 @@ def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
         raise ValueError(
             f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
         )
-    names = list(options[0])
-    for copy, each in enumerate(options):
-        if set(each) != set(names):
-            raise ValueError(
-                f"options must give the same for every copy: {_listed(names)} for copy 0, "
-                f"but {_listed(each)} for copy {copy}"
-            )
-    batched = {}
-    for name in names:
-        parts = [np.asarray(each[name]) for each in options]
-        shapes = [part.shape for part in parts]
-        if len(set(shapes)) > 1:
-            raise ValueError(
-                f"options[{name!r}] must have the same shape for every copy, got {', '.join(map(str, shapes))}"
-            )
-        batched[name] = np.stack(parts)
-    return batched
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(map(repr, names)) or "nothing"
+    if any(each.keys() != options[0].keys() for each in options):
+        raise ValueError(f"options must give the same names for every copy, got {options!r}")
+    return {name: np.stack([np.asarray(each[name]) for each in options]) for name in options[0]}

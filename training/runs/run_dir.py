@@ -74,9 +74,6 @@ class Run:
 
     def __init__(self, folder: str | Path) -> None:
         folder = Path(folder)
-        if not folder.is_dir():
-            what = "it is a file" if folder.exists() else "there is no such folder"
-            raise BadFileError(folder, f"is no run folder: {what}")
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder

@@ -122,11 +122,6 @@ def resolved(config: TrainConfig) -> TrainConfig:
     )
 
 
-def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
-    """Return the untrained model of a resolved configuration."""
-    return build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
-
-
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
@@ -138,7 +133,7 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):
         try:
-            model = new_model(config, env)
+            model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
         except UNFIT as error:
             usual, asked = config.preset.arguments(), config.hyperparameters
             other = {name: value for name, value in asked.items() if usual.get(name) != value}
