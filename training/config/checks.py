@@ -67,29 +67,6 @@ def check_whole(name: str, value: Any, least: int) -> int:
     return whole_number(name, value, least, GREATEST.get(name))
 
 
-def check_stalling(share: Any, asked: int | None, interval: int, limits: tuple[int, int]) -> None:
-    """Check the settings of a training that ends when it stalls.
-
-    Args:
-        share: Share of the decisions without a rise of success; None for a training that does not end early.
-        asked: `min_timesteps` as given.
-        interval: Decisions between two validations, 0 for none.
-        limits: Fewest and most decisions.
-    """
-    if share is None:
-        if asked is not None:
-            raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
-        return
-    if not is_number(share) or not 0.0 < share < 1.0:
-        raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
-    if not interval:
-        raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
-    if limits[0] >= limits[1]:
-        raise ValueError(
-            f"n_timesteps must be over min_timesteps ({limits[0]}) with stop_when_stalled, got {limits[1]}"
-        )
-
-
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     """Check that a file can be written."""
     if path is None:

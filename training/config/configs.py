@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
 import tyro
 
+from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
@@ -20,7 +21,6 @@ from viapoint.training.config.checks import (
     check_env_kwargs,
     check_file,
     check_folder,
-    check_stalling,
     check_whole,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
@@ -195,8 +195,20 @@ class TrainConfig(Config):
         check_env_kwargs(self.env_kwargs)
         if not isinstance(self.hyperparameters, Mapping):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
-        limits = self.least_timesteps, self.total_timesteps
-        check_stalling(self.stop_when_stalled, self.min_timesteps, self.evaluation_interval, limits)
+        share = self.stop_when_stalled
+        if share is None:
+            if self.min_timesteps is not None:
+                raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
+            return
+        if not is_number(share) or not 0.0 < share < 1.0:
+            raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
+        if not self.evaluation_interval:
+            raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
+        if self.least_timesteps >= self.total_timesteps:
+            raise ValueError(
+                f"n_timesteps must be over min_timesteps ({self.least_timesteps}) with stop_when_stalled, "
+                f"got {self.total_timesteps}"
+            )
 
     @property
     def preset(self) -> Preset:

@@ -303,16 +303,16 @@ class Panels:
 def _lines(lines: Sequence[tuple[Any, Any, str, Colour]]) -> tuple[Any, Any]:
     """Return data and series of a plot with lines on one common time axis."""
     if not lines:
-        return (np.zeros(2), np.zeros(2)), ({"label": "time"}, *_series("nothing", PALETTE.plan))
+        return (np.zeros(2), np.zeros(2)), ({"label": "time"}, _series("nothing", PALETTE.plan))
     time = max((line[0] for line in lines), key=lambda each: float(each[-1]))
     columns = [np.interp(time, x, y) for x, y, *_ in lines]
-    series = [each for *_, label, colour in lines for each in _series(label, colour)]
+    series = [_series(label, colour) for *_, label, colour in lines]
     return (time, *columns), ({"label": "time"}, *series)
 
 
-def _series(label: str, colour: Colour) -> tuple[Any, ...]:
+def _series(label: str, colour: Colour) -> dict[str, Any]:
     line: dict[str, Any] = {"label": label, "stroke": _css(colour), "width": 2, "points": {"show": False}}
-    return (line | ({"dash": (6, 5)} if label == "executed" else {}),)
+    return line | ({"dash": (6, 5)} if label == "executed" else {})
 
 
 def _table(

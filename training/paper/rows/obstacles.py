@@ -75,7 +75,9 @@ def agent_movements(agent: Path | None) -> ObstacleMovements:
     method = agent_method("agent", found, 0)
     simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
     check_scenes(scenes, simulation.task.collision_model)
-    action = method.decide(simulation.observe(_padded(scenes, simulation)), _padded(scenes, simulation))
+    missing = simulation.task.scenes.n_obstacles[1] - scenes.obstacles.shape[1]
+    padded = scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
+    action = method.decide(simulation.observe(padded), padded)
     success = simulation(scenes, action).success
     simulation.close()
     if not success.any():
@@ -103,13 +105,6 @@ def check_agent(agent: Path) -> None:
             f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
             f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
         )
-
-
-def _padded(scenes: Scenes, simulation: SceneSimulation) -> Scenes:
-    """Return scenes with as many obstacle rows as the observation; the added ones are absent."""
-    most = simulation.task.scenes.n_obstacles[1]
-    missing = most - scenes.obstacles.shape[1]
-    return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
 
 
 class Features(NamedTuple):
