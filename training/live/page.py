@@ -156,7 +156,7 @@ def _serve(host: str, port: int) -> viser.ViserServer:
             probe.bind((host, port))
         except OSError as error:
             raise OSError(
-                f"the page cannot listen on {host}:{port} ({error.strerror}); choose another port with --port"
+                f"the page cannot listen on {host}:{port} ({error.strerror}); --host and --port choose another address"
             ) from None
         port = probe.getsockname()[1]
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
@@ -164,7 +164,7 @@ def _serve(host: str, port: int) -> viser.ViserServer:
         server = viser.ViserServer(host=host, port=port, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise OSError(f"the page cannot listen on {host}:{port}; choose another port with --port")
+        raise OSError(f"the page cannot listen on {host}:{port}; --host and --port choose another address")
     # The page never asks for a public address, and a message that does gets none: no request leaves the machine.
     server.request_share_url = lambda *_, **__: None
     return server
