@@ -37,8 +37,8 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 def test_every_link_of_the_whole_arm_clears():
     pytest.importorskip("ompl")
-    simulation = SceneSimulation("viapoint/PlanarWholeArm-v0", 6)
-    scenes = simulation.task.sampler()([np.random.default_rng(0)] * 6)
+    simulation = SceneSimulation("viapoint/PlanarWholeArm-v0", 4)
+    scenes = simulation.task.sampler()([np.random.default_rng(0)] * 4)
     method = make_method("ompl", "viapoint/PlanarWholeArm-v0")
     done = method.execute(scenes, method.decide({}, scenes))
     assert done.success.mean() > 0.5

@@ -33,14 +33,6 @@ def test_wilson_solves_the_score_equation(trials):
     assert statistics.wilson(trials, trials).high == 1.0
 
 
-def test_wilson_is_symmetric_and_narrows():
-    left, right = statistics.wilson(3, 40), statistics.wilson(37, 40)
-    assert left.low == pytest.approx(1 - right.high)
-    widths = [np.subtract(*statistics.wilson(n // 2, n)[:0:-1]) for n in (10, 100, 1000)]
-    assert widths[0] > widths[1] > widths[2] > 0
-    assert math.isnan(statistics.wilson(0, 0).estimate)
-
-
 def test_mcnemar_is_the_exact_binomial_test():
     """With the sum over the tail of the binomial distribution as an independent computation."""
     generator = np.random.default_rng(0)

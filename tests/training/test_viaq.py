@@ -114,7 +114,7 @@ def test_it_goes_on_in_other_scenes_of_its_task_only(made):
         {"gamma": 0.0},
     ],
 )
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", ENV, REPLANNING])
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", REPLANNING])
 def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id, settings):
     env = made(env_id)
     model = model_on(env, **settings).learn(32)

@@ -21,6 +21,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.algorithms.model_io import untrained
+from viapoint.training.config.checks import check_whole
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.io.files import versions
@@ -212,6 +213,11 @@ def evaluate(
         >>> [row["method"] for row in result.rows]
         ['agent', 'straight line']
     """
+    if n_scenes is not None:
+        check_whole("n_scenes", n_scenes, 1)
+    for number in [checks] if checks is None or isinstance(checks, int) else checks:
+        if number is not None:
+            check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
     env_id, kwargs = task_of(agent, env, env_kwargs)
