@@ -20,7 +20,7 @@ from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, 
 from viapoint.training.paper import figures
 from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
 from viapoint.training.paper.rows import alternatives, curved, double_step, obstacles, straight
-from viapoint.training.paper.rows.obstacles import ObstacleMovements, check_agent
+from viapoint.training.paper.rows.obstacles import check_agent
 
 ROWS: dict[int, Callable[[], list[Claim]]] = {
     1: straight.point_to_point_claims,
@@ -44,44 +44,42 @@ class Drawing(NamedTuple):
 
     name: str
     caption: str
-    draw: Callable[[ObstacleMovements], Figure]
-
-
-def _plain(draw: Callable[[], Figure]) -> Callable[[ObstacleMovements], Figure]:
-    return lambda avoidance: draw()
+    draw: Callable[..., Figure]
+    of_agent: bool = False
+    """True if `draw` takes the movements around obstacles."""
 
 
 DRAWINGS = (
     Drawing("fig01_model", "The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
             "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
-            _plain(figures.model)),
+            figures.model),
     Drawing("fig03_straight", "Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
-            "simulated arm, here and in the following figures.", _plain(figures.straight_movements)),
+            "simulated arm, here and in the following figures.", figures.straight_movements),
     Drawing("fig04_joints", "Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
-            "the same for the hand is not for the joints.", _plain(figures.joints)),
+            "the same for the hand is not for the joints.", figures.joints),
     Drawing("fig05_height", "A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
-            "relative to d1 + d2. Dotted: passage of the via-point.", _plain(figures.height)),
-    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", _plain(figures.place)),
-    Drawing("fig07_turned", "The same in other directions (Fig. 7).", _plain(figures.turned)),
+            "relative to d1 + d2. Dotted: passage of the via-point.", figures.height),
+    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", figures.place),
+    Drawing("fig07_turned", "The same in other directions (Fig. 7).", figures.turned),
     Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and the one "
             "with the median depth (B), each with the model through its point of greatest curvature.",
-            figures.obstacles),
+            figures.obstacles, of_agent=True),
     Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
             "B, D: difference from the model. Grey squares: movements around rows of lights.",
-            figures.isochrony),
-    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", _plain(figures.scaling)),
+            figures.isochrony, of_agent=True),
+    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", figures.scaling),
     Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
-            _plain(figures.valleys)),
+            figures.valleys),
     Drawing("alternatives", "Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
-            "(D).", _plain(figures.alternatives)),
+            "(D).", figures.alternatives),
     Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
-            "the torques of both (C, D; limits dotted).", _plain(figures.limits)),
+            "the torques of both (C, D; limits dotted).", figures.limits),
     Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
             "after its start: by a second movement that is added, or by one new plan with the same arrival.",
-            _plain(figures.paths_and_speeds)),
+            figures.paths_and_speeds),
     Drawing("double_step_jerk", "Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
             "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
-            _plain(figures.comparison)),
+            figures.comparison),
 )  # fmt: skip
 """Figures in the order of the paper."""
 
@@ -100,7 +98,8 @@ def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None])
     for drawing in DRAWINGS:
         report_step(drawing.name)
         with mpl.rc_context(figures.STYLE):
-            picture, _ = figures.save(drawing.draw(avoidance), out, drawing.name)
+            figure = drawing.draw(avoidance) if drawing.of_agent else drawing.draw()
+            picture, _ = figures.save(figure, out, drawing.name)
         pictures.append((picture, drawing.caption))
     return Reproduction(claims, pictures)
 
