@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import html
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from viapoint.training.live.decisions import Proposal
     from viapoint.training.live.movements import Profile
-    from viapoint.training.live.setting import Setting
+    from viapoint.training.live.setting import MethodResult, Setting
 
 WIDTH = 330
 """Width of a panel, [pixels]."""
@@ -35,19 +35,6 @@ CHECKS = {"none": 0, "16": 16, "64": 64}
 """Numbers of proposals that the agent checks with computed geometry."""
 GOOD, BAD, PLAIN = "#1b7f4b", "#c4202b", "#4a4f58"
 """Colours of messages."""
-
-
-class MethodResult(NamedTuple):
-    """Simulated outcome of a method in one scene."""
-
-    name: str
-    success: bool
-    reward: float
-    clearance: float
-    """Least clearance of the executed movement, [m]."""
-    jerk_ratio: float
-    seconds: float
-    """Time of the decision, [s]."""
 
 
 class Panels:

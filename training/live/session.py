@@ -25,7 +25,7 @@ from viapoint.training.live.movements import (
     plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
-from viapoint.training.live.panels import BAD, GOOD, RESET, MethodResult, Panels
+from viapoint.training.live.panels import BAD, GOOD, RESET, Panels
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import viser
 
     from viapoint.envs.mdp.task import Task
-    from viapoint.training.live.setting import Setting, Shared
+    from viapoint.training.live.setting import MethodResult, Setting, Shared
 
 LATENCIES = 200
 """Changes whose latency is kept."""
@@ -462,7 +462,8 @@ class Session:
 
     def _compare(self) -> None:
         """Compare methods, one job for each, so that changes of the scene come between."""
-        scene, setting, results = self._scene, self._setting, list[MethodResult]()
+        scene, setting = self._scene, self._setting
+        results: list[MethodResult] = []
         setting.observe(self._fitted, self._env)  # an impossible scene is refused
         rows = setting.compare(self._fitted, self._checks)
 

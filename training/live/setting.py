@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +19,6 @@ from viapoint.training.algorithms.agent import Agent
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
-from viapoint.training.live.panels import MethodResult
 from viapoint.training.live.scene_draws import Draw, scene_kinds
 from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
 from viapoint.training.planners.baselines import Method, agent_method, make_method
@@ -29,6 +28,19 @@ BASELINES = {"straight": "straight", "geometry search": "search512", "planner": 
 """Compared methods by their names in the table."""
 MOST_SHOWN = 24
 """Greatest number of obstacles of a scene."""
+
+
+class MethodResult(NamedTuple):
+    """Simulated outcome of a method in one scene."""
+
+    name: str
+    success: bool
+    reward: float
+    clearance: float
+    """Least clearance of the executed movement, [m]."""
+    jerk_ratio: float
+    seconds: float
+    """Time of the decision, [s]."""
 
 
 class Setting:
