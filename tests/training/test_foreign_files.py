@@ -14,7 +14,7 @@ from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, PaperConfig, PlayConfig, TrainConfig
 from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper
-from viapoint.training.paper.figures.style import save as save_figure
+from viapoint.training.paper.figures import save as save_figure
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
@@ -144,14 +144,13 @@ def test_a_demo_writes_over_no_file_of_something_else(name, begun, tmp_path, mon
     assert content_of(tmp_path) == before
 
 
-@pytest.mark.parametrize(("name", "guide"), [*((each, False) for each in paper.PAGES), ("fig01_model.svg", False),
-                                             ("limits.png", False), ("guide/paper_limits.png", True)])  # fmt: skip
-def test_the_paper_is_written_over_no_file_of_something_else(name, guide, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", [*paper.PAGES, "fig01_model.svg", "limits.png"])
+def test_the_paper_is_written_over_no_file_of_something_else(name, tmp_path, monkeypatch):
     monkeypatch.setattr(paper, "reproduce", lambda *_: pytest.fail("began to work"))
     put(tmp_path, name)
     before = content_of(tmp_path)
     with pytest.raises(BadFileError):
-        paper.run(PaperConfig(out=tmp_path, guide=tmp_path / "guide" if guide else None))
+        paper.run(PaperConfig(out=tmp_path))
     assert content_of(tmp_path) == before
 
 
@@ -160,12 +159,12 @@ def test_what_the_paper_and_the_demo_wrote_can_be_written_again(tmp_path, monkey
 
     claims = [paper.Claim(row=1, claim="one", model=1.0, expected=paper.straight.near(1.0, 0.1))]
     pictures = []
-    for name in paper.GUIDE_FIGURES:
-        picture, _ = save_figure(Figure(), tmp_path, name)
+    for drawing in paper.DRAWINGS:
+        picture, _ = save_figure(Figure(), tmp_path, drawing.name)
         pictures.append((picture, "caption"))
     monkeypatch.setattr(paper, "reproduce", lambda *_: paper.Reproduction(claims, pictures))
     for _ in range(2):
-        paper.run(PaperConfig(out=tmp_path, guide=tmp_path / "guide"))
+        paper.run(PaperConfig(out=tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,7 @@ import pytest
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.files import BadFileError, read_arrays, write_json
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import BadFileError, read_arrays, versions, write_json
 from viapoint.training.runs import run_dir
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train

@@ -11,10 +11,9 @@ import pytest
 from viapoint.training.cli import main as cli
 from viapoint.training.paper import run
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.passage_polynomial import count_roots, passage_polynomial, root_of
-from viapoint.training.paper.profiles import Profile
-from viapoint.training.paper.reference_movements import construction, via_waypoints
+from viapoint.training.paper.movements import Profile, construction, via_waypoints
 from viapoint.training.paper.rows import obstacles
+from viapoint.training.paper.rows.curved import count_roots, passage_polynomial, root_of
 from viapoint.training.paper.rows.double_step import double_step, excess_cost
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
@@ -30,7 +29,7 @@ def made(tmp_path_factory):
     every = obstacles.light_scenes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(obstacles, "light_scenes", lambda: every.take(slice(None, None, FEWER)))
-        cli.main(["paper", "--out", str(out), "--guide", str(out / "guide")])
+        cli.main(["paper", "--out", str(out)])
     return out
 
 

@@ -110,7 +110,6 @@ def test_words(words):
         (EvaluateConfig, "json", {"agent": "a"}),
         (PlayConfig, "video", {"agent": "a"}),
         (PaperConfig, "out", {}),
-        (PaperConfig, "guide", {}),
         (DemoConfig, "out", {}),
         (StudyConfig, "out", {"file": "study.yaml"}),
     ],

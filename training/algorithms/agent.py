@@ -211,14 +211,8 @@ def find_model(source: str | Path) -> Path:
         return folder
     if (folder / "config.json").is_file():
         return best_model(folder)
-    reason = "there is no such folder"
-    if folder.is_dir():
-        reason = "it holds no config.json and no model.json"
-    elif folder.exists():
-        reason = "it is a file"
     raise BadFileError(
-        folder,
-        f"is no run folder or model folder: {reason}; ids of environments with a shipped agent are {known}",
+        folder, f"is no run folder or model folder; ids of environments with a shipped agent are {known}"
     )
 
 

@@ -10,7 +10,8 @@ import hashlib
 import importlib.metadata
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,13 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from viapoint.envs.actions.via_points import MOST_VIAS
+from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.training.algorithms.extractors import EXTRACTORS
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
-from viapoint.training.io.model_limits import (
-    LARGEST_MODEL_JSON,
-    LARGEST_WEIGHTS,
-    check_env_arguments,
-    parameter_budget,
-)
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments, observed_candidates
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
@@ -47,6 +45,21 @@ NOT_STORED = frozenset(
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
 """Arguments of algorithms that model files do not hold."""
+
+LARGEST_MODEL_JSON = 1 << 20
+"""Greatest size of `model.json`, [bytes]."""
+LARGEST_WEIGHTS = 1 << 30
+"""Greatest size of `weights.safetensors`, [bytes]."""
+LARGEST_ARGUMENTS = {
+    "n_via": MOST_VIAS,
+    "n_obstacles": MOST_OBSTACLES,
+    "width": 8192,
+    "height": 8192,
+    "threads": 1024,
+}
+"""Greatest values in a file of those arguments of an environment that memory and time grow with."""
+SPARE_PARAMETERS = 100_000
+"""Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
@@ -76,13 +89,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         hyperparameters = dict(record["hyperparameters"])
-        if env is None:  # to decide, hardly any room is needed for experience
-            buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
-            hyperparameters[buffer] = 2
         with warnings.catch_warnings(), parameter_budget(arrays):
-            warnings.simplefilter(
-                "ignore", UserWarning
-            )  # PPO finds that its batches do not fill one environment
+            warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
+            if env is None:
+                hyperparameters = _to_decide(hyperparameters)
             chosen = env or own_environment(record["env"])
             model = build(record["algorithm"], record["policy"], chosen, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
@@ -147,17 +157,16 @@ def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
     """Return a model like this one before its training, with the weights of a seed."""
     record, env = describe(model), model.get_env()
     assert env is not None
-    hyperparameters = dict(record["hyperparameters"])
-    hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
+    hyperparameters = _to_decide(record["hyperparameters"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # as in load_model
-        return build(
-            record["algorithm"],
-            record["policy"],
-            env,
-            hyperparameters,
-            seed=seed,
-        )
+        return build(record["algorithm"], record["policy"], env, hyperparameters, seed=seed)
+
+
+def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return hyperparameters with hardly any room for experience, which decisions do not need."""
+    buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
+    return {**hyperparameters, buffer: 2}
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
@@ -220,8 +229,39 @@ def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
     """
     if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
         raise ValueError(f"environment {record['id']!r} is not known")
-    check_env_arguments(record["kwargs"])
+    for name, most in LARGEST_ARGUMENTS.items():
+        value = record["kwargs"].get(name, 0)
+        for each in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(each, int | float) and each > most:
+                raise ValueError(f"{name} may be at most {most} in a file, got {each}")
     return ViaVecEnv(record["id"], 1, observe_candidates=record.get("candidates", 0), **record["kwargs"])
+
+
+@contextmanager
+def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
+    """Limit the parameters of new networks to the number in the weights, plus a few.
+
+    Torch reserves memory for a layer before it touches it, and the check comes between the two.
+
+    Raises:
+        ValueError: A network with more parameters is built.
+    """
+    there = sum(int(np.prod(array.shape)) for array in arrays.values())
+    left = there + SPARE_PARAMETERS
+
+    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
+        nonlocal left
+        left -= parameter.numel() if parameter is not None else 0
+        if left < 0:
+            raise ValueError(
+                f"it describes larger networks than the {there} parameters in the weights can fill"
+            )
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def argument_names(kind: type[BaseAlgorithm]) -> set[str]:

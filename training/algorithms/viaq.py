@@ -108,15 +108,8 @@ class ViaQ(Agent, OffPolicyAlgorithm):
     ) -> None:
         self.explore_uniformly, self.temperature = explore_uniformly, temperature
         self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
-        check_arguments(
-            ViaQ,
-            {
-                "explore_uniformly": explore_uniformly,
-                "temperature": temperature,
-                "explore_candidates": explore_candidates,
-                "next_candidates": next_candidates,
-            },
-        )
+        own = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
+        check_arguments(ViaQ, {name: getattr(self, name) for name in own})
         super().__init__(
             policy,
             env,

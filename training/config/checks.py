@@ -15,7 +15,7 @@ import numpy as np
 from typeguard import TypeCheckError, check_type
 
 from viapoint.envs.common.validation import is_number, whole_number
-from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -62,61 +62,9 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
 
 
-def check_whole_movements(env: str) -> None:
-    """Check that an action of the task is a whole movement."""
-    if env in STEP_TASKS or env in REPLANNING_TASKS:
-        like = STEP_TASKS.get(env, DEFAULT_ENV)
-        raise ValueError(f"env must be one where an action is a whole movement, {like} for one, got {env!r}")
-
-
-def check_has_scenes(env: str) -> None:
-    """Check that scenes are shipped for a task."""
-    if env in OWN_ARM_TASKS:
-        raise ValueError(f"env must be one with frozen scenes, {OWN_ARM_TASKS[env]} for one, got {env!r}")
-
-
 def check_whole(name: str, value: Any, least: int) -> int:
     """Return a whole number from `least` to its greatest value."""
     return whole_number(name, value, least, GREATEST.get(name))
-
-
-def check_observed(number: int, algo: str, env: str) -> None:
-    """Check that an algorithm can observe candidates in an environment."""
-    if number and (algo == "viaq" or env in STEP_TASKS):
-        raise ValueError(
-            "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
-            f"control step, got {number} for {algo} on {env}"
-        )
-
-
-def check_stalling(share: Any, asked: int | None, interval: int, limits: tuple[int, int]) -> None:
-    """Check the settings of a training that ends when it stalls.
-
-    Args:
-        share: Share of the decisions without a rise of success; None for a training that does not end early.
-        asked: `min_timesteps` as given.
-        interval: Decisions between two validations, 0 for none.
-        limits: Fewest and most decisions.
-    """
-    if share is None:
-        if asked is not None:
-            raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
-        return
-    if not is_number(share) or not 0.0 < share < 1.0:
-        raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
-    if not interval:
-        raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
-    if limits[0] >= limits[1]:
-        raise ValueError(
-            f"n_timesteps must be over min_timesteps ({limits[0]}) with stop_when_stalled, got {limits[1]}"
-        )
-
-
-def check_baselines(names: tuple[str, ...]) -> None:
-    """Check that baselines differ, as a table has one row for each."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"baselines must differ, {name} is there twice")
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:
@@ -125,10 +73,6 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
         return
     if suffix and path.suffix.lower() != suffix:
         raise ValueError(f"{name} must end in {suffix}, got {path}")
-    if os.path.isdir(path):
-        raise ValueError(f"{name} must be a file, and {path} is a folder")
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise ValueError(f"{name} must be a file, and {path} is something else")
     check_ours(path)
     _check_place(name, path, path.parent)
 

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
 import tyro
 
-from viapoint.envs.registration import ENV_IDS, STEP_TASKS
-from viapoint.training.config.base import Config
+from viapoint.envs.common.validation import is_number
+from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
-    check_baselines,
     check_env,
     check_env_kwargs,
     check_file,
     check_folder,
-    check_has_scenes,
-    check_observed,
-    check_stalling,
     check_whole,
-    check_whole_movements,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 from viapoint.training.io.files import parse_yaml
@@ -79,6 +75,54 @@ NamedValues = Annotated[
     ),
 ]
 """Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Configuration of a command; paths may be given as strings."""
+
+    least: ClassVar[Mapping[str, int]] = {}
+    """Least values of the whole numbers, by name; None is allowed where it is the default."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, str) and "Path" in str(each.type):
+                object.__setattr__(self, each.name, Path(value))
+            if each.name in self.least and not (value is None and each.default is None):
+                object.__setattr__(self, each.name, check_whole(each.name, value, self.least[each.name]))
+        self._check()
+
+    def _check(self) -> None:
+        """Check what is not a whole number."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return {
+            name: f"{value}"
+            if isinstance(value, Path)
+            else list(value)
+            if isinstance(value, tuple)
+            else value
+            for name, value in values.items()
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> Self:
+        """Return the configuration that plain values describe.
+
+        Raises:
+            ValueError: A name is unknown or a value is not allowed.
+        """
+        names = [each.name for each in dataclasses.fields(cls)]
+        unknown = sorted(set(record) - set(names))
+        if unknown:
+            raise ValueError(f"{cls.__name__} knows {', '.join(names)}, not {unknown[0]!r}")
+        return cls(
+            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,12 +187,28 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        check_observed(self.observe_candidates, self.algo, self.env)
+        if self.observe_candidates and (self.algo == "viaq" or self.env in STEP_TASKS):
+            raise ValueError(
+                "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
+                f"control step, got {self.observe_candidates} for {self.algo} on {self.env}"
+            )
         check_env_kwargs(self.env_kwargs)
         if not isinstance(self.hyperparameters, Mapping):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
-        limits = self.least_timesteps, self.total_timesteps
-        check_stalling(self.stop_when_stalled, self.min_timesteps, self.evaluation_interval, limits)
+        share = self.stop_when_stalled
+        if share is None:
+            if self.min_timesteps is not None:
+                raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
+            return
+        if not is_number(share) or not 0.0 < share < 1.0:
+            raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
+        if not self.evaluation_interval:
+            raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
+        if self.least_timesteps >= self.total_timesteps:
+            raise ValueError(
+                f"n_timesteps must be over min_timesteps ({self.least_timesteps}) with stop_when_stalled, "
+                f"got {self.total_timesteps}"
+            )
 
     @property
     def preset(self) -> Preset:
@@ -246,7 +306,8 @@ class EvaluateConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        check_baselines(self.baselines)
+        if len(set(self.baselines)) < len(self.baselines):
+            raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
         if self.env is not None:
             check_env(self.env)
         if self.agent is None and self.env is None:
@@ -320,12 +381,9 @@ class PaperConfig(Config):
     """Folder for the figures and the table."""
     agent: Path | None = None
     """Run folder or model folder of the agent that moves around the rows of lights; default: the shipped agent."""
-    guide: Path | None = None
-    """Folder for the small pictures of docs/flash-hogan.md."""
 
     def _check(self) -> None:
         check_folder("out", self.out)
-        check_folder("guide", self.guide)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,8 +410,11 @@ class DemoConfig(Config):
 
     def _check(self) -> None:
         check_env(self.env)
-        check_whole_movements(self.env)
-        check_has_scenes(self.env)
+        if self.env in {*STEP_TASKS, *REPLANNING_TASKS, *OWN_ARM_TASKS}:
+            like = STEP_TASKS.get(self.env) or OWN_ARM_TASKS.get(self.env, DEFAULT_ENV)
+            raise ValueError(
+                f"env must have frozen scenes and whole movements as actions, {like} for one, got {self.env!r}"
+            )
         check_folder("out", self.out)
 
     @property

@@ -82,7 +82,10 @@ def rows(record: Record) -> list[list[str]]:
     columns = _columns(record)
     heads = ["method", *(column.heading for column in columns)]
     table = [
-        [_name(name, summary), *(column.cell(summary) for column in columns)]
+        [
+            f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name,
+            *(column.cell(summary) for column in columns),
+        ]
         for name, summary in record["methods"].items()
     ]
     shown = [i for i in range(len(heads)) if any(line[i] != "-" for line in table)]
@@ -149,7 +152,3 @@ def write(record: Record, folder: Path) -> tuple[Path, Path]:
     write_bytes(document, f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
     write_json(data, dict(record))
     return document, data
-
-
-def _name(name: str, summary: Summary) -> str:
-    return f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import uuid
@@ -33,6 +35,16 @@ JSON_MARK = b'"viapoint":'
 """Name of the version in JSON files of this package."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
+PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+"""Packages that results depend on."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    return {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }
 
 
 class BadFileError(ValueError):

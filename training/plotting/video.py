@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,8 +21,7 @@ from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame, Observation
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.io.files import check_ours
-from viapoint.training.io.mp4 import write_mp4
+from viapoint.training.io.files import MARK, check_ours
 from viapoint.training.plotting.top_view import draw_movement
 
 Decide = Callable[[Observation, Scenes], Any]
@@ -67,7 +67,7 @@ def record_video(
     camera = Camera(env)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     try:
-        count = write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
+        count = _write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
@@ -88,6 +88,27 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterat
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
         hold = round(PAUSE * SPEED * camera.fps)
         yield from _with_captions(camera.frames(scene), left, *describe_outcome(info), hold=hold)
+
+
+def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
+    """Encode frames of equal size, with even numbers of pixels, as an MP4 file (H.264), and return their number."""
+    count, writer = 0, None
+    try:
+        for frame in frames:
+            if writer is None:
+                height, width = frame.shape[:2]
+                writer = imageio_ffmpeg.write_frames(
+                    str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
+                    output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
+                    macro_block_size=1, ffmpeg_log_level="error",
+                )  # fmt: skip
+                writer.send(None)
+            writer.send(np.ascontiguousarray(frame))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.close()
+    return count
 
 
 def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:

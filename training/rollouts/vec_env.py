@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
@@ -18,6 +17,7 @@ import viapoint.envs
 from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.training.search.candidates import OBSERVED
+from viapoint.training.search.observe_candidates import VectorObserveCandidates
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -29,8 +29,6 @@ REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration"
 """Metrics of an episode that the info dictionaries report."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which the info dictionaries report."""
-OBSERVE_CANDIDATES = "viapoint.training.search.observe_candidates:VectorObserveCandidates"
-"""Entry point of the wrapper that adds the margins of candidates to observations."""
 
 
 def observed_candidates(env: VecEnv) -> int:
@@ -116,8 +114,7 @@ class ViaVecEnv(VecEnv):
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
             )
         if observe_candidates:
-            wrapper: Any = load_env_creator(OBSERVE_CANDIDATES)
-            self.venv = wrapper(self.venv, observe_candidates)
+            self.venv = VectorObserveCandidates(self.venv, observe_candidates)
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
@@ -275,24 +272,6 @@ def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
         raise ValueError(
             f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
         )
-    names = list(options[0])
-    for copy, each in enumerate(options):
-        if set(each) != set(names):
-            raise ValueError(
-                f"options must give the same for every copy: {_listed(names)} for copy 0, "
-                f"but {_listed(each)} for copy {copy}"
-            )
-    batched = {}
-    for name in names:
-        parts = [np.asarray(each[name]) for each in options]
-        shapes = [part.shape for part in parts]
-        if len(set(shapes)) > 1:
-            raise ValueError(
-                f"options[{name!r}] must have the same shape for every copy, got {', '.join(map(str, shapes))}"
-            )
-        batched[name] = np.stack(parts)
-    return batched
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(map(repr, names)) or "nothing"
+    if any(each.keys() != options[0].keys() for each in options):
+        raise ValueError(f"options must give the same names for every copy, got {options!r}")
+    return {name: np.stack([np.asarray(each[name]) for each in options]) for name in options[0]}

@@ -32,11 +32,11 @@ from viapoint.training.io.files import (
     check_ours,
     read_json,
     tidy,
+    versions,
     write_bytes,
     write_folder,
     write_json,
 )
-from viapoint.training.io.installed import versions
 from viapoint.training.runs.checkpoints import (
     is_checkpoint,
     read_checkpoint,
@@ -74,9 +74,6 @@ class Run:
 
     def __init__(self, folder: str | Path) -> None:
         folder = Path(folder)
-        if not folder.is_dir():
-            what = "it is a file" if folder.exists() else "there is no such folder"
-            raise BadFileError(folder, f"is no run folder: {what}")
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder

@@ -15,8 +15,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from viapoint.training.algorithms.model_io import build
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import BadFileError
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStalledError
 from viapoint.training.runs.run_dir import MAY_CHANGE, Run, check_free, check_unchanged, write_config
@@ -123,11 +122,6 @@ def resolved(config: TrainConfig) -> TrainConfig:
     )
 
 
-def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
-    """Return the untrained model of a resolved configuration."""
-    return build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
-
-
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
@@ -139,7 +133,7 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):
         try:
-            model = new_model(config, env)
+            model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
         except UNFIT as error:
             usual, asked = config.preset.arguments(), config.hyperparameters
             other = {name: value for name, value in asked.items() if usual.get(name) != value}
