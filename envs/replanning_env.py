@@ -284,10 +284,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
             generators[i] = tried[i]
         return changing
 
-    def _draw_next(self, rows: Int) -> ChangingScenes:  # type: ignore[override]
-        """Sample the next scenes, none of them ahead: changes of a scene take numbers of the same generator."""
-        return self._draw(self.generators, rows, {})
-
     def _start(self, rows: Int, scenes: ChangingScenes) -> Float:  # type: ignore[override]
         """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""
         joints = super()._start(rows, scenes)  # type: ignore[arg-type]

@@ -28,7 +28,6 @@ from viapoint.envs.config import EnvConfig, ViaPointConfig
 from viapoint.envs.mdp.rewards import reward_terms
 from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
 from viapoint.envs.scenes.options import draw_given
-from viapoint.envs.scenes.sampler import SceneQueue
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, join_groups
 from viapoint.envs.sim.outcome import Rollout
@@ -97,7 +96,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.arm, self.action_layout = self.task.arm, self.task.action
         self.observation_layout = self.task.observation
         self._sampler = self.task.sampler()
-        self._queue = SceneQueue(self._sampler, self.num_envs)
         self._simulator = Simulator(
             self.task.collision_model,
             n_obstacles=self.observation_layout.n_rows,
@@ -188,7 +186,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         rows = np.arange(self.num_envs)
         # The next scenes depend on no outcome, so they are drawn during the physics.
-        decision, following = self._execute(self._decode(actions), lambda: self._draw_next(rows))
+        decision, following = self._execute(
+            self._decode(actions), lambda: self._draw(self.generators, rows, {})
+        )
         assert following is not None
         self._start(rows, following.result())
         return self._as_step(decision)
@@ -355,10 +355,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         for i, generator in zip(rows, tried, strict=True):
             generators[i] = generator
         return scenes
-
-    def _draw_next(self, rows: Int) -> Scenes:
-        """Sample the scenes that follow those of some environments; some of later episodes are sampled with them."""
-        return self._queue(self.generators, rows)
 
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         """Start episodes with the arms at rest at the start and the obstacles in place; return the joint angles."""

@@ -8,11 +8,9 @@ computed at once, or with which others: those at many scenes are computed togeth
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,8 +38,6 @@ MOST = 24
 """Attempts at one scene for which further groups are begun: those after the first good one are in vain."""
 SHARED_GROUPS = 8
 """Groups of attempts at a scene that share the number :attr:`SceneSampler.fixed`."""
-AHEAD = 4
-"""Scenes of each generator that may wait in a queue."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
 
@@ -83,29 +79,24 @@ class SceneSampler:
         Raises:
             RuntimeError: No scene was found in many attempts, for example with given ends at the border of the reach.
         """
-        scenes, pending = self.empty(len(generators)), np.arange(len(generators))
+        number = len(generators)
+        start, goal = np.zeros((2, number, self.arm.dimension))
+        scenes = Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
+        pending = np.arange(number)
         attempts = [Attempts(self, each) for each in generators]
-        apart = len({id(each.bit_generator) for each in generators}) == len(generators)
+        apart = len({id(each.bit_generator) for each in generators}) == number
         while len(pending):
             left = np.ones(len(pending), dtype=bool)
             for begin in range(0, len(pending), TOGETHER):
                 some = pending[begin : begin + TOGETHER]
                 given = None if ends is None else (ends[0][some], ends[1][some])
-                which, found, _ = next_attempts([attempts[k] for k in some], given, apart=apart)
+                which, found = next_attempts([attempts[k] for k in some], given, apart=apart)
                 scenes.put(some[which], found)
                 left[begin + which] = False
             pending = pending[left]
-        return self.with_spare_rows(scenes)
-
-    def empty(self, number: int) -> Scenes:
-        """Return arrays of zeros for scenes, without spare rows."""
-        start, goal = np.zeros((2, number, self.arm.dimension))
-        return Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
-
-    def with_spare_rows(self, scenes: Scenes) -> Scenes:
-        """Return scenes with empty rows for given obstacles, of which there may be more than are drawn."""
         if not self._spare:
             return scenes
+        # Empty rows for given obstacles, of which there may be more than are drawn.
         return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0))))
 
     def not_found(self, attempts: int, ends: Ends) -> str:
@@ -211,7 +202,7 @@ class Attempts:
         """Attempts that were taken."""
         self._rest = np.empty((0, sampler.size))
         # Attempts up to the end of each group that was drawn, and the generator's state there.
-        self._groups: list[tuple[int, Any]] = []
+        self._groups: list[tuple[int, Mapping[str, Any]]] = []
 
     def take(self, least: int, most: int) -> Float:
         """Return the numbers of the next attempts, shape (n, size); n = 0 after the last.
@@ -232,17 +223,16 @@ class Attempts:
         self.made += len(taken)
         return taken
 
-    def end(self, attempt: int) -> Any:
-        """Set the generator back to the end of the group that holds an attempt, and return its state there."""
+    def end(self, attempt: int) -> None:
+        """Set the generator back to the end of the group that holds an attempt."""
         state = next(state for end, state in self._groups if attempt < end)
         if state is not self._groups[-1][1]:
             self.generator.bit_generator.state = state
-        return state
 
 
 def next_attempts(
     attempts: Sequence[Attempts], ends: Ends = None, *, apart: bool = True
-) -> tuple[Int, Scenes, list[Any]]:
+) -> tuple[Int, Scenes]:
     """Compute the next attempts at several scenes.
 
     Args:
@@ -251,7 +241,7 @@ def next_attempts(
         apart: False if scenes share a generator: whole groups are then drawn in turn.
 
     Returns:
-        Indices of scenes with a good attempt, the scenes, and the states of their generators.
+        Indices of scenes with a good attempt, and the scenes; their generators are at the next scene.
 
     Raises:
         RuntimeError: There are no further attempts at a scene.
@@ -271,70 +261,9 @@ def next_attempts(
     found, scenes = sampler.attempt(Uniforms(np.concatenate(taken)), given)
     first = np.flatnonzero(np.diff(owner[found], prepend=-1))
     which, place = owner[found[first]], found[first] - begin[found[first]]
-    states = [
+    for k, at in zip(which, place, strict=True):
         attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
-        for k, at in zip(which, place, strict=True)
-    ]
-    return which, scenes.take(first), states
-
-
-class SceneQueue:
-    """Scenes of N random generators that are sampled ahead, so that attempts at many scenes are computed together.
-
-    The scenes are those that the sampler returns, and the generators end in the same states: each scene waits with the
-    states of its generator before and after it, and is discarded if the generator has been used in the meantime.
-    """
-
-    def __init__(self, sampler: SceneSampler, number: int) -> None:
-        self._sampler = sampler
-        self._scenes = sampler.empty(number * AHEAD)
-        self._first, self._waiting = np.zeros((2, number), dtype=np.int64)
-        self._attempts: dict[int, Attempts] = {}
-        self._before: dict[int, Any] = {}
-        self._after: dict[int, deque[Any]] = {}
-
-    def __call__(self, generators: Sequence[np.random.Generator], rows: Int) -> Scenes:
-        """Return the next scenes of the generators at `rows`.
-
-        Raises:
-            RuntimeError: No scene was found in many attempts.
-        """
-        for k in rows:
-            if not _same(self._before.get(k), generators[k].bit_generator.state):
-                self._restart(k, generators[k])
-        while not self._waiting[rows].all():
-            self._sample()
-        scenes = self._scenes.take(rows * AHEAD + self._first[rows])
-        self._first[rows] = (self._first[rows] + 1) % AHEAD
-        self._waiting[rows] -= 1
-        for k in rows:
-            self._before[k] = generators[k].bit_generator.state = self._after[k].popleft()
-        return self._sampler.with_spare_rows(scenes)
-
-    def _restart(self, k: int, generator: np.random.Generator) -> None:
-        """Begin anew where a generator is."""
-        self._before[k], self._after[k], self._waiting[k] = generator.bit_generator.state, deque(), 0
-        self._attempts[k] = Attempts(self._sampler, copy.deepcopy(generator))
-
-    def _sample(self) -> None:
-        """Compute attempts for the generators with the fewest scenes waiting."""
-        some = np.array([k for k in self._attempts if self._waiting[k] < AHEAD])
-        some = some[np.argsort(self._waiting[some], kind="stable")[:TOGETHER]]
-        which, scenes, states = next_attempts([self._attempts[k] for k in some])
-        rows = some[which]
-        self._scenes.put(rows * AHEAD + (self._first[rows] + self._waiting[rows]) % AHEAD, scenes)
-        self._waiting[rows] += 1
-        for k, state in zip(rows, states, strict=True):
-            self._after[k].append(state)
-            self._attempts[k] = Attempts(self._sampler, self._attempts[k].generator)
-
-
-def _same(first: Any, second: Any) -> bool:
-    """Return True if states of bit generators are equal; those with arrays count as different."""
-    try:
-        return bool(first == second)
-    except ValueError:
-        return False
+    return which, scenes.take(first)
 
 
 def _has_boxes(obstacles: Float) -> Bool:
