@@ -21,7 +21,7 @@ from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
-from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
+from viapoint.envs.scenes.options import CHANGES, given_changes
 from viapoint.envs.scenes.scene import refuse
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
@@ -271,8 +271,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         jumps, courses = given_changes(options, len(rows), layout.dimension, layout.n_rows)
         draw = super()._draw
         scenes = draw(tried, rows, scene)
-        if courses is not None:
-            check_owners(courses, scenes.present)
         again = None if options else lambda some: draw(tried, rows[some], {})
         try:
             changing = self._change_sampler([tried[i] for i in rows], scenes, jumps, courses, again=again)
