@@ -12,7 +12,7 @@ from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Replanning
 from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions
 from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import ReplanningObservationLayout
@@ -79,9 +79,8 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         assert isinstance(config, ReplanningConfig)
         action, base, model = task.action, task.observation, task.collision_model
         shortest, longest = action.duration_range
-        self.changes = ChangeDistribution(
-            n_jumps=fewest_and_most(config.n_jumps, "n_jumps"), moving=bool(config.moving_obstacles)
-        )
+        n_jumps: Any = config.n_jumps
+        self.changes = ChangeDistribution(n_jumps=n_jumps, moving=bool(config.moving_obstacles))
         """Distribution of the changes of scenes."""
         self.decoder = ReplanningDecoder(action)
         """Meaning of the components of an action during a movement."""

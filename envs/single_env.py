@@ -10,7 +10,7 @@ from gymnasium.utils import EzPickle
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Observation
-from viapoint.envs.common.validation import as_given, real_numbers
+from viapoint.envs.common.validation import as_given
 from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.vector_env import METADATA, ReachVectorEnv
 
@@ -89,11 +89,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         """
         if self._over:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        shape: Any = self.action_space.shape
-        given = real_numbers(action, shape)
-        if given.shape != shape:
-            raise ValueError(f"action must have shape {shape}, got {given.shape}")
-        observation, reward, info = self.batch.execute_actions(given[None])
+        observation, reward, info = self.batch.execute_actions([action])
         terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
         self._over = terminated or truncated
         values = {name: value[0].item() for name, value in info.items()}

@@ -13,13 +13,14 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.box import Box
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.cylinder import Cylinder
 from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape, as_points, checked_radius
+from viapoint.envs.geometry.shape import Shape, checked_radius
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -202,9 +203,9 @@ def signed_distances(
 
 def _checked_ends(first: Any, second: Any) -> list[Float]:
     """Return the ends of segments, or points alone where there is no second end."""
-    ends = [as_points("first", first)]
+    ends = [finite_array("first", first, (..., 3))]
     if second is not None:
-        ends.append(as_points("second", second))
+        ends.append(finite_array("second", second, (..., 3)))
     return ends
 
 
