@@ -292,14 +292,10 @@ def sampler_of_family(
     if family not in families:
         raise ValueError(f"family must be one of {', '.join(families)}, got {family!r}")
     record = families[family]
-    if not set(record.shapes) <= {*distribution.shapes, *CAPSULES}:
+    if most < record.n_obstacles or not set(record.shapes) <= {*distribution.shapes, *CAPSULES}:
         raise ValueError(
-            f"{family} needs a task with the shapes {', '.join(record.shapes)}, this one has "
-            f"{', '.join(distribution.shapes)}"
-        )
-    if most < record.n_obstacles:
-        raise ValueError(
-            f"{family} needs a task with up to {record.n_obstacles} obstacles, this one has {most} at most"
+            f"{family} needs a task with up to {record.n_obstacles} obstacles and the shapes {record.shapes}, this one "
+            f"has {most} obstacles and the shapes {distribution.shapes}"
         )
     if isinstance(distribution, SpaceDistribution):
         return SceneSampler(collision_model, dataclasses.replace(distribution, families=(family,)))
