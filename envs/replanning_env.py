@@ -27,8 +27,7 @@ from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
-from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import Decision, ReachVectorEnv
+from viapoint.envs.vector_env import Decision, ReachEnv, ReachVectorEnv
 
 
 class PlanStart(NamedTuple):

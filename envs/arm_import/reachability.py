@@ -152,9 +152,9 @@ class Feasibility:
         table = min(above.min(), hand[2] - self._hand_radius)
         return (
             f"the nearest configuration misses it by {error:.4f} m and {rotation:.2f} rad (at most "
-            f"{HAND_TOLERANCE} m and {ORIENTATION_TOLERANCE} rad), has {joint} {inside.min():.2f} rad inside its range (more than "
-            f"{JOINT_MARGIN} rad), parts {table:.3f} m above the table and links {apart.min():.3f} m apart (more than "
-            f"{LINK_MARGIN} m)"
+            f"{HAND_TOLERANCE} m and {ORIENTATION_TOLERANCE} rad), has {joint} {inside.min():.2f} rad inside its "
+            f"range (more than {JOINT_MARGIN} rad), parts {table:.3f} m above the table and links {apart.min():.3f} m "
+            f"apart (more than {LINK_MARGIN} m)"
         )
 
     def _ends(self, joints: Float) -> Float:
