@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -26,19 +26,72 @@ from viapoint.envs.common.validation import (
 )
 from viapoint.envs.config import EnvConfig, ViaPointConfig
 from viapoint.envs.mdp.rewards import reward_terms
-from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
+from viapoint.envs.rendering.renderer import RENDER_MODES, MovementRenderer
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, join_groups
 from viapoint.envs.sim.outcome import Rollout
-from viapoint.envs.sim.scheduler import Scheduler
 from viapoint.envs.sim.simulator import Simulator
 
 METADATA: dict[str, Any] = {
-    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_modes": RENDER_MODES,
     "render_fps": 50,
     "autoreset_mode": AutoresetMode.SAME_STEP,
 }
+SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "autoreset_mode"}
+
+
+class Scheduler:
+    """Runner of stages on a background thread, which starts with the first job, or on the calling thread alone.
+
+    The physics engine is C code that releases Python's global lock, so a background thread can compute references and
+    outcomes in NumPy while the main thread waits for the engine. No result depends on it.
+    """
+
+    def __init__(self, threaded: bool) -> None:
+        self._threaded = threaded
+        self._pool: ThreadPoolExecutor | None = None
+
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run `job(*arguments)` on the background thread; jobs run one at a time in the order of submission."""
+        if not self._threaded:
+            return _run_now(job, *arguments)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="viapoint")
+        return self._pool.submit(job, *arguments)
+
+    def run(
+        self,
+        groups: Sequence[Any],
+        build_references: Callable[[Any], Any],
+        simulate: Callable[[Any], Any],
+        measure: Callable[[Any, Any], Any],
+        meanwhile: Callable[[], Any] | None = None,
+    ) -> tuple[list[Any], Future[Any] | None]:
+        """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
+
+        With one group there is nothing to overlap, and all stages run on the calling thread. The independent job
+        `meanwhile` may run during the physics; its future is returned with the results of the last stage.
+        """
+        submit = self.submit if len(groups) > 1 else _run_now
+        references = [submit(build_references, group) for group in groups]
+        # The physics waits for the first references only, so the independent job comes after all of them.
+        following = None if meanwhile is None else self.submit(meanwhile)
+        measured = [submit(measure, each.result(), simulate(each.result())) for each in references]
+        return [each.result() for each in measured], following
+
+    def close(self) -> None:
+        """Stop the background thread."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+def _run_now(job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Run a job on the calling thread and return its completed future."""
+    done: Future[Any] = Future()
+    done.set_result(job(*arguments))
+    return done
 
 
 class Decision(NamedTuple):
@@ -115,7 +168,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """True where the last step truncated the episode, shape (num_envs,)."""
         self._last: Execution | None = None
         self.action_names = self.action_layout.names
-        self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
+        self.render_mode = config.render_mode
         self._renderer = MovementRenderer(
             self._simulator, self.render_mode, config.width, config.height, METADATA["render_fps"]
         )
@@ -301,8 +354,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:
-            modes = ", ".join(METADATA["render_modes"])
-            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
+            gym.logger.warn(
+                f"render() does nothing without a render_mode; choose one of {', '.join(RENDER_MODES)}"
+            )
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
             assert self.scenes is not None
@@ -386,9 +440,7 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         'ReachEnv'
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        name: value for name, value in METADATA.items() if name != "autoreset_mode"
-    }
+    metadata = SINGLE_METADATA
     batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
     """Vector environment class that this environment wraps."""
 

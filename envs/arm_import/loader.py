@@ -97,7 +97,7 @@ def load_arm(
 
     Example:
         >>> import numpy as np
-        >>> from viapoint.envs.arm_import import load_arm
+        >>> from viapoint.envs import load_arm
         >>> arm = load_arm(
         ...     "docs/ur5e.xml",
         ...     hand_site="hand",

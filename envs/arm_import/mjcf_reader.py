@@ -97,10 +97,15 @@ def parse_mjcf(
     velocity_limit: Any,
 ) -> ParsedMjcf:
     """Read and check a file; see :func:`~viapoint.envs.arm_import.loader.load_arm` for arguments and errors."""
-    spec = _read(path)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        whole = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {str(path)!r} as an MJCF file: {error}") from None
+    if not spec.geoms:
+        raise ValueError(f"there are no geoms in {str(path)!r}: nothing of the arm can collide")
     _check_exist("site", (hand_site,), [site.name for site in spec.sites])
     _check_exist("joint", joints, [joint.name for joint in spec.joints])
-    whole = _compile(spec, path)
     ranges = _ranges(whole, joints, joint_range)
     torque = (
         _torques(whole, joints) if torque_limit is None else per_joint("torque_limit", torque_limit, joints)
@@ -124,23 +129,6 @@ def parse_mjcf(
     model = _isolate(spec, joints, whole)
     _check_order(model, joints, hand_site)
     return ParsedMjcf(model, joints, hand_site, home, ranges, torque, velocity)
-
-
-def _read(path: Path) -> mujoco.MjSpec:
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {str(path)!r} as an MJCF file: {error}") from None
-    if not spec.geoms:
-        raise ValueError(f"there are no geoms in {str(path)!r}: nothing of the arm can collide")
-    return spec
-
-
-def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile {str(path)!r}: {error}") from None
 
 
 def _check_exist(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
@@ -180,19 +168,13 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
         driven = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(driven)]
         found.append(max(limits, default=np.nan))
-    torques = np.array(found)
-    missing, one_way = (
-        ", ".join(name for name, bad in zip(joints, each, strict=True) if bad)
-        for each in (~np.isfinite(torques), torques <= 0.0)
-    )
+    missing = [name for name, torque in zip(joints, found, strict=True) if not torque > 0.0]
     if missing:
-        raise ValueError(f"no actuator with a limited force drives {missing}; add one, or give torque_limit")
-    if one_way:
         raise ValueError(
-            f"the force on {one_way} is limited to one direction; give it a range about 0 in the file, or give "
+            f"no actuator with a force limited to a range about 0 drives {', '.join(missing)}; add one, or give "
             "torque_limit"
         )
-    return torques
+    return np.array(found)
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
