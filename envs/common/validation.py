@@ -80,7 +80,8 @@ def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple
 def number_of_at_least(name: str, value: Any, least: float, below: float = np.inf) -> float:
     """Return a finite real number that is at least `least` and less than `below`."""
     if not is_number(value) or not least <= float(value) < below:
-        raise ValueError(f"{name} must be a number from {least:g} to less than {below:g}, got {value!r}")
+        allowed = f"{least:g} or more" if below == np.inf else f"from {least:g} to less than {below:g}"
+        raise ValueError(f"{name} must be a finite number, {allowed}, got {value!r}")
     return float(value)
 
 
@@ -117,7 +118,7 @@ def as_real_array(values: Any) -> NDArray[Any] | None:
 
 def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
     """Return finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
-    array = finite_array(f"action ({', '.join(names)})", actions, (num_envs, len(names)))
+    array = finite_array(f"actions of all environments ({', '.join(names)})", actions, (num_envs, len(names)))
     return np.clip(array, -1.0, 1.0)
 
 
@@ -149,9 +150,8 @@ def finite_array(name: str, values: Any, *shapes: tuple[Any, ...]) -> Float:
     if array is None:
         raise ValueError(f"{name} must be an array of real numbers, got {values!r:.60}")
     if shapes and not any(_fits(array.shape, shape) for shape in shapes):
-        signs = {None: "n", ...: "..."}
-        allowed = [f"({', '.join(str(signs.get(size, size)) for size in shape)})" for shape in shapes]
-        raise ValueError(f"{name} must have shape {' or '.join(allowed)}, got {array.shape}")
+        allowed = " or ".join(map(str, shapes)).replace("Ellipsis", "...").replace("None", "n")
+        raise ValueError(f"{name} must have shape {allowed}, got {array.shape}")
     finite = np.isfinite(array)
     if not finite.all():
         raise ValueError(f"{name} must be finite, got {array[~finite][0]}")

@@ -19,6 +19,7 @@ from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.shape import Shape, checked_radius
+from viapoint.primitives.array_api import broadcast_batch
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -240,7 +241,8 @@ def nearest_distance(
     if not is_number(most) or np.isnan(most):
         raise ValueError(f"most must be a number, got {most!r:.60}")
     ends, radius = _checked_ends(first, second), checked_radius(radius)
-    shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
+    leading = {f"end {i}": end.shape[:-1] for i, end in enumerate(ends)}
+    shape = broadcast_batch(**leading, radius=np.shape(radius))
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
     middle = 0.5 * (flat[0] + flat[-1])

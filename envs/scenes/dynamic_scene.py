@@ -145,13 +145,13 @@ def problems_of_changes(
         margin = np.asarray(collision_model.arm.reach_margin(goal))
         yield problem(
             given[:, k] & (margin < 0.0),
-            f"the target of jump {k} must be within the arm's reach, [m]",
+            f"the target of jump {k} must be within the arm's reach: its margin must be 0 m or more",
             margin,
         )
         then = scenes.at(np.where(given[:, k], scenes.jumps[:, k, 0], 0.0))
         least = rest_clearance(then, goal, collision_model).min(axis=-1)
         yield problem(
             given[:, k] & (least <= 0.0),
-            f"the target of jump {k} must be free when it appears: an obstacle touches the arm, clearance [m]",
+            f"the target of jump {k} must be free when it appears: the arm's clearance must be over 0 m",
             least,
         )

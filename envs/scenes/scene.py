@@ -180,7 +180,7 @@ def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = (()
     for name, point in ends:
         margin = np.asarray(arm.reach_margin(point))
         yield problem(
-            margin < 0.0, f"{name} must be within the arm's reach: its margin [m] is negative", margin
+            margin < 0.0, f"{name} must be within the arm's reach: its margin must be 0 m or more", margin
         )
     faults = _problems_of_shapes(scenes) if has_shapes(scenes.obstacles) else _problems_of_capsules(scenes)
     for wrong, why in faults:
@@ -193,7 +193,7 @@ def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = (()
         clearance = rest_clearance(scenes, point, collision_model)[:, :-1]
         yield problem(
             clearance <= 0.0,
-            f"touches the arm at the {name}: its clearance [m] must be over 0",
+            f"touches the arm at the {name}: its clearance must be over 0 m",
             clearance,
             obstacle,
         )
