@@ -24,7 +24,6 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint import primitives
 from viapoint.envs.mdp.task import Task
-from viapoint.envs.scenes.sampler import AHEAD
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Executor
 from viapoint.envs.sim.simulator import Simulator
@@ -34,8 +33,8 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
 TRAJECTORIES, SAMPLES = 4096, 200
-WARM_UP = 2 * AHEAD
-"""Steps before those that are timed: scenes are then as many ahead as later."""
+WARM_UP = 2
+"""Steps before those that are timed."""
 EPISODES = 20
 """Episodes of a single environment that are timed together."""
 MIDDLE = 0.3

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from viapoint.envs.scenes.families import register_scene_family
     from viapoint.envs.scenes.options import scene_from_json, scene_to_json
     from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
-    from viapoint.envs.single_env import ReachEnv
-    from viapoint.envs.vector_env import ReachVectorEnv
+    from viapoint.envs.vector_env import ReachEnv, ReachVectorEnv
     from viapoint.envs.velocity_env import VelocityEnv, VelocityVectorEnv
 else:
     __getattr__, __dir__ = lazy_imports(__name__)

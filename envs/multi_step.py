@@ -32,7 +32,7 @@ class MultiStepVectorEnv(ReachVectorEnv):
         decision = self.execute_actions(actions)
         rows = np.flatnonzero(self.terminated | self.truncated)
         if rows.size:
-            self._start(rows, self._draw_next(rows))
+            self._start(rows, self._draw(self.generators, rows, {}))
         return self._as_step(decision)
 
     def state(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Replanning
 from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions
 from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import ReplanningObservationLayout
@@ -21,14 +21,13 @@ from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
-from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
+from viapoint.envs.scenes.options import CHANGES, given_changes
 from viapoint.envs.scenes.scene import refuse
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
-from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import Decision, ReachVectorEnv
+from viapoint.envs.vector_env import Decision, ReachEnv, ReachVectorEnv
 
 
 class PlanStart(NamedTuple):
@@ -79,9 +78,8 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         assert isinstance(config, ReplanningConfig)
         action, base, model = task.action, task.observation, task.collision_model
         shortest, longest = action.duration_range
-        self.changes = ChangeDistribution(
-            n_jumps=fewest_and_most(config.n_jumps, "n_jumps"), moving=bool(config.moving_obstacles)
-        )
+        n_jumps: Any = config.n_jumps
+        self.changes = ChangeDistribution(n_jumps=n_jumps, moving=bool(config.moving_obstacles))
         """Distribution of the changes of scenes."""
         self.decoder = ReplanningDecoder(action)
         """Meaning of the components of an action during a movement."""
@@ -271,8 +269,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         jumps, courses = given_changes(options, len(rows), layout.dimension, layout.n_rows)
         draw = super()._draw
         scenes = draw(tried, rows, scene)
-        if courses is not None:
-            check_owners(courses, scenes.present)
         again = None if options else lambda some: draw(tried, rows[some], {})
         try:
             changing = self._change_sampler([tried[i] for i in rows], scenes, jumps, courses, again=again)
@@ -283,10 +279,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         for i in rows:
             generators[i] = tried[i]
         return changing
-
-    def _draw_next(self, rows: Int) -> ChangingScenes:  # type: ignore[override]
-        """Sample the next scenes, none of them ahead: changes of a scene take numbers of the same generator."""
-        return self._draw(self.generators, rows, {})
 
     def _start(self, rows: Int, scenes: ChangingScenes) -> Float:  # type: ignore[override]
         """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""

@@ -1,10 +1,10 @@
-"""Vector environment in which one decision is one movement."""
+"""Environments in which one decision is one movement."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -26,20 +26,72 @@ from viapoint.envs.common.validation import (
 )
 from viapoint.envs.config import EnvConfig, ViaPointConfig
 from viapoint.envs.mdp.rewards import reward_terms
-from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
+from viapoint.envs.rendering.renderer import RENDER_MODES, MovementRenderer
 from viapoint.envs.scenes.options import draw_given
-from viapoint.envs.scenes.sampler import SceneQueue
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, join_groups
 from viapoint.envs.sim.outcome import Rollout
-from viapoint.envs.sim.scheduler import Scheduler
 from viapoint.envs.sim.simulator import Simulator
 
 METADATA: dict[str, Any] = {
-    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_modes": RENDER_MODES,
     "render_fps": 50,
     "autoreset_mode": AutoresetMode.SAME_STEP,
 }
+SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "autoreset_mode"}
+
+
+class Scheduler:
+    """Runner of stages on a background thread, which starts with the first job, or on the calling thread alone.
+
+    The physics engine is C code that releases Python's global lock, so a background thread can compute references and
+    outcomes in NumPy while the main thread waits for the engine. No result depends on it.
+    """
+
+    def __init__(self, threaded: bool) -> None:
+        self._threaded = threaded
+        self._pool: ThreadPoolExecutor | None = None
+
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run `job(*arguments)` on the background thread; jobs run one at a time in the order of submission."""
+        if not self._threaded:
+            return _run_now(job, *arguments)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="viapoint")
+        return self._pool.submit(job, *arguments)
+
+    def run(
+        self,
+        groups: Sequence[Any],
+        build_references: Callable[[Any], Any],
+        simulate: Callable[[Any], Any],
+        measure: Callable[[Any, Any], Any],
+        meanwhile: Callable[[], Any] | None = None,
+    ) -> tuple[list[Any], Future[Any] | None]:
+        """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
+
+        With one group there is nothing to overlap, and all stages run on the calling thread. The independent job
+        `meanwhile` may run during the physics; its future is returned with the results of the last stage.
+        """
+        submit = self.submit if len(groups) > 1 else _run_now
+        references = [submit(build_references, group) for group in groups]
+        # The physics waits for the first references only, so the independent job comes after all of them.
+        following = None if meanwhile is None else self.submit(meanwhile)
+        measured = [submit(measure, each.result(), simulate(each.result())) for each in references]
+        return [each.result() for each in measured], following
+
+    def close(self) -> None:
+        """Stop the background thread."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+def _run_now(job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Run a job on the calling thread and return its completed future."""
+    done: Future[Any] = Future()
+    done.set_result(job(*arguments))
+    return done
 
 
 class Decision(NamedTuple):
@@ -97,7 +149,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.arm, self.action_layout = self.task.arm, self.task.action
         self.observation_layout = self.task.observation
         self._sampler = self.task.sampler()
-        self._queue = SceneQueue(self._sampler, self.num_envs)
         self._simulator = Simulator(
             self.task.collision_model,
             n_obstacles=self.observation_layout.n_rows,
@@ -117,7 +168,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """True where the last step truncated the episode, shape (num_envs,)."""
         self._last: Execution | None = None
         self.action_names = self.action_layout.names
-        self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
+        self.render_mode = config.render_mode
         self._renderer = MovementRenderer(
             self._simulator, self.render_mode, config.width, config.height, METADATA["render_fps"]
         )
@@ -158,7 +209,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
             options: `start`, `goal` and `obstacles` set up a given scene, see
-                :func:`~viapoint.envs.scenes.options.given_scenes`; `reset_mask`, shape (num_envs,), names the
+                :func:`~viapoint.envs.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
                 environments to reset, all others keep their scenes.
 
         Raises:
@@ -188,7 +239,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         rows = np.arange(self.num_envs)
         # The next scenes depend on no outcome, so they are drawn during the physics.
-        decision, following = self._execute(self._decode(actions), lambda: self._draw_next(rows))
+        decision, following = self._execute(
+            self._decode(actions), lambda: self._draw(self.generators, rows, {})
+        )
         assert following is not None
         self._start(rows, following.result())
         return self._as_step(decision)
@@ -301,8 +354,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:
-            modes = ", ".join(METADATA["render_modes"])
-            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
+            gym.logger.warn(
+                f"render() does nothing without a render_mode; choose one of {', '.join(RENDER_MODES)}"
+            )
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
             assert self.scenes is not None
@@ -356,10 +410,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             generators[i] = generator
         return scenes
 
-    def _draw_next(self, rows: Int) -> Scenes:
-        """Sample the scenes that follow those of some environments; some of later episodes are sampled with them."""
-        return self._queue(self.generators, rows)
-
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         """Start episodes with the arms at rest at the start and the obstacles in place; return the joint angles."""
         if self.scenes is None or len(rows) == self.num_envs:
@@ -376,3 +426,90 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         assert self.scenes is not None
         joints = np.asarray(self.arm.inverse_kinematics(self.scenes.start))
         return self.observation_layout.observe(joints, self.scenes.start, self.scenes)
+
+
+class ReachEnv(gym.Env[Any, Any], EzPickle):
+    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> type(env.unwrapped).__name__
+        'ReachEnv'
+    """
+
+    metadata = SINGLE_METADATA
+    batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
+    """Vector environment class that this environment wraps."""
+
+    def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
+        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
+        self.batch = self.batch_kind(1, threads=threads, **kwargs)
+        """Vector environment with one environment."""
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+        self.render_mode = self.batch.render_mode
+        self.task = self.batch.task
+        self.action_layout = self.batch.action_layout
+        self.observation_layout = self.batch.observation_layout
+        self._over = True
+
+    @property
+    def last_rollout(self) -> Rollout | None:
+        """Last movement at every physics step; None before the first."""
+        rollouts = self.batch.last_rollout
+        return rollouts[0] if rollouts else None
+
+    @property
+    def last_plan(self) -> Plan | None:
+        """Last decision as via-points (K + 2, D) [m] and durations (K + 1,) [s]; None before the first."""
+        plan = self.batch.last_plan
+        return None if plan is None else plan.take(0)
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo model."""
+        return self.batch.model
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far."""
+        return self.batch.physics_steps
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
+        self.batch.use_generator(self._np_random, self._np_random_seed)
+        observation, info = self.batch.reset(seed=seed, options=options)
+        self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
+        self._over = False
+        if self.render_mode == "human":
+            self.batch.render()
+        return {name: part[0] for name, part in observation.items()}, info
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute one action, see :meth:`ReachVectorEnv.step`; where it is a movement, it ends the episode.
+
+        Args:
+            action: Shape (m,), in [-1, 1]; components beyond are clipped.
+        """
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
+        observation, reward, info = self.batch.execute_actions([action])
+        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
+        self._over = terminated or truncated
+        seen = {name: part[0] for name, part in observation.items()}
+        values = {name: value[0].item() for name, value in info.items()}
+        return seen, float(reward[0]), terminated, truncated, values
+
+    def render(self) -> Any:
+        """Render the last movement in the render mode; after a reset, the scene."""
+        frames = self.batch.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Stop worker threads and close the render window."""
+        self.batch.close()

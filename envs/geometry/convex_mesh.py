@@ -11,7 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import best_of, dot, frozen
 from viapoint.envs.common.types import Float, Index
-from viapoint.envs.common.validation import array_of_shape
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.segments import lowest_of_lines, nearest_on_segments, nearest_to_origin
 from viapoint.envs.geometry.shape import (
     Components,
@@ -70,12 +70,8 @@ class ConvexMesh(Shape):
     @classmethod
     def hull(cls, points: Any, **pose: Any) -> Self:
         """Return the convex hull of points, shape (K, 3), [m]; `pose` are position, quaternion and name."""
-        try:
-            vertices = _checked_vertices(points)
-            vertices = vertices[_convex_hull(vertices).vertices]
-        except ValueError as error:
-            raise cls._refusal(pose.get("name", ""), str(error)) from None
-        return cls(vertices, **pose)
+        vertices = finite_array("vertices", points, (None, 3))
+        return cls(vertices[_convex_hull(vertices).vertices], **pose)
 
     @property
     def bounding_sphere(self) -> tuple[Float, Float]:
@@ -97,11 +93,9 @@ class ConvexMesh(Shape):
         raise ValueError(f"{self.kind} is for arms in space; in the plane, use boxes, cylinders and capsules")
 
     def _check(self) -> None:
-        try:
-            object.__setattr__(self, "vertices", frozen(_checked_vertices(self.vertices)))
-            _check_convex(self.vertices, self.polytope)
-        except ValueError as error:
-            raise self._error(str(error)) from None
+        vertices = finite_array("vertices", self.vertices, (None, 3))
+        object.__setattr__(self, "vertices", frozen(vertices.copy()))
+        _check_convex(self.vertices, self.polytope)
 
     def _signed(self, points: Components) -> Float:
         """Return the signed distance.
@@ -220,16 +214,6 @@ class NamedMesh(ConvexMesh):
         self.__dict__.update(vertices=self.mesh.vertices, polytope=self.mesh.polytope)
 
 
-def _checked_vertices(points: Any) -> Float:
-    """Return vertices as an array, shape (V, 3)."""
-    array = array_of_shape(
-        "vertices", points, "(V, 3) with V at least 4", lambda *s: s[1:] == (3,) and s[0] > 3
-    )
-    if not np.isfinite(array).all():
-        raise ValueError(f"vertices must be finite, got {array[~np.isfinite(array).all(axis=1)][0].tolist()}")
-    return array
-
-
 def _convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
     """Return the :class:`scipy.spatial.ConvexHull` of vertices, as triangles.
 
@@ -245,7 +229,7 @@ def _convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
 
     size = np.ptp(vertices, axis=0).max()
     around = (vertices - vertices.mean(axis=0)) / (size if size > 0.0 else 1.0)
-    if np.linalg.svd(around, compute_uv=False)[2] < DENT:
+    if len(vertices) < 4 or np.linalg.svd(around, compute_uv=False)[2] < DENT:
         raise ValueError("vertices must span a volume, they lie in a plane; use a thin box or a point cloud")
     try:
         hull = ConvexHull(vertices, qhull_options=f"Qt C{coplanar * size:g}" if coplanar else "Qt")

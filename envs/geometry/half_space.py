@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import array_of_shape
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape
 
 EXTENT = 1.0
@@ -45,13 +45,10 @@ class HalfSpace(Shape):
             position: A point of the surface, shape (3,), [m].
             name: Name for error messages.
         """
-        try:
-            outward = array_of_shape("normal", normal, "(3,)", lambda *shape: shape == (3,))
-        except ValueError as error:
-            raise cls._refusal(name, str(error)) from None
+        outward = finite_array("normal", normal, (3,))
         longest = np.abs(outward).max()
-        if not 0.0 < longest < np.inf:
-            raise cls._refusal(name, f"normal must be finite and not zero, got {outward.tolist()}")
+        if longest == 0.0:
+            raise ValueError(f"normal must not be zero, got {outward.tolist()}")
         return cls(position=position, quaternion=quaternion_to(outward / longest), name=name)
 
     @property

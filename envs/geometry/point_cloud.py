@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, ClassVar, Self
 
 import mujoco
@@ -11,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import TINY, frozen
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import array_of_shape
+from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.shape import (
     OUTLINE_POINTS,
     Components,
@@ -21,6 +20,9 @@ from viapoint.envs.geometry.shape import (
     bounds_of_points,
     length,
 )
+
+LEAST_SPACING = 1e-6
+"""Least edge of the cubes of :meth:`PointCloud.covering`, [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +62,8 @@ class PointCloud(Shape):
             radius: Radius of the spheres around the given points, [m].
             **pose: `position`, `quaternion` and `name`.
         """
-        for name, value, allowed in (
-            ("spacing", spacing, "greater than 0"),
-            ("radius", radius, "0 or greater"),
-        ):
-            number = isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= value < np.inf
-            if not number or (value == 0.0 and name == "spacing"):
-                raise cls._refusal(pose.get("name", ""), f"{name} must be {allowed}, got {value!r:.60}")
+        number_of_at_least("spacing", spacing, LEAST_SPACING)
+        number_of_at_least("radius", radius, 0.0)
         given = cls(points, **pose).points
         cubes = np.unique(np.floor(given / spacing), axis=0)
         return cls((cubes + 0.5) * spacing, radius=0.5 * np.sqrt(3.0) * spacing + radius, **pose)
@@ -92,19 +89,9 @@ class PointCloud(Shape):
 
     def _check(self) -> None:
         if self.radius.shape:
-            raise self._error(f"radius must be one number for all points, got shape {self.radius.shape}")
-        wanted = "(K, 3) with K at least 1"
-        try:
-            array = array_of_shape("points", self.points, wanted, lambda *s: s[1:] == (3,) and s[0] > 0)
-        except ValueError as error:
-            raise self._error(str(error)) from None
-        if not (finite := np.isfinite(array).all(axis=1)).all():
-            wrong = int(finite.argmin())
-            raise self._error(
-                f"points must be finite, got {array[wrong].tolist()} at index {wrong} ({(~finite).sum()} of "
-                f"{len(array)} points); remove them: points[np.isfinite(points).all(axis=1)]"
-            )
-        object.__setattr__(self, "points", frozen(array))
+            raise ValueError(f"radius must be one number for all points, got shape {self.radius.shape}")
+        points = finite_array("points", self.points, (None, 3))
+        object.__setattr__(self, "points", frozen(points.copy()))
 
     def _signed(self, points: Components) -> Float:
         parts = np.stack(np.broadcast_arrays(*points))

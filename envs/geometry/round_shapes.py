@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm, quaternion_to
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import array_of_shape
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.segments import nearest_to_origin, point_axis_squared, segment_axis_squared
 from viapoint.envs.geometry.shape import FLAT, GUARD, Components, Geom, Shape, length
 
@@ -107,19 +107,15 @@ class Capsule(Shape):
             radius: [m].
             name: Name for error messages.
         """
-        sizes = ((3,), (2,))
-        try:
-            first, second = (
-                in_space(array_of_shape("ends", end, "(3,) or (2,)", lambda *shape: shape in sizes))
-                for end in (first, second)
-            )
-        except ValueError as error:
-            raise cls._refusal(name, str(error)) from None
+        first = in_space(finite_array("first", first, (3,), (2,)))
+        second = in_space(finite_array("second", second, (3,), (2,)))
         half = 0.5 * (second - first)
         turn, size = quaternion_to(half), norm(half)
         if not 0.0 < size < np.inf:
-            reason = f"ends must be finite and different, got {first.tolist()} and {second.tolist()}"
-            raise cls._refusal(name, f"{reason}; a capsule without a length is a Sphere")
+            raise ValueError(
+                f"ends must be different, got {first.tolist()} and {second.tolist()}; a capsule without a length is a "
+                "Sphere"
+            )
         return cls(radius, size, position=0.5 * (first + second), quaternion=turn, name=name)
 
     @property

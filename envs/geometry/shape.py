@@ -109,11 +109,10 @@ class Shape(abc.ABC):
         if not isinstance(self.name, str):
             raise ValueError(f"{self.kind}: name must be a string, got {self.name!r:.60}")
         try:
-            values = {name: finite_array(name, getattr(self, name)) for name in self._trailing()}
-            for name, last in self._trailing().items():
-                shape = values[name].shape
-                if shape[len(shape) - len(last) :] != last:
-                    raise ValueError(f"{name} must have shape (..., {last[0]}), got shape {shape}")
+            values = {
+                name: finite_array(name, getattr(self, name), (..., *last))
+                for name, last in self._trailing().items()
+            }
             for name in self.sizes:
                 if not (values[name] > 0.0).all():
                     raise ValueError(f"{name} must be greater than 0, got {getattr(self, name)!r}")
@@ -121,9 +120,9 @@ class Shape(abc.ABC):
             for name, value in values.items():
                 object.__setattr__(self, name, frozen(value.copy()))
             broadcast_batch(**self._leading())
+            self._check()
         except ValueError as error:
             raise self._error(str(error)) from None
-        self._check()
 
     def __eq__(self, other: object) -> bool:
         """Return True for a shape of the same kind with the same parameters and name."""
@@ -320,12 +319,7 @@ class Shape(abc.ABC):
 
     def _error(self, message: str) -> ValueError:
         """Return an error that names the shape."""
-        return self._refusal(self.name, message)
-
-    @classmethod
-    def _refusal(cls, name: str, message: str) -> ValueError:
-        """Return an error that names a shape before it exists."""
-        return ValueError(f"{cls.kind}{f' {name!r}' if name else ''}: {message}")
+        return ValueError(f"{self.kind}{f' {self.name!r}' if self.name else ''}: {message}")
 
     @classmethod
     def _trailing(cls) -> dict[str, tuple[int, ...]]:
@@ -382,19 +376,11 @@ class Shape(abc.ABC):
         return [dot(offset, axis) for axis in self._axes]
 
 
-def as_points(name: str, values: Any) -> Float:
-    """Return finite points as an array, shape (..., 3)."""
-    points = finite_array(name, values)
-    if points.shape[-1:] != (3,):
-        raise ValueError(f"points must have shape (..., 3), got shape {points.shape}")
-    return points
-
-
 def _as_double(name: str, values: Any) -> Float:
-    """Return points as :func:`as_points`; an array in double precision is not searched for infinite numbers."""
+    """Return finite points, shape (..., 3); an array in double precision is not searched for infinite numbers."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.shape[-1:] == (3,):
         return values
-    return as_points(name, values)
+    return finite_array(name, values, (..., 3))
 
 
 def checked_radius(radius: Any) -> Any:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
-from numbers import Real
+from dataclasses import MISSING, fields
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, is_number
 from viapoint.envs.geometry.box import Box
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.cylinder import Cylinder
 from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape, as_points, checked_radius
+from viapoint.envs.geometry.shape import Shape, checked_radius
+from viapoint.primitives.array_api import broadcast_batch
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -85,7 +85,7 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         0.18
         >>> as_obstacle({"shape": "box", "sizes": (0.1, 0.2, 0.02)})
         Traceback (most recent call last):
-        ValueError: box: unknown parameter 'sizes', did you mean 'size'? Parameters are size, position, quaternion, name
+        ValueError: box: parameters are size, position, quaternion, name; unknown are ['sizes'], missing are ['size']
     """
     if isinstance(value, Shape):
         return value
@@ -93,28 +93,24 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         raise ValueError(f"an obstacle must be a shape of viapoint.envs or a dictionary, got {value!r:.80}")
     values = dict(value)
     kind = values.pop("shape", None)
-    shape, name = SHAPES.get(kind) if isinstance(kind, str) else None, values.get("name")
-    named = f"{name!r}: " if isinstance(name, str) and name else ""
+    shape = SHAPES.get(kind) if isinstance(kind, str) else None
     if shape is None:
-        known = f"Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
-        if kind is None:
-            raise ValueError(f"{named}the key 'shape' is missing. {known}")
-        raise ValueError(f"{named}unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
+        raise ValueError(f"shape must be one of {', '.join(SHAPES)}, got {kind!r}; {MESH_HINT}")
     allowed = shape.parameters()
-    named = f"{kind} {named}".rstrip(": ")
-    for name in values:
-        if name not in allowed:
-            known = f"Parameters are {', '.join(allowed)}"
-            raise ValueError(f"{named}: unknown parameter {name!r}{_meant(name, allowed)} {known}")
-    try:
-        return shape(**values)
-    except TypeError:
-        missing = [f.name for f in fields(shape) if f.name not in values and f.default is f.default_factory]
-        raise ValueError(f"{named}: missing {', '.join(missing)}") from None
+    unknown = [name for name in values if name not in allowed]
+    needed = [each.name for each in fields(shape) if each.init and each.default is MISSING]
+    missing = [name for name in needed if name not in values]
+    if unknown or missing:
+        raise ValueError(
+            f"{kind}: parameters are {', '.join(allowed)}; unknown are {unknown}, missing are {missing}"
+        )
+    return shape(**values)
 
 
-def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
+def as_obstacles(values: Iterable[Shape | Mapping[str, Any]], *, single: bool = False) -> list[Shape]:
     """Return shapes from a list of shapes and dictionaries; an error names the index of the obstacle.
+
+    Batches of shapes are refused if each must be a `single` one.
 
     Example:
         >>> from viapoint.envs import as_obstacles
@@ -129,6 +125,8 @@ def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
     for i, value in enumerate(values):
         try:
             found.append(as_obstacle(value))
+            if single:
+                found[-1].require_single()
         except ValueError as error:
             raise ValueError(f"obstacle {i}: {error}") from None
     return found
@@ -202,9 +200,9 @@ def signed_distances(
 
 def _checked_ends(first: Any, second: Any) -> list[Float]:
     """Return the ends of segments, or points alone where there is no second end."""
-    ends = [as_points("first", first)]
+    ends = [finite_array("first", first, (..., 3))]
     if second is not None:
-        ends.append(as_points("second", second))
+        ends.append(finite_array("second", second, (..., 3)))
     return ends
 
 
@@ -239,20 +237,12 @@ def nearest_distance(
         >>> nearest_distance([HalfSpace(), Sphere(0.1, position=(0.5, 0.0, 0.3))], [0.5, 0.0, 0.6], most=1.0).round(3)
         np.float64(0.2)
     """
-    obstacles = as_obstacles(obstacles)
-    if isinstance(most, bool) or not isinstance(most, Real) or most != most:
+    obstacles = as_obstacles(obstacles, single=True)
+    if not is_number(most) or np.isnan(most):
         raise ValueError(f"most must be a number, got {most!r:.60}")
     ends, radius = _checked_ends(first, second), checked_radius(radius)
-    for i, each in enumerate(obstacles):
-        try:
-            each.require_single()
-        except ValueError as error:
-            raise ValueError(f"obstacle {i}: {error}") from None
-    try:
-        shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
-    except ValueError:
-        sizes = ", ".join(map(str, (*(end.shape for end in ends), np.shape(radius))))
-        raise ValueError(f"points and radius must broadcast, got the shapes {sizes}") from None
+    leading = {f"end {i}": end.shape[:-1] for i, end in enumerate(ends)}
+    shape = broadcast_batch(**leading, radius=np.shape(radius))
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
     middle = 0.5 * (flat[0] + flat[-1])
@@ -317,9 +307,3 @@ def add_to_model(
 
 def _length(vectors: Float) -> Any:
     return np.sqrt((vectors * vectors) @ np.ones(3))
-
-
-def _meant(name: Any, known: Iterable[str]) -> str:
-    """Return a suggestion for a misspelled name."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
-    return f", did you mean {close[0]!r}?" if close else "."

@@ -20,18 +20,12 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.sim.simulator import Simulator
 
-__all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame_steps"]
+__all__ = ["GLUnavailableError", "MovementRenderer", "frame_steps"]
 
-
+RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]
+"""Values of `render_mode` besides None."""
 STILL_SUPERSAMPLING = 2
 """Supersampling of single pictures; frames of films have none, because it takes time."""
-
-
-def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
-    """Return a render mode after checking that it is None or known."""
-    if mode is not None and mode not in known:
-        raise ValueError(f"render_mode must be None or one of {', '.join(known)}, got {mode!r}")
-    return mode
 
 
 def frame_steps(time: Float, fps: int) -> Int:
@@ -60,6 +54,8 @@ class MovementRenderer:
     """
 
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
+        if mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be None or one of {', '.join(RENDER_MODES)}, got {mode!r}")
         self._simulator = simulator
         self.mode = mode
         self._size = whole_number("width", width, 1), whole_number("height", height, 1)

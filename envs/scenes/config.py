@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from viapoint.envs.common.validation import check_increasing_pair
+from viapoint.envs.common.validation import check_increasing_pair, fewest_and_most
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.scenes.families import MOST_DRAWN, MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
@@ -58,7 +57,8 @@ class SceneDistribution:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
+        number = fewest_and_most("n_obstacles", self.n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        object.__setattr__(self, "n_obstacles", number)
         check_shapes(self.shapes, self.dimension)
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
@@ -92,7 +92,8 @@ class SpaceDistribution(SpatialSizes):
 
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
+        number = fewest_and_most("n_obstacles", self.n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        object.__setattr__(self, "n_obstacles", number)
         check_shapes(self.shapes, self.dimension)
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:
@@ -129,16 +130,3 @@ class SpaceDistribution(SpatialSizes):
             name for name, family in families if family.trained and set(family.shapes) <= set(shapes)
         )
         return {"shapes": shapes, "families": TRAINED + others}
-
-
-def check_count(pair: Sequence[int], name: str, limit: int, fewest_limit: int | None = None) -> None:
-    """Check a pair of fewest and most.
-
-    Raises:
-        ValueError: The numbers are out of range.
-    """
-    fewest, most = pair
-    least = limit if fewest_limit is None else fewest_limit
-    if not 0 <= fewest <= most <= limit or fewest > least:
-        also = f" and fewest <= {least}" if least < limit else ""
-        raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}{also}, got {pair}")

@@ -1,5 +1,7 @@
 """Laws of drawn scenes, of those about a feasible path and of uniform ones, and of given scenes."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,8 +15,7 @@ from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.draws import Uniforms
 from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
 from viapoint.envs.scenes.scene import TARGETS, check_scenes, rest_clearance, rows_of_lights
-from viapoint.envs.scenes.uniform import UniformScenes
-from viapoint.envs.single_env import ReachVectorEnv
+from viapoint.envs.vector_env import ReachVectorEnv
 
 NUMBER = 96
 HAND, WHOLE_ARM, SPACE = (
@@ -164,11 +165,12 @@ def test_ends_and_obstacles_of_uniform_scenes_are_anywhere_in_the_workspace(env)
 
 
 def test_an_attempt_at_a_uniform_scene_takes_the_numbers_it_says(env):
-    uniform = UniformScenes(env.task.collision_model, env.task.scenes)
+    capsules = dataclasses.replace(env.task.scenes, shapes=CAPSULES)
+    uniform = UniformSampler(env.task.collision_model, capsules)
     numbers = np.random.default_rng(0).random((40, uniform.size))
-    uniform(Uniforms(numbers), None)
+    uniform.attempt(Uniforms(numbers), None)
     with pytest.raises(ValueError):
-        uniform(Uniforms(numbers[:, 1:]), None)
+        uniform.attempt(Uniforms(numbers[:, 1:]), None)
 
 
 def test_uniform_scenes_may_have_no_obstacles():
