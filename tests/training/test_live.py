@@ -25,7 +25,7 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import load_agent
 from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
-from viapoint.training.live import drawing, movements, obstacle_editing, playback
+from viapoint.training.live import drawing, movements, obstacle_editing
 from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
 from viapoint.training.live.scene_draws import benchmark_problems, scene_kinds
@@ -334,10 +334,7 @@ def test_what_cannot_be_served_is_refused(capsys, tmp_path):
             assert end.value.code == 2
             (line,) = capsys.readouterr().err.splitlines()
             assert named in line
-    for call in (
-        lambda: LivePage(PLANAR, env=PANDA, port=0),
-        lambda: playback.Playback(None, None, None).film(iter(()), 1.0, print),
-    ):
+    for call in (lambda: LivePage(PLANAR, env=PANDA, port=0),):
         with pytest.raises(ValueError):
             call()
 
