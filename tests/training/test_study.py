@@ -1,7 +1,9 @@
 """Studies: what a file means, what is refused, and that a study which was killed or runs on two nodes ends alike."""
 
+import doctest
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +17,8 @@ import yaml
 from viapoint.training import Study, run_study
 from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
 from viapoint.training.study.tables import COLUMNS, markdown
+
+pytestmark = pytest.mark.xdist_group("ray")  # one worker, so that all tests share a Ray and a study
 
 ENV = "viapoint/PlanarObstacles-v0"
 FEW = {"learning_starts": 64, "gradient_steps": 1}
@@ -67,7 +71,7 @@ def whole(ray, tmp_path_factory):
 def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     folder, table, told, before = whole
     assert list(table.columns) == COLUMNS
-    assert len(told) == 6  # two agents with two seeds each, and two baselines
+    assert len(told) == 7  # how much there is to do; two agents with two seeds each, and two baselines
     rows = table.set_index("method")
     assert set(rows.index) == {"viaq", "sac", "straight", "stored"}
     assert rows.seeds.to_dict() == {"viaq": 2, "sac": 2, "straight": 1, "stored": 1}
@@ -84,7 +88,7 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     assert results_in(folder) == before
     more = {**GIVEN, "baselines": [*GIVEN["baselines"], "random"]}
     assert len(run_study(Study.from_dict(more), out=folder, told=lines.append)) == len(table) + 1
-    assert len(lines) == 1
+    assert len(lines) == 2
 
 
 def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
@@ -113,7 +117,7 @@ def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
     assert complete < 6
     lines = []
     run_study(Study.from_dict(GIVEN), out=folder, told=lines.append)
-    assert len(lines) == 6 - complete
+    assert len(lines) == 7 - complete
     assert results_in(folder) == whole[3]
 
 
@@ -174,6 +178,15 @@ def test_grids_and_checks_make_rows():
     assert config.hyperparameters == {"batch_size": 128}
     assert config.env_kwargs == {"n_via": 2}
     assert config.seed == 3
+
+
+def test_the_examples_of_the_page_and_of_the_function_run(ray):
+    page = Path(__file__).parents[2] / "docs" / "studies.md"
+    (example,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    exec(compile(example, page, "exec"), {})
+    finder = doctest.DocTestFinder(recurse=False)
+    for each in finder.find(run_study, "run_study", globs={}):
+        assert doctest.DocTestRunner().run(each).failed == 0
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
