@@ -290,7 +290,8 @@ def _environment(
     whole = [each for each in ENV_IDS if each not in STEP_TASKS]
     if env_id not in whole:
         raise ValueError(unknown_name("id", env_id, whole))
-    check_env_kwargs(env_kwargs or {})
+    kwargs = env_kwargs or {}
+    check_env_kwargs(kwargs)
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes, 1)
     # Models are selected on `validation`, so it is measured only where it is asked for.
@@ -308,9 +309,7 @@ def _environment(
         raise ValueError(
             f"no set among {', '.join(scenes or SETS)} is shipped for {env_id}; there are {', '.join(there)}"
         )
-    return Environment(
-        name=name, id=env_id, env_kwargs=env_kwargs or {}, scenes=tuple(places), n_scenes=n_scenes
-    )
+    return Environment(name=name, id=env_id, env_kwargs=kwargs, scenes=tuple(places), n_scenes=n_scenes)
 
 
 def _agent(

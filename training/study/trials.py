@@ -1,8 +1,4 @@
-"""Trials of a study: what one worker trains and measures.
-
-OUT/<environment>/<row>/seed-<n>/               run folder of a training
-OUT/<environment>/<row>/seed-<n>/result.json    measurements of a trial, written when it is complete
-"""
+"""Trials of a study: what one worker trains and measures, and the record that it leaves in `result.json`."""
 
 from __future__ import annotations
 
