@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-PATIENCE = 40.0
+PATIENCE = 90.0
 """Time limit of an answer of the browser, [s]."""
 SIZE = 1280, 800
 """Width and height of the window, [pixels]."""
