@@ -36,3 +36,8 @@ def no_hang():
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+def pytest_collection_modifyitems(items):
+    """Run the longest group of tests first, so that no worker waits for it at the end."""
+    items.sort(key=lambda item: [mark.args for mark in item.iter_markers("xdist_group")] != [("ray",)])
