@@ -21,7 +21,7 @@ demo: $(READY)   ## train, evaluate, draw and film an agent
 	@$(BIN)/viapoint demo --out $(RUN)
 
 test: $(READY)   ## the whole test suite
-	@$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup --quiet
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder --quiet
 
 check: $(READY)  ## format, lint, strict types and docstrings
 	@$(BIN)/ruff format --check .

@@ -21,6 +21,7 @@ MAY_IMPORT = {
         "array_api_compat",
         "gymnasium",
         "mujoco",
+        "numba",
         "scipy",
         "glfw",
         "viapoint.primitives",

@@ -15,10 +15,7 @@ from viser import transforms
 from viapoint.training.live.page import LivePage
 from viapoint.training.live.scene_file import LiveScene, to_json
 
-pytestmark = [
-    pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine"),
-    pytest.mark.xdist_group("browser"),  # two browsers at once are slow
-]
+pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
 PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v0"
 MESSAGE = "#viapoint-message"
