@@ -24,6 +24,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ._hermite_tables import coefficient_table, stiffness_table
+from ._weighted_solver import rounding_slack, weighted_coefficients
 from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
 
 Entry: TypeAlias = Any
@@ -34,6 +35,12 @@ States: TypeAlias = list[list[Any]]
 
 Nodes: TypeAlias = dict[tuple[int, int], int]
 """Row of each unknown states[k][i] in Eq. 1, by (k, i)."""
+
+_DIGITS = 0.2
+"""Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations.
+
+Their relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
+"""
 
 _SHORT, _LONG = 1e-3, 1e3
 """Durations [s] between which no power of them over- or underflows, even in single precision."""
@@ -146,14 +153,55 @@ def least_cost_coefficients(
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
 
-    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
-
     Args:
         xp: namespace.
         order: m.
         waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S), positive; may be shared by the batch [s].
+        durations: (..., S); may be shared by the batch. 0 is allowed between waypoints that are equal within
+            rounding; the via-points after such segments are dropped [s].
         states: per knot, its derivatives (see States).
+    """
+    segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
+    if segments == 1 or not _is_extreme(to_numpy(durations), eps).any():
+        return _banded_coefficients(xp, order, waypoints, durations, states)
+    *batch, knots, dimension = waypoints.shape
+    count = int(np.prod(batch, dtype=int))
+    if not count:
+        return like(xp, np.zeros((*batch, 2 * order, segments, dimension)), waypoints)
+    flat_points = xp.reshape(waypoints, (count, knots, dimension))
+    flat_durations = xp.reshape(broadcast_to(xp, durations, (*batch, segments)), (count, segments))
+    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
+    numbers = to_numpy(flat_durations)
+    empty = numbers <= 0
+    positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
+    kinds = np.column_stack([empty, _is_extreme(positive, eps)])
+
+    def index(rows: Any) -> Any:
+        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
+
+    parts, members = [], []
+    for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
+        where = np.flatnonzero((kinds == kind).all(axis=1))
+        rows = index(where)
+        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
+        group = (flat_points[rows], flat_durations[rows], chosen)
+        parts.append(_connect_kind(xp, order, *group, empty=kind[:-1], extreme=bool(kind[-1])))
+        members.append(where)
+    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
+    return xp.reshape(joined, (*batch, *joined.shape[1:]))
+
+
+def _is_extreme(durations: Any, eps: float) -> Any:
+    """Return (...,) True where the normal equations lose digits at durations (..., S), or a segment is empty."""
+    return durations.min(axis=-1) <= eps**_DIGITS * durations.max(axis=-1)
+
+
+def _banded_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (..., 2m, S, D) by the normal equations.
+
+    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
     """
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
         scale = unit_factors(xp, durations)
@@ -166,6 +214,24 @@ def least_cost_coefficients(
             scaled.append(row)
         durations, states = durations * scale, scaled
     return _coefficients(xp, order, waypoints, durations, states)
+
+
+def _weighted_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
+    dtype = waypoints.dtype
+    slack = like(xp, rounding_slack(to_numpy(waypoints).astype(np.float64)), durations)
+    given = [waypoints, durations, slack]
+    double = [
+        [xp.astype(value, xp.float64) if is_given(value) else value for value in row]
+        for row in [given, *states]
+    ]
+    (waypoints, durations, slack), *states = double
+    total = xp.sum(durations, axis=-1)
+    for _ in range(2 * order - 1):
+        slack = slack * total
+    return xp.astype(weighted_coefficients(xp, order, waypoints, durations, states, slack), dtype)
 
 
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
@@ -198,36 +264,6 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def coefficients_with_empty(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
-) -> Array:
-    """Return least-cost coefficients where durations, with the full batch shape, may be 0 between equal waypoints.
-
-    The via-points after empty segments are dropped, movement by movement.
-    """
-    *batch, knots, dimension = waypoints.shape
-    count = int(np.prod(batch, dtype=int))
-    if not count:
-        return like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
-    flat_points = xp.reshape(waypoints, (count, knots, dimension))
-    flat_durations = xp.reshape(durations, (count, knots - 1))
-    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
-    empty = to_numpy(flat_durations) <= 0
-
-    def index(rows: Any) -> Any:
-        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
-
-    parts, members = [], []
-    for pattern in np.unique(empty, axis=0):  # movements with the same empty segments are solved together
-        where = np.flatnonzero((empty == pattern).all(axis=1))
-        rows = index(where)
-        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
-        parts.append(_connect_pattern(xp, order, flat_points[rows], flat_durations[rows], chosen, pattern))
-        members.append(where)
-    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
-    return xp.reshape(joined, (*batch, *joined.shape[1:]))
-
-
 def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
     """Return a derivative with the batch in one axis, (N, D); None and FREE stay."""
     if not is_given(value):
@@ -235,8 +271,15 @@ def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
     return xp.reshape(broadcast_to(xp, value, (*batch, value.shape[-1])), (-1, value.shape[-1]))
 
 
-def _connect_pattern(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, empty: Any
+def _connect_kind(
+    xp: Namespace,
+    order: int,
+    waypoints: Array,
+    durations: Array,
+    states: States,
+    *,
+    empty: Any,
+    extreme: bool,
 ) -> Array:
     """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
     full = np.flatnonzero(~empty).tolist()
@@ -245,7 +288,10 @@ def _connect_pattern(
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
-    solved = least_cost_coefficients(xp, order, points, lengths, chosen)
+    solve = _weighted_coefficients if extreme else _banded_coefficients
+    solved = solve(xp, order, points, lengths, chosen)
+    if len(full) == len(empty):
+        return solved
     zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
     columns = []
     for s, is_empty in enumerate(empty):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ._boundary import check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
 from .array_api import (
     Array,
@@ -14,8 +16,12 @@ from .array_api import (
     broadcast_to,
     leading_shape,
     require,
+    to_numpy,
 )
 from .trajectory import Trajectory, connect
+
+_EQUAL = 64.0
+"""Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate."""
 
 
 def point_to_point(
@@ -144,9 +150,14 @@ def _check_durations(xp: Namespace, waypoints: Array, durations: Array) -> None:
     require(durations >= 0, "durations", durations, "must not be negative")
     total = xp.sum(durations, axis=-1)
     require(xp.any(positive, axis=-1), "durations", total, "must not all be 0; their sum")
-    still = (waypoints[..., 1:, :] == waypoints[..., :-1, :]).all(axis=-1)
-    full = broadcast_to(xp, durations, tuple(still.shape))
-    require((full > 0) | still, "durations", full, "may be 0 only between equal waypoints")
+    points = to_numpy(waypoints).astype(np.float64)
+    points = points.reshape(-1, *points.shape[-2:])
+    rounding = _EQUAL * float(xp.finfo(waypoints.dtype).eps) * np.abs(points).max(axis=(1, 2))
+    still = np.abs(np.diff(points, axis=1)).max(axis=-1) <= rounding[:, None]
+    full = np.broadcast_to(to_numpy(durations), (*waypoints.shape[:-2], durations.shape[-1]))
+    require(
+        (full > 0) | still.reshape(full.shape), "durations", full, "may be 0 only between equal waypoints"
+    )
 
 
 def minimum_jerk_coefficients(

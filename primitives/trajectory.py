@@ -12,7 +12,7 @@ import numpy as np
 from ._evaluate import derivative_coefficients, evaluate
 from ._extrema import Extrema, Pieces, axis_extrema, largest_norm
 from ._hermite_tables import energy_table
-from ._knot_solver import States, coefficients_with_empty, least_cost_coefficients
+from ._knot_solver import States, least_cost_coefficients
 from .array_api import (
     Array,
     Namespace,
@@ -349,6 +349,5 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     some_empty = bool((durations <= 0).any())
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
-    solve = coefficients_with_empty if some_empty else least_cost_coefficients
-    coefficients = solve(xp, order, waypoints, durations, states)
+    coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
     return Trajectory.from_segments(coefficients, durations, xp, some_empty=some_empty)
