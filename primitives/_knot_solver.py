@@ -16,7 +16,6 @@ durations. So an item of a batch gives the same bits as alone, which LAPACK does
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate, product, repeat
 from operator import mul
 from typing import Any, TypeAlias
@@ -42,76 +41,46 @@ _DIGITS = 0.2
 Their relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
 """
 
+_MISS = 1e-10
+"""Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent."""
+
 _SHORT, _LONG = 1e-3, 1e3
 """Durations [s] between which no power of them over- or underflows, even in single precision."""
 
 
-@dataclass(frozen=True)
-class BandedFactor:
-    """L D L^T factorisation of a symmetric positive definite matrix, stored as sparse rows."""
-
-    pivots: list[Entry]
-    upper: list[dict[int, Entry]]
-    multipliers: list[dict[int, Entry]]
-
-    def solve(self, right: Sequence[Array]) -> list[Array]:
-        """Solve for one array per row; the entries broadcast against them."""
-        work = list(right)
-        for p, multipliers in enumerate(self.multipliers):
-            for q, multiplier in multipliers.items():
-                work[q] = work[q] - multiplier * work[p]
-        for p in reversed(range(len(work))):
-            for q, entry in self.upper[p].items():
-                work[p] = work[p] - entry * work[q]
-            work[p] = work[p] / self.pivots[p]
-        return work
-
-
-def _factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
-    """Eliminate without pivoting (stable for positive definite A); upper[p][q], q >= p, is consumed."""
-    multipliers: list[dict[int, Entry]] = []
-    pivots: list[Entry] = []
-    for p, row in enumerate(upper):
-        pivot = row.pop(p)
-        pivots.append(pivot)
-        factors = {}
-        for q, divided in row.items():
-            factors[q] = factor = divided / pivot
-            for r, entry in row.items():
-                if r >= q:
-                    below = upper[q].get(r)
-                    upper[q][r] = -(factor * entry) if below is None else below - factor * entry
-        multipliers.append(factors)
-    return BandedFactor(pivots, upper, multipliers)
-
-
-def solve_states(
-    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States
-) -> tuple[States, Nodes, BandedFactor]:
-    """Compute the FREE derivatives at the knots.
+def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
+    """Return the states with every FREE derivative computed.
 
     Args:
         order: m.
         durations: per segment, shapes that broadcast against the steps [s].
         steps: per segment, the difference of its two points [m].
         states: per knot, its m - 1 derivatives (see States).
-
-    Returns:
-        The states with every FREE replaced, the rows of the unknowns, and the factorisation of A.
     """
     nodes: Nodes = {}
     for k, state in enumerate(states):
         for i, value in enumerate(state):
             if value is FREE:
                 nodes[k, i] = len(nodes)
-    if not nodes:
-        return states, {}, BandedFactor([], [], [])
-    upper, right = _assemble(order, durations, steps, states, nodes)
-    factor = _factorise(upper)
+    upper, values = _assemble(order, durations, steps, states, nodes)
+    # Elimination without pivoting is stable, as A is positive definite.
+    for p, row in enumerate(upper):
+        pivot = row[p]
+        for q in [q for q in row if q > p]:
+            factor = row[q] / pivot
+            values[q] = values[q] - factor * values[p]
+            for r in [r for r in row if r >= q]:
+                entry = factor * row[r]
+                upper[q][r] = upper[q][r] - entry if r in upper[q] else -entry
+    for p in reversed(range(len(values))):
+        for q, entry in upper[p].items():
+            if q > p:
+                values[p] = values[p] - entry * values[q]
+        values[p] = values[p] / upper[p][p]
     solved = list(map(list, states))
-    for (k, i), value in zip(nodes, factor.solve(right), strict=True):
+    for (k, i), value in zip(nodes, values, strict=True):
         solved[k][i] = value
-    return solved, nodes, factor
+    return solved
 
 
 def _assemble(
@@ -162,7 +131,7 @@ def least_cost_coefficients(
         states: per knot, its derivatives (see States).
     """
     segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
-    if segments == 1 or not _is_extreme(to_numpy(durations), eps).any():
+    if not _is_extreme(to_numpy(durations), eps).any():
         return _banded_coefficients(xp, order, waypoints, durations, states)
     *batch, knots, dimension = waypoints.shape
     count = int(np.prod(batch, dtype=int))
@@ -231,7 +200,16 @@ def _weighted_coefficients(
     total = xp.sum(durations, axis=-1)
     for _ in range(2 * order - 1):
         slack = slack * total
-    return xp.astype(weighted_coefficients(xp, order, waypoints, durations, states, slack), dtype)
+    coefficients = weighted_coefficients(xp, order, waypoints, durations, states, slack)
+    # The tolerance is for rounding: where times force a movement to miss more than that, it must not.
+    points = to_numpy(waypoints)
+    missed = np.abs(to_numpy(xp.sum(coefficients, axis=1)) - points[:, 1:]).max(axis=(1, 2))
+    fits = missed <= _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
+    if not fits.all():
+        coefficients = weighted_coefficients(
+            xp, order, waypoints, durations, states, slack * like(xp, 1.0 * fits, slack)
+        )
+    return xp.astype(coefficients, dtype)
 
 
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
@@ -243,7 +221,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
         lengths = durations.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
     else:
         lengths = [durations[..., s : s + 1] for s in range(segments)]
-    states = solve_states(order, lengths, pieces, states)[0]
+    states = _solve_states(order, lengths, pieces, states)
     rest = 0.0 * pieces[0]
     # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
     first, last = [waypoints[..., :-1, :]], [steps]
@@ -286,6 +264,10 @@ def _connect_kind(
     # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
     kept = [0, *(s + 1 for s in full)]
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
+    if not full:
+        return xp.concat(
+            [waypoints[..., None, :-1, :], *[0.0 * waypoints[..., None, :-1, :]] * (2 * order - 1)], axis=-3
+        )
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
     solve = _weighted_coefficients if extreme else _banded_coefficients

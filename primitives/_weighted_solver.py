@@ -46,7 +46,7 @@ Entry: TypeAlias = Any
 Column: TypeAlias = tuple[int, int]
 """Unknown states[k][i], by (k, i)."""
 
-_ROUNDING = 32.0 * 2.0**-52
+_ROUNDING = 64.0 * 2.0**-52
 """Tolerance of waypoints, relative to their greatest coordinate."""
 
 _FASTEST = 100.0

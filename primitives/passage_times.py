@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ._boundary import chosen_items, read_arguments, unit_time_ends, waypoint_shapes
+from ._boundary import check_durations, chosen_items, read_arguments, unit_time_ends, waypoint_shapes
 from ._passage.cost import PassageCost
 from ._passage.moving_ends import fractions_moving
 from ._passage.newton import attach_gradient, fractions_by_newton
@@ -25,7 +25,6 @@ from .array_api import (
     is_given,
     like,
     ordered_sum,
-    require,
     to_numpy,
 )
 from .trajectory import connect
@@ -73,7 +72,8 @@ def passage_durations(
         `through` then drops it.
 
     Raises:
-        ValueError: an argument is not finite or has a wrong shape, or duration <= 0.
+        ValueError: an argument is not finite or has a wrong shape, or duration <= 0 (0 is allowed for a movement
+            from rest to rest through equal waypoints).
 
     Warns:
         RuntimeWarning: the iteration did not converge for some movements (K >= 2, knots about to merge);
@@ -90,7 +90,8 @@ def passage_durations(
         duration=duration,
     )
     batch = broadcast_batch(**waypoint_shapes(waypoints, ends), duration=tuple(duration.shape))
-    require(duration > 0, "duration", duration, "must be positive")
+    waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
+    check_durations("duration", duration[..., None], waypoints, ends)
     flat_ends = dict(ends)
     for name, value in ends.items():
         if is_given(value):
@@ -108,7 +109,7 @@ def passage_durations(
     given = [
         value if value is None or value is FREE else xp.astype(value, xp.float64) for value in ends.values()
     ]
-    waypoints = broadcast_to(xp, xp.astype(waypoints, xp.float64), (*batch, *waypoints.shape[-2:]))
+    waypoints = xp.astype(waypoints, xp.float64)
     time = xp.astype(duration, xp.float64)
     moving = unit_time_ends(dict(zip(ends, given, strict=True)), time)
     fractions = attach_gradient(like(xp, numbers, waypoints), waypoints, moving, cost, xp)

@@ -17,9 +17,8 @@ has the value z* and the derivative dz/dp = -H^-1 dg/dp. So no iteration is unro
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -28,24 +27,31 @@ from ..trajectory import connect
 from .cost import PassageCost, duration_gradient
 from .rest_to_rest import attach_root_gradient, nearer_fraction
 
-Evaluate: TypeAlias = Callable[[Floats, Any], tuple[Floats, Floats, Floats]]
-"""(z (n, M), items (M,)) -> value (M,), gradient (n, M), Hessian (n, n, M) of the problems `items` at z."""
-
 _STARTS = 10
 """Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution."""
+
+_MOST_SEGMENTS = 16
+"""Number of segments up to which several starts are tried."""
 
 _LARGEST = 1e3
 """Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient."""
 
-_DIFFERENCE = 1e-8
-"""Step of the log-durations for difference quotients of the gradient."""
+_DIFFERENCE, _WIDE_DIFFERENCE = 1e-8, 1e-6
+"""Steps of the log-durations for one-sided and for central difference quotients of the gradient."""
 
 _LONGEST_STEP = 1.5
 _NOISE = 1e-13
+"""Relative error of a cost."""
+
 _CONVERGED_STEP = 1e-8
-_SMALL_GAIN = 1e-8
-_LARGE_STEP = 1e-2
+"""Newton step that is the last: by quadratic convergence its successor would be of the order of its square."""
+
+_SMALL_GAIN, _LARGE_STEP = 1e-8, 1e-2
+"""Gain of the logarithm of the cost that counts as none, if rounding forbids it or only a large step would make it."""
+
 _REACHED = 1e-6
+"""Distance from a lower bound of the logarithm of the cost that is close enough."""
+
 _ITERATIONS = 80
 _HALVINGS = 12
 
@@ -71,9 +77,9 @@ def fractions_by_newton(
         several: True for several starts.
     """
     first, *others = _starts(cost, guess, several)
-    best = _minimise_cost(cost, first)
+    best = _minimise(cost, first)
     for start in others:
-        found = _minimise_cost(cost, start)
+        found = _minimise(cost, start)
         # A later start must be better by more than rounding, or noise would decide ties.
         better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
         pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
@@ -88,7 +94,7 @@ def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
     chord = np.sqrt(ordered_sum(cost.steps * cost.steps, 1))
     # A movement from rest covers the cube of the time; a smooth path is followed like a straight one.
     starts = [_lowest(cost, [np.cbrt(chord), _straight_durations(chord), guess])]
-    if several:
+    if several and segments <= _MOST_SEGMENTS:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
         starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
@@ -105,7 +111,8 @@ def _straight_durations(chord: Floats) -> Floats:
     times = np.where(covered <= left, time, 1.0 - time)
     durations = np.diff(times, axis=0, prepend=0.0, append=1.0)
     # No segment is passed faster than at the peak speed 15/8: a very short one keeps a positive duration.
-    return np.maximum(durations, chord / (1.875 * total))
+    positive: Floats = np.maximum(durations, chord / (1.875 * total))
+    return positive
 
 
 def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
@@ -117,34 +124,30 @@ def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
     return chosen
 
 
-def _minimise_cost(cost: PassageCost, start: Floats) -> Minima:
-    """Minimise log(J + reference) from durations (S, N)."""
-    reference = cost.reference()
-
-    def evaluate(z: Floats, items: Any) -> tuple[Floats, Floats, Floats]:
-        return log_cost(cost.chosen(items), z, reference[items])
-
-    return _minimise(evaluate, np.log(start))
-
-
 def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
     """Return log(J + reference), its gradient and its Hessian with respect to z.
 
-    The Hessian consists of difference quotients of the gradient, all computed at once. The cost does not change if
-    all z shift: that gives the last row, and 1 1^T, which makes the Hessian regular, changes no step.
+    The Hessian consists of difference quotients of the gradient, all computed at once, central ones for many
+    segments, which make it ill conditioned. The cost does not change if all z shift: that gives the last row, and
+    1 1^T, which makes the Hessian regular, changes no step.
     """
     size, count = z.shape
-    shifted = np.repeat(z[:, None], size, axis=1)
-    for i in range(1, size):
-        shifted[i - 1, i] += _DIFFERENCE
-    h = _softmax(shifted.reshape(size, -1))
-    items = np.tile(np.arange(count), size)
+    upper, lower = (_DIFFERENCE, 0.0) if size <= _MOST_SEGMENTS else (_WIDE_DIFFERENCE, -_WIDE_DIFFERENCE)
+    columns = [z]
+    for shift in (upper, lower):
+        for i in range(size - 1 if shift else 0):
+            moved = z.copy()
+            moved[i] += shift
+            columns.append(moved)
+    h = _softmax(np.concatenate(columns, axis=1))
+    items = np.tile(np.arange(count), len(columns))
     j, first = cost.chosen(items).derivatives(h)
     scale = 1.0 / (j + reference[items])
-    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, size, count)
-    gradient = gradients[:, 0]
+    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, len(columns), count)
+    gradient, above = gradients[:, 0], gradients[:, 1:size]
+    below = gradients[:, size:] if lower else gradient[:, None]
     hessian = np.empty((size, size, count))
-    hessian[:-1] = ((gradients[:, 1:] - gradient[:, None]) / _DIFFERENCE).swapaxes(0, 1)
+    hessian[:-1] = ((above - below) / (upper - lower)).swapaxes(0, 1)
     hessian[-1] = -ordered_sum(hessian[:-1])
     value: Floats = np.log(j[:count] + reference)
     return value, gradient, 0.5 * (hessian + hessian.swapaxes(0, 1)) + 1.0
@@ -157,15 +160,11 @@ def _softmax(z: Floats) -> Floats:
     return shares
 
 
-def _minimise(evaluate: Evaluate, z: Floats) -> Minima:
-    """Return local minima from the starts z (n, N).
-
-    A Newton step shorter than 1e-8 is the last one: by quadratic convergence its successor would be of the
-    order of its square. Where the cost is flat, because waypoints are equal within their tolerance, no step counts.
-    """
-    z = z.copy()
+def _minimise(cost: PassageCost, start: Floats) -> Minima:
+    """Return local minima of log(J + reference) from durations (S, N)."""
+    z, reference = np.log(start), cost.reference()
     active = np.arange(z.shape[1])
-    value, gradient, hessian = evaluate(z, active)
+    value, gradient, hessian = log_cost(cost, z, reference)
     converged = np.zeros(z.shape[1], dtype=bool)
     result = value.copy()
     for _ in range(_ITERATIONS):
@@ -173,25 +172,32 @@ def _minimise(evaluate: Evaluate, z: Floats) -> Minima:
         size, gain = np.abs(step).max(axis=0), -ordered_sum(gradient * step)
         last = size < _CONVERGED_STEP
         z[:, active[last]] += step[:, last]
-        flat = (gain < _SMALL_GAIN) & (size > _LARGE_STEP)
-        converged[active[last | flat]] = True
-        keep = ~(last | flat)
-        active, step, gain = active[keep], step[:, keep], gain[keep]
+        # Where waypoints are equal within their tolerance the cost is flat: no step counts.
+        done = last | ((gain < _SMALL_GAIN) & (size > _LARGE_STEP))
+        converged[active[done]] = True
+        active, step, gain = active[~done], step[:, ~done], gain[~done]
         if not active.size:
             break
-        state = value[keep], gradient[:, keep], hessian[:, :, keep]
-        before = z[:, active]
-        z[:, active], value, gradient, hessian = _search(evaluate, before, active, step, *state)
-        result[active] = value
-        # A step that rounding forbids is the last one, too.
-        stays = (z[:, active] == before).all(axis=0)
+        state = value[~done], gradient[:, ~done], hessian[..., ~done]
+        moved, value, gradient, hessian = _search(
+            cost.chosen(active), reference[active], z[:, active], step, *state
+        )
+        stays = (moved == z[:, active]).all(axis=0)
+        z[:, active], result[active] = moved, value
         converged[active[stays & (gain < _SMALL_GAIN)]] = True
-        active, value, gradient, hessian = (part[..., ~stays] for part in (active, value, gradient, hessian))
+        active, value = active[~stays], value[~stays]
+        gradient, hessian = gradient[:, ~stays], hessian[..., ~stays]
     return Minima(z, result, converged)
 
 
 def _search(
-    evaluate: Evaluate, z: Floats, items: Any, step: Floats, value: Floats, gradient: Floats, hessian: Floats
+    cost: PassageCost,
+    reference: Floats,
+    z: Floats,
+    step: Floats,
+    value: Floats,
+    gradient: Floats,
+    hessian: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return z after a backtracking line search, with value, gradient and Hessian there.
 
@@ -199,17 +205,18 @@ def _search(
     whose value cannot fall any more stays where it is.
     """
     slope = ordered_sum(gradient * step)
+    origin, first = z, value
     z, value, gradient, hessian = z.copy(), value.copy(), gradient.copy(), hessian.copy()
-    waiting = np.arange(len(items))
+    waiting = np.arange(z.shape[1])
     length = 1.0
-    origin, first = z.copy(), value.copy()
     for _ in range(_HALVINGS):
         trial = origin[:, waiting] + length * step[:, waiting]
-        new_value, new_gradient, new_hessian = evaluate(trial, items[waiting])
-        falls = new_value <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
+        found = log_cost(cost.chosen(waiting), trial, reference[waiting])
+        falls = found[0] <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
         accepted = waiting[falls]
-        z[:, accepted], value[accepted] = trial[:, falls], new_value[falls]
-        gradient[:, accepted], hessian[:, :, accepted] = new_gradient[:, falls], new_hessian[:, :, falls]
+        z[:, accepted] = trial[:, falls]
+        for kept, new in zip((value, gradient, hessian), found, strict=True):
+            kept[..., accepted] = new[..., falls]
         waiting = waiting[~falls]
         if not waiting.size:
             break
@@ -243,7 +250,7 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
     pivots = work[range(size), range(size)]
     other = np.flatnonzero(~((pivots > 0).all(axis=0) & np.isfinite(solution).all(axis=(0, 1))))
     for item in other:
-        values, vectors = np.linalg.eigh(matrix[..., item])
+        values, vectors = np.linalg.eigh(np.nan_to_num(matrix[..., item]))
         size_of = np.abs(values)
         inverse = 1.0 / np.maximum(size_of, 1e-10 * size_of.max())
         solution[..., item] = vectors @ (inverse[:, None] * (vectors.T @ right[..., item]))

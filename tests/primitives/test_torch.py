@@ -20,7 +20,6 @@ from viapoint.primitives import (
     through,
 )
 
-
 torch.set_num_threads(1)
 
 
