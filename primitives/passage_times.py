@@ -76,8 +76,7 @@ def passage_durations(
             from rest to rest through equal waypoints).
 
     Warns:
-        RuntimeWarning: the iteration did not converge for some movements (K >= 2, knots about to merge);
-            their durations are the best found.
+        RuntimeWarning: the iteration did not converge for some movements; their durations are the best found.
 
     Example:
         >>> from viapoint.primitives import passage_durations
