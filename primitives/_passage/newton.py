@@ -89,11 +89,14 @@ def fractions_by_newton(
 
 
 def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
-    """Return durations to start from, each (S, N): the best of three guesses, and others."""
+    """Return durations to start from, each (S, N): the best of some guesses, and others."""
     segments, _, count = cost.steps.shape
     chord = np.sqrt(ordered_sum(cost.steps * cost.steps, 1))
     # A movement from rest covers the cube of the time; a smooth path is followed like a straight one.
-    starts = [_lowest(cost, [np.cbrt(chord), _straight_durations(chord), guess])]
+    guesses = [np.cbrt(chord), _straight_durations(chord)]
+    if not np.isnan(guess).all():
+        guesses.append(guess)
+    starts = [_lowest(cost, guesses)]
     if several and segments <= _MOST_SEGMENTS:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
