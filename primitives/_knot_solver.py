@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._hermite_tables import coefficient_table, stiffness_table
+from ._hermite_tables import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
 from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
 
@@ -41,8 +41,11 @@ _DIGITS = 0.2
 Their relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
 """
 
-_MISS = 1e-10
+_MISS = 1e-9
 """Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent."""
+
+_GAIN = 1e-8
+"""Least relative change of the cost for which the tolerance of waypoints counts."""
 
 _SHORT, _LONG = 1e-3, 1e3
 """Durations [s] between which no power of them over- or underflows, even in single precision."""
@@ -190,26 +193,36 @@ def _weighted_coefficients(
 ) -> Array:
     """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
     dtype = waypoints.dtype
-    slack = like(xp, rounding_slack(to_numpy(waypoints).astype(np.float64)), durations)
-    given = [waypoints, durations, slack]
-    double = [
-        [xp.astype(value, xp.float64) if is_given(value) else value for value in row]
-        for row in [given, *states]
-    ]
-    (waypoints, durations, slack), *states = double
+    given = [[waypoints, durations], *states]
+    double = [[xp.astype(value, xp.float64) if is_given(value) else value for value in row] for row in given]
+    (waypoints, durations), *states = double
     total = xp.sum(durations, axis=-1)
+    points, pace = to_numpy(waypoints), to_numpy(total)[:, None]
+    ends = []
+    for state in (states[0], states[-1]):
+        scaled = [to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)]
+        ends.append(scaled)
+    slack = like(xp, rounding_slack(points, ends), durations)
     for _ in range(2 * order - 1):
         slack = slack * total
-    coefficients = weighted_coefficients(xp, order, waypoints, durations, states, slack)
-    # The tolerance is for rounding: where times force a movement to miss more than that, it must not.
-    points = to_numpy(waypoints)
-    missed = np.abs(to_numpy(xp.sum(coefficients, axis=1)) - points[:, 1:]).max(axis=(1, 2))
-    fits = missed <= _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
-    if not fits.all():
-        coefficients = weighted_coefficients(
-            xp, order, waypoints, durations, states, slack * like(xp, 1.0 * fits, slack)
-        )
-    return xp.astype(coefficients, dtype)
+    soft = weighted_coefficients(xp, order, waypoints, durations, states, slack)
+    exact = weighted_coefficients(xp, order, waypoints, durations, states, 0.0 * slack)
+    # The tolerance is for rounding alone: it must lower the cost, and no waypoint may be missed by more.
+    lengths = to_numpy(durations / total[:, None])
+    costs = _costs(order, exact, lengths), _costs(order, soft, lengths)
+    steps = to_numpy(soft)[:, 1:].sum(axis=1)
+    missed = np.abs(steps - np.diff(points, axis=1)).max(axis=(1, 2))
+    far = missed > _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
+    better = far | (costs[0] <= (1.0 + _GAIN) * costs[1])
+    chosen = like(xp, 1.0 * better, slack)[:, None, None, None]
+    return xp.astype(xp.where(chosen > 0, exact, soft), dtype)
+
+
+def _costs(order: int, coefficients: Array, lengths: Any) -> Any:
+    """Return (N,) the costs of movements with durations (N, S)."""
+    table = np.array(energy_table(order, order))
+    modes = np.einsum("ik,nksd->nisd", table, to_numpy(coefficients)[:, order:])
+    return ((modes * modes).sum(axis=(1, 3)) / lengths ** (2 * order - 1)).sum(axis=-1)
 
 
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:

@@ -31,6 +31,7 @@ which changes nothing where durations are not extremely short.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 from typing import Any, TypeAlias
@@ -48,6 +49,9 @@ Column: TypeAlias = tuple[int, int]
 
 _ROUNDING = 64.0 * 2.0**-52
 """Tolerance of waypoints, relative to their greatest coordinate."""
+
+_REACHES = (0.5, 0.1, 0.02)
+"""Distances that cost about as much as a velocity, an acceleration and a jerk of 1 at an end, in unit time."""
 
 _FASTEST = 100.0
 """Mean velocity of a segment, relative to the speed on the whole path, above which it tells nothing."""
@@ -86,11 +90,15 @@ class _Rotation:
         self.second.residual = self.c * first + self.share * second
 
 
-def rounding_slack(points: Any) -> Any:
-    """Return the slack (N,) of waypoints (N, S + 1, D) in unit time."""
-    extent = np.abs(points - points[:, :1]).max(axis=(1, 2))
+def rounding_slack(points: Any, ends: Sequence[Sequence[Any]]) -> Any:
+    """Return the slack (N,) of waypoints (N, S + 1, D) with the derivatives (N, D) at both ends, in unit time."""
+    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
+    for end in ends:
+        for value, reach in zip(end, _REACHES, strict=False):
+            if isinstance(value, np.ndarray):
+                size = np.maximum(size, reach * np.abs(value).max(axis=1))
     tolerance = _ROUNDING * np.abs(points).max(axis=(1, 2))
-    return np.minimum(tolerance / np.where(extent > 0, extent, np.inf), _LARGEST_SLACK) ** 2
+    return np.minimum(tolerance / np.where(size > 0, size, np.inf), _LARGEST_SLACK) ** 2
 
 
 def mode_weights(order: int, length: Entry, slack: Entry) -> list[Entry]:

@@ -104,7 +104,7 @@ def passage_durations(
     numbers = numbers.reshape(*batch, waypoints.shape[-2] - 1)
     if xp is np or not follows_gradient(waypoints, duration, *ends.values()):
         return like(xp, numbers, waypoints) * duration[..., None]
-    cost = PassageCost.from_points(points, unit_ends, rounding_slack(points))
+    cost = PassageCost.from_points(points, unit_ends, rounding_slack(points, (unit_ends[:2], unit_ends[2:])))
     given = [
         value if value is None or value is FREE else xp.astype(value, xp.float64) for value in ends.values()
     ]
@@ -172,7 +172,7 @@ def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     if knots == 2:
         return np.ones((count, 1))
     points, ends = _scaled(points, ends)
-    slack = rounding_slack(points)
+    slack = rounding_slack(points, (ends[:2], ends[2:]))
     if knots == 3:
         return fractions_moving(points, ends, slack) if moving else fractions_at_rest(points)
     ends = ends if moving else [None] * 4

@@ -243,13 +243,14 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
     """
     size = len(matrix)
     work, solution = matrix.copy(), right.copy()
-    for j in range(size):
-        factor = work[j + 1 :, j] / work[j, j]
-        work[j + 1 :, j:] -= factor[:, None] * work[j, j:]
-        solution[j + 1 :] -= factor[:, None] * solution[j]
-    for j in reversed(range(size)):
-        solution[j] /= work[j, j]
-        solution[:j] -= work[:j, j, None] * solution[j]
+    with np.errstate(all="ignore"):
+        for j in range(size):
+            factor = work[j + 1 :, j] / work[j, j]
+            work[j + 1 :, j:] -= factor[:, None] * work[j, j:]
+            solution[j + 1 :] -= factor[:, None] * solution[j]
+        for j in reversed(range(size)):
+            solution[j] /= work[j, j]
+            solution[:j] -= work[:j, j, None] * solution[j]
     pivots = work[range(size), range(size)]
     other = np.flatnonzero(~((pivots > 0).all(axis=0) & np.isfinite(solution).all(axis=(0, 1))))
     for item in other:
