@@ -21,7 +21,7 @@ demo: $(READY)   ## train, evaluate, draw and film an agent
 	@$(BIN)/viapoint demo --out $(RUN)
 
 test: $(READY)   ## the whole test suite
-	@$(BIN)/python -m pytest --numprocesses 2 --quiet
+	@$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup --quiet
 
 check: $(READY)  ## format, lint, strict types and docstrings
 	@$(BIN)/ruff format --check .
@@ -43,7 +43,7 @@ versions: $(READY) ## the suite with the oldest versions that are allowed, in an
 	@$(BIN)/python benchmarks/versions.py oldest
 
 bench: $(READY)  ## throughput as ratios
-	@$(BIN)/viapoint bench
+	@$(BIN)/python benchmarks/throughput.py
 
 clean:           ## remove the virtual environment, caches and runs
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""Measure arms: agreement of clearance with contact in MuJoCo, gradients, and the clearance of an arm from itself.
+"""Measure arms: agreement of clearance with contact in MuJoCo, and the clearance of an arm from itself.
 
     OMP_NUM_THREADS=1 python benchmarks/arm_contacts.py --out docs/arm-contacts.json
 
@@ -10,7 +10,6 @@ Columns:
     contacts   poses in which MuJoCo reports contact: with the obstacle, the arm itself or the table
     wrong      poses whose contact differs from the sign of the clearance, if that is over 0.1 mm
     worst      greatest clearance of all poses whose contact differs from its sign, [mm]
-    gradient   greatest difference of the gradient by the joints from central differences, where it is unique, [m/rad]
     reach      least clearance of the arm from itself and the table within reach, [mm]
     touching   share of the positions within reach at which it is negative, [%]
     excess     greatest distance of a point of a fitted capsule from the geom that it covers, [mm]; 0 without such
@@ -29,14 +28,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from viapoint.envs import load_arm
 from viapoint.envs.arms import ADULT, PANDA, Arm
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.arms.serial_arm import SerialArm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.distance import arm_clearance
 from viapoint.envs.sim.simulator import Simulator
 
 BLOCK = 1000
@@ -45,8 +42,6 @@ NEAR = 0.005
 """Clearance within which half of the obstacles are, [m]."""
 CONTACT_TOLERANCE = 1e-4
 """Clearance below which contact may differ, [m]."""
-GRADIENT_POSES, STEP = 500, 1e-6
-"""Configurations whose gradients are compared, and step of the differences, [rad]."""
 REACH_POSITIONS = 1_000_000
 """Random positions of the hand, of which those within reach are checked."""
 ROOT = Path(__file__).parents[1]
@@ -122,32 +117,6 @@ def agreement(arm: Arm, number: int, generator: np.random.Generator) -> dict[str
     }
 
 
-def gradient_error(arm: Arm, generator: np.random.Generator) -> float:
-    """Return the greatest difference of gradients by the joints from central differences, [m/rad].
-
-    Where the two one-sided differences differ, another pair of bodies becomes the nearest one, and neither is unique.
-    """
-    joints, rows, _ = random_poses(arm, GRADIENT_POSES, generator)
-    at = torch.as_tensor(joints).requires_grad_()
-    obstacles, present = torch.as_tensor(rows), torch.ones(len(rows), 1, dtype=torch.bool)
-
-    def clearance(angles: Any) -> Any:
-        from_obstacle = arm_clearance(arm.links(angles)[:, None], arm.link_radii, obstacles, present)[:, 0]
-        return torch.minimum(from_obstacle, arm.self_clearance(angles))
-
-    (gradient,) = torch.autograd.grad(clearance(at).sum(), at)
-    worst = 0.0
-    for joint in range(joints.shape[1]):
-        step = torch.zeros_like(at)
-        step[:, joint] = STEP
-        with torch.no_grad():
-            before, here, after = (clearance(at + sign * step) for sign in (-1.0, 0.0, 1.0))
-        smooth = torch.abs(after - 2.0 * here + before) < 1e-4 * STEP
-        difference = torch.abs((after - before) / (2.0 * STEP) - gradient[:, joint])
-        worst = max(worst, float(difference[smooth].max()))
-    return worst
-
-
 def within_reach(arm: Arm, generator: np.random.Generator) -> dict[str, Any]:
     """Return the least clearance of an arm from itself within reach, and the share of positions with a negative one."""
     hand = generator.uniform(-1.0, 1.0, (REACH_POSITIONS, arm.dimension))
@@ -173,7 +142,7 @@ def main() -> None:
     for arm in arms():
         generator = np.random.default_rng(0)
         row = {"arm": arm.name, "capsules": len(arm.link_radii), **agreement(arm, options.poses, generator)}
-        row |= {"gradient": float(f"{gradient_error(arm, generator):.1e}"), **within_reach(arm, generator)}
+        row |= within_reach(arm, generator)
         if isinstance(arm, SerialArm):
             row["excess"] = round(1e3 * max(capsule.excess for capsule in arm.shape), 1)
         found.append(row)

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.registration import REPLANNING_TASKS, TASKS
-from viapoint.training.planners.baselines import SEARCHES
+from viapoint.training.planners.baselines import factory
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.search.geometry_search import GeometrySearch
@@ -84,7 +84,7 @@ def report(env_id: str, scenes: str, number: int, methods: list[str]) -> None:
     simulation = new_simulation(env_id, min(256, len(some.start)), threads=1)
     observation = simulation.observe(some)
     for name in methods:
-        method: Any = SEARCHES[name](simulation)
+        method: Any = factory(name, simulation.env_id)(simulation)
         result = simulation.play(method, some, method.decide(observation))
         jerk = np.median(result.info["jerk_ratio"][result.success]) if result.success.any() else np.nan
         decisions = result.info["decisions"].mean() if "decisions" in result.info else 1.0
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--scenes", default="validation")
     parser.add_argument("--number", type=int, default=200, help="greatest number of scenes of each task")
     parser.add_argument("--tasks", nargs="+", default=[*TASKS, *REPLANNING_TASKS])
-    parser.add_argument("--methods", nargs="+", default=list(SEARCHES))
+    parser.add_argument("--methods", nargs="+", default=["search16", "search64", "search512", "search4096"])
     arguments = parser.parse_args()
     heads = ("single", "batch", "refined", "all", "ratio", "solved", "jerk")
     print(f"{'task':25} {'method':10} {' '.join(f'{head:>8}' for head in heads)} {'decisions':>9}")

@@ -35,13 +35,13 @@ from typing import Any
 
 import coal
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from viapoint.envs import ConvexMesh
 from viapoint.envs.arm_import.capsule_fit import cover_points, cut_polytope
 from viapoint.envs.arms import PANDA
 from viapoint.envs.arms.serial_arm import LinkCapsule, serial_arm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.convex_mesh import hull_triangles
 from viapoint.envs.geometry.distance import point_distance_squared
 
 ASSETS = Path(__file__).parents[1] / "envs" / "assets"
@@ -271,7 +271,7 @@ def capsule_surface(rows: Float) -> Float:
 def mesh_surface(body: ConvexMesh) -> Float:
     """Return points on the surface of a convex mesh, shape (n, 3), [m]."""
     found = []
-    for a, b, c in body.vertices[hull_triangles(body.vertices)]:
+    for a, b, c in body.vertices[ConvexHull(body.vertices).simplices]:
         count = 1 + int(max(np.linalg.norm(b - a), np.linalg.norm(c - a)) / SPACING)
         u, v = np.meshgrid(*[np.linspace(0.0, 1.0, count + 1)] * 2)
         inside = u + v <= 1.0 + 1e-9
@@ -350,7 +350,7 @@ def convex(body: ConvexMesh) -> coal.ConvexBase:
     """Return a convex mesh for coal."""
     points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     points.extend(list(np.asarray(body.vertices)))
-    triangles.extend([coal.Triangle(*map(int, each)) for each in hull_triangles(body.vertices)])
+    triangles.extend([coal.Triangle(*map(int, each)) for each in ConvexHull(body.vertices).simplices])
     return coal.Convex(points, triangles)
 
 

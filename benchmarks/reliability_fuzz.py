@@ -15,6 +15,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded
 
 import argparse
+import ctypes
 import json
 import time
 from collections import Counter
@@ -24,7 +25,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from reliability_long import memory
 
 import viapoint.envs
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS, TASKS
@@ -34,6 +34,7 @@ DOCUMENTED = (ValueError, gym.error.ResetNeeded)
 """Exceptions that a call may raise."""
 PARTS = 10
 """Number of parts of each run; memory is measured after each."""
+MEGABYTE = 1 << 20
 ALLOWED = 8.0
 """Allowed growth of memory, [MB]."""
 TINY = float(np.finfo(np.float32).smallest_subnormal)
@@ -205,6 +206,13 @@ def fuzz_calls(env_id: str, number: int, seed: int = 0) -> Counter[str]:
             assert env.observation_space.contains(result[0])
     env.close()
     return found
+
+
+def memory() -> float:
+    """Return the resident memory of this process without free blocks of its allocator, [MB]."""
+    getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)(0)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / MEGABYTE
 
 
 def run_in_parts(fuzz: Callable[..., Counter[str]], env_id: str, number: int) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """Gymnasium environments whose actions are via-points and durations; importing this package registers them.
 
-:data:`ENV_IDS` lists the ids. Other names are imported when they are first used.
+:data:`ENV_IDS` lists the ids. Other names are imported when they are first used: the import of all would take twice as
+long.
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
 from viapoint.envs.common import mujoco_check as mujoco_check
 from viapoint.envs.registration import ENV_IDS, TASKS, register_all
+from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
     from viapoint.envs.actions.via_points import Plan
@@ -39,47 +40,10 @@ if TYPE_CHECKING:
     from viapoint.envs.scenes.families import register_scene_family
     from viapoint.envs.scenes.options import scene_from_json, scene_to_json
     from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
-    from viapoint.envs.single_env import ReachEnv
-    from viapoint.envs.vector_env import ReachVectorEnv
+    from viapoint.envs.vector_env import ReachEnv, ReachVectorEnv
     from viapoint.envs.velocity_env import VelocityEnv, VelocityVectorEnv
 else:
-    _NAMES = {
-        "actions.via_points": ("Plan",),
-        "arm_import.loader": ("load_arm",),
-        "arms": ("register_arm",),
-        "arms.base": ("Arm",),
-        "geometry.box": ("Box",),
-        "geometry.convex_mesh": ("ConvexMesh",),
-        "geometry.cylinder": ("Cylinder",),
-        "geometry.half_space": ("HalfSpace",),
-        "geometry.point_cloud": ("PointCloud",),
-        "geometry.round_shapes": ("Capsule", "Sphere"),
-        "geometry.rows": ("observation_rows", "obstacle_rows", "obstacles_from_rows"),
-        "geometry.shape": ("Shape",),
-        "geometry.shapes": (
-            "SHAPES", "add_to_model", "as_obstacle", "as_obstacles", "nearest_distance", "obstacles_from_json",
-            "obstacles_to_json", "register_mesh", "signed_distances",
-        ),
-        "mdp.task": ("family_sampler",),
-        "record_video": ("RecordMovements",),
-        "replanning_env": ("ReplanningEnv", "ReplanningVectorEnv"),
-        "scenes.families": ("register_scene_family",),
-        "scenes.options": ("scene_from_json", "scene_to_json"),
-        "scenes.scene": ("TARGETS", "rows_of_lights"),
-        "single_env": ("ReachEnv",),
-        "vector_env": ("ReachVectorEnv",),
-        "velocity_env": ("VelocityEnv", "VelocityVectorEnv"),
-    }  # fmt: skip
-    _MODULES = {name: f"viapoint.envs.{module}" for module, names in _NAMES.items() for name in names}
-
-    def __getattr__(name):
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(_MODULES[name]), name)
-
-    def __dir__():
-        return sorted({*globals(), *_MODULES})
-
+    __getattr__, __dir__ = lazy_imports(__name__)
 
 register_all()
 

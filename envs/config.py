@@ -15,7 +15,6 @@ import numpy as np
 
 from viapoint.envs.actions.via_points import ActionLayout, Timing
 from viapoint.envs.arms import ADULT, Arm, arm_of
-from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.mdp.rewards import ReplanningRewardWeights, RewardWeights, StepRewardWeights
 from viapoint.envs.mdp.task import Task, distribution_of
@@ -37,7 +36,6 @@ class EnvConfig:
     whole_arm: bool = False
     n_obstacles: int | tuple[int, int] = (1, 5)
     shapes: str | Sequence[str] = CAPSULES
-    uniform_share: float = 0.0
     duration_range: tuple[float, float] = (0.6, 1.2)
     reward_weights: RewardWeights | Mapping[str, float] | None = None
     render_mode: str | None = None
@@ -64,8 +62,7 @@ class EnvConfig:
         """Return the signature of a vector environment with these keyword arguments."""
         named = inspect.signature(cls).parameters.values()
         number = inspect.Parameter("num_envs", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=1)
-        workers = inspect.Parameter("workers", inspect.Parameter.KEYWORD_ONLY, default=0, annotation="int")
-        return inspect.Signature([number, *named, workers])
+        return inspect.Signature([number, *named])
 
     def task(self) -> Task:
         """Return the task that these arguments describe.
@@ -78,14 +75,14 @@ class EnvConfig:
         if not isinstance(self.whole_arm, bool | np.bool_):
             raise TypeError(f"whole_arm must be True or False, got {self.whole_arm!r}")
         distribution = distribution_of(arm)
+        n_obstacles: Any = self.n_obstacles
         return Task(
             arm=arm,
             whole_arm=bool(self.whole_arm),
             action=self._action_layout(arm.dimension),
             weights=self.weights_kind.of(self.reward_weights),
             scenes=distribution(
-                n_obstacles=fewest_and_most(self.n_obstacles),
-                uniform_share=self.uniform_share,
+                n_obstacles=n_obstacles,
                 **distribution.for_shapes(check_shapes(self.shapes)),
             ),
             replanning=self.replanning,
@@ -117,13 +114,6 @@ class VelocityConfig(EnvConfig):
     stepwise = True
 
     control_step: float = 0.04
-
-    def task(self) -> Task:
-        """Return the task that these arguments describe; see :meth:`EnvConfig.task`."""
-        weights = self.reward_weights
-        if isinstance(weights, RewardWeights) and not isinstance(weights, StepRewardWeights):
-            raise ValueError(f"reward_weights must be StepRewardWeights or a mapping, got {weights!r}")
-        return super().task()
 
 
 @dataclass(frozen=True, kw_only=True)

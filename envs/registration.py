@@ -70,7 +70,7 @@ def register_all() -> None:
     """Register every id with Gymnasium; a second call changes nothing."""
     own_arm, step = ({a: TASKS[b] for a, b in shared.items()} for shared in (OWN_ARM_TASKS, STEP_TASKS))
     tables = (
-        ("single_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS | own_arm),
+        ("vector_env:ReachEnv", "vector_env:ReachVectorEnv", TASKS | own_arm),
         ("velocity_env:VelocityEnv", "velocity_env:VelocityVectorEnv", step),
         ("replanning_env:ReplanningEnv", "replanning_env:ReplanningVectorEnv", REPLANNING_TASKS),
     )

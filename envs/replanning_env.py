@@ -12,7 +12,7 @@ from viapoint.envs.actions.replanning import MovingPlan, NominalPlan, Replanning
 from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions, fewest_and_most
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE, checked_actions
 from viapoint.envs.config import ReplanningConfig
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.mdp.observation import ReplanningObservationLayout
@@ -21,17 +21,13 @@ from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.rendering.renderer import History
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes, problems_of_changes
 from viapoint.envs.scenes.motion import ChangeDistribution, ChangeSampler
-from viapoint.envs.scenes.options import CHANGES, check_owners, given_changes
+from viapoint.envs.scenes.options import CHANGES, given_changes
 from viapoint.envs.scenes.scene import refuse
 from viapoint.envs.sim.episode_state import Episodes
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
 from viapoint.envs.sim.replan_triggers import Event, ReplanTriggers
 from viapoint.envs.sim.replanning_executor import Decisions, ReplanningExecutor
-from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import Decision, ReachVectorEnv
-
-HISTORY_NAMES = ("time", *MovingPlan._fields)
-"""Columns of a stored history of plans."""
+from viapoint.envs.vector_env import Decision, ReachEnv, ReachVectorEnv
 
 
 class PlanStart(NamedTuple):
@@ -82,9 +78,8 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         assert isinstance(config, ReplanningConfig)
         action, base, model = task.action, task.observation, task.collision_model
         shortest, longest = action.duration_range
-        self.changes = ChangeDistribution(
-            n_jumps=fewest_and_most(config.n_jumps, "n_jumps"), moving=bool(config.moving_obstacles)
-        )
+        n_jumps: Any = config.n_jumps
+        self.changes = ChangeDistribution(n_jumps=n_jumps, moving=bool(config.moving_obstacles))
         """Distribution of the changes of scenes."""
         self.decoder = ReplanningDecoder(action)
         """Meaning of the components of an action during a movement."""
@@ -174,42 +169,29 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         self.scenes = self.scenes._replace(goal=goals.copy(), jumps=np.zeros_like(self.scenes.jumps))
         return self.observe()
 
-    def episodes_state(self) -> dict[str, Any]:
-        """See :meth:`MultiStepVectorEnv.episodes_state`."""
+    def state(self) -> dict[str, Any]:
+        """Return the state of the environments; see :meth:`ReachVectorEnv.state`."""
+        state = super().state()
         every = [each for history in self._history for each in history]
-        columns = [np.array([time for time, _ in every])]
-        for k, mine in enumerate(self._plan):
-            columns.append(np.concatenate([np.empty((0, *mine.shape[1:])), *(plan[k] for _, plan in every)]))
-        history = {f"history_{name}": part for name, part in zip(HISTORY_NAMES, columns, strict=True)}
-        history["history_number"] = np.array([len(each) for each in self._history])
-        return {**super().episodes_state(), **history}
+        episodes = state["episodes"]
+        episodes["history_number"] = np.array([len(history) for history in self._history])
+        episodes["history_time"] = np.array([time for time, _ in every])
+        for k, (name, part) in enumerate(self._plan._asdict().items()):
+            none = np.empty((0, *part.shape[1:]))
+            episodes[f"history_{name}"] = np.concatenate([none, *(plan[k] for _, plan in every)])
+        return state
 
-    def restore_episodes(self, state: Mapping[str, Any]) -> None:
-        """See :meth:`MultiStepVectorEnv.restore_episodes`."""
-        super().restore_episodes(state)
-        began, *parts = (np.asarray(state[f"history_{name}"]) for name in HISTORY_NAMES)
-        plans = [(float(time), take(MovingPlan(*parts), [k])) for k, time in enumerate(began)]
-        ends = np.cumsum(state["history_number"])
-        self._history = [
-            plans[end - number : end] for end, number in zip(ends, state["history_number"], strict=True)
-        ]
-
-    @staticmethod
-    def take_episodes(state: Mapping[str, Any], rows: slice) -> dict[str, Any]:
-        """See :meth:`MultiStepVectorEnv.take_episodes`."""
-        ends = np.cumsum(state["history_number"])
-        plans = slice(*(int(ends[k - 1]) if k else 0 for k in (rows.start, rows.stop)))
-        history = {f"history_{name}": np.asarray(state[f"history_{name}"])[plans] for name in HISTORY_NAMES}
-        others = {name: part for name, part in state.items() if name not in history}
-        return {**MultiStepVectorEnv.take_episodes(others, rows), **history}
-
-    def parse_options(self, options: Mapping[str, Any], number: int) -> dict[str, Float]:
-        """See :meth:`ReachVectorEnv.parse_options`."""
-        layout = self.task.observation
-        jumps, courses = given_changes(options, number, layout.dimension, layout.n_rows)
-        scene = super().parse_options({k: v for k, v in options.items() if k not in CHANGES}, number)
-        changes = {"jumps": jumps, "courses": courses}
-        return {**scene, **{name: part for name, part in changes.items() if part is not None}}
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of environments of the same kind and number."""
+        super().restore(state)
+        episodes = state["episodes"]
+        plans = MovingPlan(*(np.asarray(episodes[f"history_{name}"]) for name in MovingPlan._fields))
+        first = 0
+        for row, number in enumerate(episodes["history_number"]):
+            self._history[row] = [
+                (float(episodes["history_time"][k]), take(plans, [k])) for k in range(first, first + number)
+            ]
+            first += number
 
     def _execute_decision(self, plan: MovingPlan, revised: Bool) -> Decision:
         """Run the stages after decoding: scale time, build references, simulate, measure, score and observe."""
@@ -287,8 +269,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         jumps, courses = given_changes(options, len(rows), layout.dimension, layout.n_rows)
         draw = super()._draw
         scenes = draw(tried, rows, scene)
-        if courses is not None:
-            check_owners(courses, scenes.present)
         again = None if options else lambda some: draw(tried, rows[some], {})
         try:
             changing = self._change_sampler([tried[i] for i in rows], scenes, jumps, courses, again=again)
@@ -299,10 +279,6 @@ class ReplanningVectorEnv(MultiStepVectorEnv):
         for i in rows:
             generators[i] = tried[i]
         return changing
-
-    def _draw_next(self, rows: Int) -> ChangingScenes:  # type: ignore[override]
-        """Sample the next scenes, none of them ahead: changes of a scene take numbers of the same generator."""
-        return self._draw(self.generators, rows, {})
 
     def _start(self, rows: Int, scenes: ChangingScenes) -> Float:  # type: ignore[override]
         """Start episodes with the arms at rest at the start and the obstacles where their courses begin."""

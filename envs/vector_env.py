@@ -1,10 +1,10 @@
-"""Vector environment in which one decision is one movement."""
+"""Environments in which one decision is one movement."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -25,22 +25,73 @@ from viapoint.envs.common.validation import (
     whole_number,
 )
 from viapoint.envs.config import EnvConfig, ViaPointConfig
-from viapoint.envs.geometry.rows import row_size
 from viapoint.envs.mdp.rewards import reward_terms
-from viapoint.envs.rendering.renderer import MovementRenderer, check_render_mode
-from viapoint.envs.scenes.options import draw_given, given_scenes
-from viapoint.envs.scenes.sampler import SceneQueue
+from viapoint.envs.rendering.renderer import RENDER_MODES, MovementRenderer
+from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.executor import Execution, Executor, join_groups
 from viapoint.envs.sim.outcome import Rollout
-from viapoint.envs.sim.scheduler import Scheduler
 from viapoint.envs.sim.simulator import Simulator
 
 METADATA: dict[str, Any] = {
-    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_modes": RENDER_MODES,
     "render_fps": 50,
     "autoreset_mode": AutoresetMode.SAME_STEP,
 }
+SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "autoreset_mode"}
+
+
+class Scheduler:
+    """Runner of stages on a background thread, which starts with the first job, or on the calling thread alone.
+
+    The physics engine is C code that releases Python's global lock, so a background thread can compute references and
+    outcomes in NumPy while the main thread waits for the engine. No result depends on it.
+    """
+
+    def __init__(self, threaded: bool) -> None:
+        self._threaded = threaded
+        self._pool: ThreadPoolExecutor | None = None
+
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run `job(*arguments)` on the background thread; jobs run one at a time in the order of submission."""
+        if not self._threaded:
+            return _run_now(job, *arguments)
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="viapoint")
+        return self._pool.submit(job, *arguments)
+
+    def run(
+        self,
+        groups: Sequence[Any],
+        build_references: Callable[[Any], Any],
+        simulate: Callable[[Any], Any],
+        measure: Callable[[Any, Any], Any],
+        meanwhile: Callable[[], Any] | None = None,
+    ) -> tuple[list[Any], Future[Any] | None]:
+        """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
+
+        With one group there is nothing to overlap, and all stages run on the calling thread. The independent job
+        `meanwhile` may run during the physics; its future is returned with the results of the last stage.
+        """
+        submit = self.submit if len(groups) > 1 else _run_now
+        references = [submit(build_references, group) for group in groups]
+        # The physics waits for the first references only, so the independent job comes after all of them.
+        following = None if meanwhile is None else self.submit(meanwhile)
+        measured = [submit(measure, each.result(), simulate(each.result())) for each in references]
+        return [each.result() for each in measured], following
+
+    def close(self) -> None:
+        """Stop the background thread."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+def _run_now(job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Run a job on the calling thread and return its completed future."""
+    done: Future[Any] = Future()
+    done.set_result(job(*arguments))
+    return done
 
 
 class Decision(NamedTuple):
@@ -49,51 +100,6 @@ class Decision(NamedTuple):
     observation: Observation
     reward: Float
     info: dict[str, Any]
-
-
-class Transition(NamedTuple):
-    """One step of N environments with same-step autoreset."""
-
-    observation: Observation
-    """Observations after the step: where an episode ended, the first ones of the next."""
-    reward: Float
-    """Shape (N,)."""
-    terminated: Bool
-    """Shape (N,)."""
-    truncated: Bool
-    """Shape (N,)."""
-    info: dict[str, Any]
-    """Metrics of the step, shape (N,) each."""
-    last_observation: Observation | None
-    """Observations before autoreset; None if no episode ended."""
-
-    def as_step(self) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Return the result of `step` in the form of Gymnasium's vector environments."""
-        observation, reward, terminated, truncated, info, last = self
-        ended, everyone = terminated | truncated, np.ones(len(reward), dtype=bool)
-        infos = {**info, **{f"_{name}": everyone.copy() for name in info}}
-        if last is not None:
-            final = np.full(len(reward), None, dtype=object)
-            for i in np.flatnonzero(ended):
-                final[i] = {name: part[i] for name, part in last.items()}
-            kept = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
-            masks = {f"_{name}": ended.copy() for name in info}
-            infos |= {"final_obs": final, "_final_obs": ended.copy()}
-            infos |= {"final_info": {**kept, **masks}, "_final_info": ended.copy()}
-        return observation, reward, terminated.copy(), truncated.copy(), infos
-
-
-class NextEpisodes(NamedTuple):
-    """Episodes that were drawn and have not begun."""
-
-    rows: Int
-    """Environments that they belong to."""
-    scenes: Any
-    """Scenes, one for each row."""
-    generators: list[np.random.Generator]
-    """Random generators of all environments after the draw."""
-    first_seed: int | None
-    """Seed of the first generator."""
 
 
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
@@ -111,7 +117,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         n_via: Number of via-points of an action.
         n_obstacles: Number of obstacles, or the fewest and the most.
         shapes: Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length.
-        uniform_share: Share of episodes whose ends and obstacles are uniform in the workspace.
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.RewardWeights`.
@@ -119,8 +124,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
-        workers: Processes that share the environments, see :class:`~viapoint.envs.worker_env.WorkerVectorEnv`, which
-            is returned then; 0 for none. Results do not depend on it.
 
     Example:
         >>> import gymnasium as gym
@@ -136,16 +139,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Class of the keyword arguments, with their defaults."""
     __signature__ = ViaPointConfig.signature()
 
-    def __new__(cls, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> Any:
-        """Return environments in this process, or in worker processes."""
-        if not whole_number("workers", workers, 0):
-            return super().__new__(cls)
-        from viapoint.envs.worker_env import WorkerVectorEnv
-
-        return WorkerVectorEnv(cls, num_envs, workers, **kwargs)
-
-    def __init__(self, num_envs: int = 1, *, workers: int = 0, **kwargs: Any) -> None:
-        assert not workers, "__new__ makes the others"
+    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
         self.config = config = self.config_kind.of(kwargs)
         EzPickle.__init__(self, num_envs, **as_given(kwargs))
         self.task = config.task()
@@ -155,7 +149,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.arm, self.action_layout = self.task.arm, self.task.action
         self.observation_layout = self.task.observation
         self._sampler = self.task.sampler()
-        self._queue = SceneQueue(self._sampler, self.num_envs)
         self._simulator = Simulator(
             self.task.collision_model,
             n_obstacles=self.observation_layout.n_rows,
@@ -175,7 +168,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """True where the last step truncated the episode, shape (num_envs,)."""
         self._last: Execution | None = None
         self.action_names = self.action_layout.names
-        self.render_mode = check_render_mode(config.render_mode, METADATA["render_modes"])
+        self.render_mode = config.render_mode
         self._renderer = MovementRenderer(
             self._simulator, self.render_mode, config.width, config.height, METADATA["render_fps"]
         )
@@ -216,7 +209,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
             options: `start`, `goal` and `obstacles` set up a given scene, see
-                :func:`~viapoint.envs.scenes.options.given_scenes`; `reset_mask`, shape (num_envs,), names the
+                :func:`~viapoint.envs.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
                 environments to reset, all others keep their scenes.
 
         Raises:
@@ -224,38 +217,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         options = reset_options(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
-        self.begin_episodes(self.draw_episodes(seed, rows, options))
-        return self.observe(), {}
-
-    def draw_episodes(
-        self, seed: int | Sequence[int | None] | None, rows: Int, options: Mapping[str, Any]
-    ) -> NextEpisodes:
-        """Draw the next episodes of the environments `rows`; the running ones go on.
-
-        Seeds and options are those of :meth:`reset`, without `reset_mask`; batched options have an entry for each row.
-        """
-        seeded, first_seed = self._seeded(seed, rows)
-        return NextEpisodes(rows, self._draw(seeded, rows, options), seeded, first_seed)
-
-    def begin_episodes(self, episodes: NextEpisodes) -> None:
-        """Begin episodes that :meth:`draw_episodes` returned."""
-        rows, scenes, self.generators, first_seed = episodes
-        self.use_generator(self.generators[0], first_seed)
-        self._last = self._last if len(rows) < self.num_envs else None
+        generators, first_seed = self._seeded(seed, rows)
+        # Nothing changes before all scenes are there: impossible ones raise an error.
+        scenes = self._draw(generators, rows, options)
+        self.generators = generators
+        self.use_generator(generators[0], first_seed)
+        if len(rows) == self.num_envs:
+            self._last = None
         self._start(rows, scenes)
-
-    def parse_options(self, options: Mapping[str, Any], number: int) -> dict[str, Float]:
-        """Return the options of a reset of `number` environments with one entry for each.
-
-        Raises:
-            ValueError: An option is unknown, or has another shape or type.
-        """
-        d, n = self.arm.dimension, self.task.observation.n_rows
-        shapes = self.task.scenes.shapes
-        points = np.zeros((number, d))
-        empty = Scenes(points, points, np.zeros((number, n, row_size(d, shapes))))
-        given = given_scenes(options, empty, self.arm, shapes)._asdict()
-        return {name: given[name] for name in options}
+        return self.observe(), {}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
         """Draw the scenes of the first environment from a generator, which was made from `seed`."""
@@ -267,20 +237,34 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        return self.transition(actions).as_step()
-
-    def transition(self, actions: Any) -> Transition:
-        """Execute one action in each environment, as :meth:`step`, and return the arrays of its result."""
         rows = np.arange(self.num_envs)
         # The next scenes depend on no outcome, so they are drawn during the physics.
-        (observation, reward, info), following = self._execute(
-            self._decode(actions), lambda: self._draw_next(rows)
+        decision, following = self._execute(
+            self._decode(actions), lambda: self._draw(self.generators, rows, {})
         )
         assert following is not None
         self._start(rows, following.result())
-        return Transition(
-            self.observe(), reward, self.terminated.copy(), self.truncated.copy(), info, observation
-        )
+        return self._as_step(decision)
+
+    def _as_step(self, decision: Decision) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
+        """Return the result of `step`: that of a decision, after which the next episodes have begun where one ended."""
+        observation, reward, info = decision
+        ended = self.terminated | self.truncated
+        infos = dict(info)
+        for name in info:
+            infos[f"_{name}"] = np.ones(self.num_envs, dtype=bool)
+        if ended.any():
+            last = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                last[i] = {name: part[i] for name, part in observation.items()}
+            final_info = {}
+            for name, value in info.items():
+                final_info[name] = np.where(ended, value, np.zeros_like(value))
+                final_info[f"_{name}"] = ended.copy()
+            infos |= {"final_obs": last, "_final_obs": ended.copy()}
+            infos |= {"final_info": final_info, "_final_info": ended.copy()}
+            observation = self.observe()
+        return observation, reward, self.terminated.copy(), self.truncated.copy(), infos
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and counters as values and arrays for :meth:`restore`.
@@ -299,12 +283,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "generators": [generator.bit_generator.state for generator in self.generators],
             "scenes": self._check_running().as_options(),
             "physics_steps": self.physics_steps,
-            "episodes": self.episodes_state(),
         }
-
-    def episodes_state(self) -> dict[str, Any] | None:
-        """Return the state of episodes of several steps, without their scenes; None for episodes of one."""
-        return None
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same kind and number."""
@@ -375,8 +354,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _render_one(self, sim: int) -> Any:
         if self.render_mode is None:
-            modes = ", ".join(METADATA["render_modes"])
-            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
+            gym.logger.warn(
+                f"render() does nothing without a render_mode; choose one of {', '.join(RENDER_MODES)}"
+            )
             return None
         if self._last is None or (self.scenes is not None and self.num_envs == 1):
             assert self.scenes is not None
@@ -430,10 +410,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             generators[i] = generator
         return scenes
 
-    def _draw_next(self, rows: Int) -> Scenes:
-        """Sample the scenes that follow those of some environments; some of later episodes are sampled with them."""
-        return self._queue(self.generators, rows)
-
     def _start(self, rows: Int, scenes: Scenes) -> Float:
         """Start episodes with the arms at rest at the start and the obstacles in place; return the joint angles."""
         if self.scenes is None or len(rows) == self.num_envs:
@@ -450,3 +426,90 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         assert self.scenes is not None
         joints = np.asarray(self.arm.inverse_kinematics(self.scenes.start))
         return self.observation_layout.observe(joints, self.scenes.start, self.scenes)
+
+
+class ReachEnv(gym.Env[Any, Any], EzPickle):
+    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> type(env.unwrapped).__name__
+        'ReachEnv'
+    """
+
+    metadata = SINGLE_METADATA
+    batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
+    """Vector environment class that this environment wraps."""
+
+    def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
+        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
+        self.batch = self.batch_kind(1, threads=threads, **kwargs)
+        """Vector environment with one environment."""
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+        self.render_mode = self.batch.render_mode
+        self.task = self.batch.task
+        self.action_layout = self.batch.action_layout
+        self.observation_layout = self.batch.observation_layout
+        self._over = True
+
+    @property
+    def last_rollout(self) -> Rollout | None:
+        """Last movement at every physics step; None before the first."""
+        rollouts = self.batch.last_rollout
+        return rollouts[0] if rollouts else None
+
+    @property
+    def last_plan(self) -> Plan | None:
+        """Last decision as via-points (K + 2, D) [m] and durations (K + 1,) [s]; None before the first."""
+        plan = self.batch.last_plan
+        return None if plan is None else plan.take(0)
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo model."""
+        return self.batch.model
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far."""
+        return self.batch.physics_steps
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
+        self.batch.use_generator(self._np_random, self._np_random_seed)
+        observation, info = self.batch.reset(seed=seed, options=options)
+        self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
+        self._over = False
+        if self.render_mode == "human":
+            self.batch.render()
+        return {name: part[0] for name, part in observation.items()}, info
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute one action, see :meth:`ReachVectorEnv.step`; where it is a movement, it ends the episode.
+
+        Args:
+            action: Shape (m,), in [-1, 1]; components beyond are clipped.
+        """
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
+        observation, reward, info = self.batch.execute_actions([action])
+        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
+        self._over = terminated or truncated
+        seen = {name: part[0] for name, part in observation.items()}
+        values = {name: value[0].item() for name, value in info.items()}
+        return seen, float(reward[0]), terminated, truncated, values
+
+    def render(self) -> Any:
+        """Render the last movement in the render mode; after a reset, the scene."""
+        frames = self.batch.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Stop worker threads and close the render window."""
+        self.batch.close()

@@ -20,8 +20,7 @@ from viapoint.envs.multi_step import MultiStepVectorEnv
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.episode_state import Episodes, Segment
 from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, SETTLING, Outcome, straight_jerk_cost
-from viapoint.envs.single_env import ReachEnv
-from viapoint.envs.vector_env import Decision, ReachVectorEnv
+from viapoint.envs.vector_env import Decision, ReachEnv, ReachVectorEnv
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from viapoint.training.io.ray_cluster import LOOPBACK
-
-os.environ.update(LOOPBACK)  # before Ray is imported, which reads it once; otherwise it replaces 127.0.0.1
+# Ray reads this once, when it is imported; otherwise it replaces 127.0.0.1 by another address.
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 LONGEST = 600
 """Time that a test with Ray may take, [s]."""
 

@@ -21,6 +21,7 @@ MAY_IMPORT = {
         "array_api_compat",
         "gymnasium",
         "mujoco",
+        "scipy",
         "glfw",
         "viapoint.primitives",
         "viapoint.envs",

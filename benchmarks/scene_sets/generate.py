@@ -7,7 +7,8 @@ set in each band of the solution share. `hard` holds equal numbers of scenes of 
 5 %. No agent in the plane is trained on these families; in space they are the narrow ones, of which `tunnel` is never
 trained on. Every scene was solved in simulation by at least one of at most 4,096 random actions, which gives its
 difficulty, and by the planner. `uniform` holds scenes in which nothing is placed about a feasible path
-(:mod:`viapoint.envs.scenes.uniform`): the first ones that have a solution. Their shares are not measured.
+(:class:`~viapoint.envs.scenes.sampler.UniformSampler`): the first ones that have a solution. Their shares are not
+measured.
 
 The search for scenes uses estimates of their shares, which change with the program. Each scene of a file therefore has
 its number among the drawn scenes. The command draws these scenes again, measures their shares, and compares hashes.

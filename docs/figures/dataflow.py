@@ -18,7 +18,7 @@ from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.paper.simulated import required_torque
+from viapoint.training.paper.movements import required_torque
 from viapoint.training.plotting.top_view import draw_movement
 
 SIZE = (12.4, 6.5)

@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import check_increasing_pair, whole_number
+from viapoint.envs.common.validation import check_increasing_pair, finite_array, whole_number
 from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 Timing = Literal["optimal", "learned"]
@@ -93,13 +93,10 @@ class ActionLayout:
         whole_number("n_via", self.n_via, 0, MOST_VIAS)
         if self.timing not in get_args(Timing):
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
-        check_increasing_pair("duration_range", self.duration_range)
-        if not SHORTEST_DURATION <= self.duration_range[0] < self.duration_range[1] <= LONGEST_DURATION:
-            raise ValueError(
-                f"duration_range must lie within {SHORTEST_DURATION} to {LONGEST_DURATION} s, "
-                f"got {self.duration_range!r}"
-            )
-        self._check_scale()
+        check_increasing_pair("duration_range", self.duration_range, SHORTEST_DURATION, LONGEST_DURATION)
+        scale = finite_array("via_scale", self.via_scale, (None,))
+        if len(scale) < self.dimension or (scale <= 0.0).any():
+            raise ValueError(f"via_scale must be {self.dimension} positive numbers, got {self.via_scale!r}")
         low, high = self.duration_range
         object.__setattr__(self, "duration_range", (float(low), float(high)))
 
@@ -150,7 +147,11 @@ class ActionLayout:
             ValueError: One of them has another shape.
         """
         action, start, goal = _arrays(action, start, goal)
-        self._check_shapes(action.shape, start.shape, goal.shape)
+        # Shapes alone are checked, not values: exported graphs of tensors have none.
+        batch = action.shape[:-1]
+        _check_shape("action", action, (*batch, self.size))
+        _check_shape("start", start, (*batch, self.dimension))
+        _check_shape("goal", goal, (*batch, self.dimension))
         xp = np if isinstance(action, np.ndarray) else namespace_of(action)  # mostly NumPy: without a call
         line = goal - start
         axes = frame(line, xp)
@@ -176,17 +177,9 @@ class ActionLayout:
             ValueError: The movement has another dimension or another number of via-points.
         """
         waypoints, durations = _arrays(*plan)
-        rows = (self.n_via + 2, self.dimension)
-        if waypoints.shape[-2:] != rows:
-            raise ValueError(
-                f"waypoints must have shape (..., {rows[0]}, {rows[1]}), start, {self.n_via} via-points and goal, "
-                f"got {tuple(waypoints.shape)}"
-            )
-        wanted = (*waypoints.shape[:-2], self.n_via + 1)
-        if durations.shape != wanted:
-            raise ValueError(
-                f"durations must have shape {wanted}, one for each segment, got {tuple(durations.shape)}"
-            )
+        batch = waypoints.shape[:-2]
+        _check_shape("waypoints", waypoints, (*batch, self.n_via + 2, self.dimension))
+        _check_shape("durations", durations, (*batch, self.n_via + 1))
         xp = namespace_of(waypoints)
         start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
         line = goal - start
@@ -202,32 +195,6 @@ class ActionLayout:
             ratios = xp.log(durations[..., 1:] / durations[..., :-1])
             components += [(ratios[..., k] - r) / LOG_SPLIT for k, r in enumerate(self._straight_split)]
         return xp.stack(components, axis=-1)
-
-    def _check_scale(self) -> None:
-        try:
-            scale = tuple(float(each) for each in self.via_scale)
-        except (TypeError, ValueError):
-            scale = ()
-        if len(scale) < self.dimension or not all(0.0 < each < float("inf") for each in scale):
-            raise ValueError(
-                f"via_scale must be {self.dimension} positive finite numbers, got {self.via_scale!r}"
-            )
-
-    def _check_shapes(self, action: tuple[int, ...], start: tuple[int, ...], goal: tuple[int, ...]) -> None:
-        """Check shapes, not values: exported graphs of tensors have none."""
-        if action[-1:] != (self.size,):
-            raise ValueError(
-                f"action must have shape (..., {self.size}) ({', '.join(self.names)}), got {tuple(action)}"
-            )
-        if start[-1:] != (self.dimension,) or goal != start:
-            raise ValueError(
-                f"start and goal must both have shape (..., {self.dimension}), got {tuple(start)} and {tuple(goal)}"
-            )
-        if action[:-1] != start[:-1]:
-            raise ValueError(
-                f"there must be a start and a goal for each action: actions have shape {tuple(action)}, "
-                f"starts {tuple(start)}"
-            )
 
     @functools.cached_property
     def _log_half_range(self) -> float:
@@ -280,30 +247,25 @@ def _arrays(*values: Array) -> tuple[Array, ...]:
         raise ValueError(f"actions, places and durations must be arrays of numbers, got {values!r}") from None
 
 
+def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    """Check the shape of an array or a tensor."""
+    if tuple(array.shape) != tuple(shape):
+        raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(array.shape)}")
+
+
 MAX_START_OFFSET = 1e-3
 """Greatest distance of a plan's beginning from the hand, [m]."""
 
 
 def checked_plan(plan: Plan, start: Float) -> Plan:
     """Return a plan as arrays, after a check that it begins at the hands, shape (N, D), [m]."""
-    try:
-        waypoints, durations = (np.asarray(part, dtype=np.float64) for part in plan)
-    except (TypeError, ValueError):
-        raise ValueError(f"plan must be waypoints and durations, got {plan!r}") from None
     number, dimension = start.shape
-    if waypoints.ndim != 3 or waypoints.shape[::2] != start.shape or waypoints.shape[1] < 2:
-        raise ValueError(
-            f"plan must have waypoints of shape ({number}, K + 2, {dimension}), got {waypoints.shape}"
-        )
-    if durations.shape != (number, waypoints.shape[1] - 1):
-        raise ValueError(
-            f"plan must have durations of shape {(number, waypoints.shape[1] - 1)}, got {durations.shape}"
-        )
+    waypoints = finite_array("waypoints of the plan", plan[0], (number, None, dimension))
+    durations = finite_array("durations of the plan", plan[1], (number, waypoints.shape[1] - 1))
     away = np.sqrt(((waypoints[:, 0] - start) ** 2).sum(axis=-1))
     if (away > MAX_START_OFFSET).any():
-        env = int((away > MAX_START_OFFSET).argmax())
+        env = int(away.argmax())
         raise ValueError(
-            f"plan {env} must begin where the hand is, at {start[env]} m, got {waypoints[env, 0]} m, "
-            f"{away[env]:.4f} m from there"
+            f"plan {env} must begin where the hand is, at {start[env]} m, got {waypoints[env, 0]} m"
         )
     return Plan(waypoints, durations)

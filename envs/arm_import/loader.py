@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from viapoint.envs.arm_import import mjcf_reader
 from viapoint.envs.arm_import.capsule_fit import cover_geom
-from viapoint.envs.arm_import.mjcf_reader import ParsedMjcf
+from viapoint.envs.arm_import.mjcf_reader import MAX_COORDINATE, MIN_RADIUS, MIN_TOLERANCE, ParsedMjcf
 from viapoint.envs.arm_import.reachability import (
     FIRST_OFF_TABLE,
     Feasibility,
@@ -36,6 +36,7 @@ from viapoint.envs.arms.mjcf import (
 )
 from viapoint.envs.arms.serial_arm import LinkCapsule, SerialArm, serial_arm
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, number_of_at_least
 
 STAGE = "stage.xml"
 """Asset with table, light and cameras."""
@@ -96,7 +97,7 @@ def load_arm(
 
     Example:
         >>> import numpy as np
-        >>> from viapoint.envs.arm_import import load_arm
+        >>> from viapoint.envs import load_arm
         >>> arm = load_arm(
         ...     "docs/ur5e.xml",
         ...     hand_site="hand",
@@ -112,10 +113,12 @@ def load_arm(
     """
     file = mjcf_reader.file_path(path)
     corners = None if workspace is None else mjcf_reader.workspace_corners(workspace)
-    zero = None if origin is None else mjcf_reader.point("origin", origin)
-    hand_radius = mjcf_reader.positive_radius(hand_radius)
-    tolerance = mjcf_reader.fit_tolerance(tolerance)
-    name = mjcf_reader.arm_name(file.stem if name is None else name)
+    zero = None if origin is None else finite_array("origin", origin, (3,))
+    hand_radius = number_of_at_least("hand_radius", hand_radius, MIN_RADIUS, MAX_COORDINATE)
+    tolerance = number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_COORDINATE)
+    name = file.stem if name is None else name
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"name must be a string of one or more characters, got {name!r}")
     parsed = mjcf_reader.parse_mjcf(
         file,
         hand_site,
@@ -145,7 +148,6 @@ def load_arm(
         hand_site="hand",
         ik=table,
         workspace=as_box(corners),
-        may_touch_itself=False,  # the whole reach was checked
     )
     shape = (written._replace(excess=each.excess) for written, each in zip(arm.shape, capsules, strict=True))
     arm = replace(arm, shape=tuple(shape))

@@ -12,12 +12,14 @@ import numpy as np
 
 from viapoint.envs.arms.mjcf import quaternion_of
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_real_array, is_number
+from viapoint.envs.common.validation import finite_array
 
 MIN_WORKSPACE_WIDTH = 1e-3
 """Least width of a workspace along each axis, [m]."""
 MAX_COORDINATE = 0.95
 """Greatest coordinate of a hand position, [m]: observations end at 1."""
+MIN_RADIUS = 1e-6
+"""Least radius of the hand, [m]."""
 MIN_TOLERANCE = 0.005
 """Least tolerance of fitted capsules, [m]."""
 POSITION_TOLERANCE = 1e-6
@@ -40,94 +42,31 @@ def file_path(value: Any) -> Path:
     return path
 
 
-def arm_name(value: Any) -> str:
-    """Return a name that is a non-empty string."""
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"name must be a string of one or more characters, got {value!r}")
-    return value
-
-
 def joint_names(joints: Any) -> tuple[str, ...]:
     """Return different names of joints."""
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
-    if not names or not all(isinstance(each, str) for each in names):
-        raise ValueError(f"joints must be names, in order from the base to the hand, got {joints!r}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"joints must be named once each, got {joints!r}")
+    if not all(isinstance(each, str) for each in names) or not MIN_JOINTS <= len(set(names)) == len(names):
+        raise ValueError(
+            f"joints must be {MIN_JOINTS} or more different names, in order from the base to the hand, got {joints!r}"
+        )
     return names
 
 
 def per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
     """Return one number for each joint, shape (J,); a single number applies to all."""
-    numbers = as_real_array(values)
-    if numbers is None or numbers.shape not in ((), (1,), (len(joints),)):
-        raise ValueError(f"{name} must be {len(joints)} numbers, one for each joint, got {values!r}")
-    return np.array(np.broadcast_to(numbers, (len(joints),)), np.float64)
-
-
-def joint_ranges(values: Any, joints: tuple[str, ...]) -> Float:
-    """Return the lowest and the highest angle of each joint, shape (J, 2), [rad]."""
-    ranges = _finite(values, (len(joints), 2))
-    if ranges is None or not (ranges[:, 0] < ranges[:, 1]).all():
-        raise ValueError(
-            f"joint_range must be {len(joints)} pairs of finite numbers in increasing order, got {values!r}"
-        )
-    return ranges
-
-
-def point(name: str, values: Any) -> Float:
-    """Return a position, shape (3,), [m]."""
-    numbers = _finite(values, (3,))
-    if numbers is None:
-        raise ValueError(f"{name} must be three finite numbers, x, y and z in m, got {values!r}")
-    return numbers
+    numbers = finite_array(name, values, (len(joints),), (1,), ())
+    return np.array(np.broadcast_to(numbers, (len(joints),)))
 
 
 def workspace_corners(values: Any) -> Float:
     """Return the lowest and the highest corner of a box from any two opposite corners, shape (2, 3), [m]."""
-    corners = _finite(values, (2, 3))
-    if corners is None:
+    corners = np.sort(finite_array("workspace", values, (2, 3)), axis=0)
+    if np.abs(corners).max() >= MAX_COORDINATE or (corners[1] - corners[0] < MIN_WORKSPACE_WIDTH).any():
         raise ValueError(
-            f"workspace must be two opposite corners, each of three finite numbers in m, got {values!r}"
+            f"workspace must be a box {MIN_WORKSPACE_WIDTH:g} m wide or more in x, y and z, with coordinates less than "
+            f"{MAX_COORDINATE} m, where observations end, got {values!r}"
         )
-    far = corners[(np.abs(corners) >= MAX_COORDINATE).any(axis=-1)]
-    if len(far):
-        raise ValueError(
-            f"the hand does not get to ({', '.join(f'{x:.4g}' for x in far[0])}) m: coordinates must be less than "
-            f"{MAX_COORDINATE} m, where observations end; give another workspace or origin"
-        )
-    if (np.abs(corners[1] - corners[0]) < MIN_WORKSPACE_WIDTH).any():
-        raise ValueError(
-            f"workspace must be a box that is {1e3 * MIN_WORKSPACE_WIDTH:g} mm wide or more in x, y and z, "
-            f"got {values!r}"
-        )
-    return np.sort(corners, axis=0)
-
-
-def positive_radius(value: Any) -> float:
-    """Return the radius of the hand, [m]."""
-    if not (is_number(value) and 0.0 < float(value) < MAX_COORDINATE):
-        raise ValueError(
-            f"hand_radius must be a positive number of m, less than {MAX_COORDINATE}, got {value!r}"
-        )
-    return float(value)
-
-
-def fit_tolerance(value: Any) -> float:
-    """Return the greatest distance of fitted capsules from their geoms, [m]."""
-    if not (is_number(value) and MIN_TOLERANCE <= float(value) < MAX_COORDINATE):
-        raise ValueError(
-            f"tolerance must be a number of m from {MIN_TOLERANCE} to less than {MAX_COORDINATE}, got {value!r}"
-        )
-    return float(value)
-
-
-def _finite(values: Any, shape: tuple[int, ...]) -> Float | None:
-    """Return finite real numbers of a shape, or None."""
-    array = as_real_array(values)
-    if array is None or array.shape != shape or not np.isfinite(array).all():
-        return None
-    return array.astype(np.float64)
+    return corners
 
 
 class ParsedMjcf(NamedTuple):
@@ -158,10 +97,15 @@ def parse_mjcf(
     velocity_limit: Any,
 ) -> ParsedMjcf:
     """Read and check a file; see :func:`~viapoint.envs.arm_import.loader.load_arm` for arguments and errors."""
-    spec = _read(path)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        whole = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {str(path)!r} as an MJCF file: {error}") from None
+    if not spec.geoms:
+        raise ValueError(f"there are no geoms in {str(path)!r}: nothing of the arm can collide")
     _check_exist("site", (hand_site,), [site.name for site in spec.sites])
     _check_exist("joint", joints, [joint.name for joint in spec.joints])
-    whole = _compile(spec, path)
     ranges = _ranges(whole, joints, joint_range)
     torque = (
         _torques(whole, joints) if torque_limit is None else per_joint("torque_limit", torque_limit, joints)
@@ -171,8 +115,8 @@ def parse_mjcf(
         velocity_limit = whole.numeric("velocity_limit").data if given else DEFAULT_VELOCITY_LIMIT
     velocity = per_joint("velocity_limit", velocity_limit, joints)
     for name, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
-        if not (np.isfinite(limit).all() and (limit > 0.0).all()):
-            raise ValueError(f"{name} must be positive and finite, got {limit}")
+        if not (limit > 0.0).all():
+            raise ValueError(f"{name} must be positive, got {limit}")
     if home is None:
         address = [int(whole.joint(joint).qposadr[0]) for joint in joints]
         home = whole.key_qpos[0, address] if whole.nkey else ranges.mean(axis=1)
@@ -187,23 +131,6 @@ def parse_mjcf(
     return ParsedMjcf(model, joints, hand_site, home, ranges, torque, velocity)
 
 
-def _read(path: Path) -> mujoco.MjSpec:
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {str(path)!r} as an MJCF file: {error}") from None
-    if not spec.geoms:
-        raise ValueError(f"there are no geoms in {str(path)!r}: nothing of the arm can collide")
-    return spec
-
-
-def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile {str(path)!r}: {error}") from None
-
-
 def _check_exist(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
     missing = [name for name in wanted if name not in there]
     if missing:
@@ -214,8 +141,6 @@ def _check_exist(kind: str, wanted: tuple[str, ...], there: list[str]) -> None:
 
 
 def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
-    if len(joints) < MIN_JOINTS:
-        raise ValueError(f"joints must be five or more, got {joints}")
     for name in joints:
         joint = model.joint(name)
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
@@ -225,7 +150,10 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float
                 f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
             )
     if given is not None:
-        return joint_ranges(given, joints)
+        ranges = finite_array("joint_range", given, (len(joints), 2))
+        if (ranges[:, 0] >= ranges[:, 1]).any():
+            raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
+        return ranges
     return np.array([model.joint(name).range for name in joints])
 
 
@@ -240,19 +168,13 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
         driven = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(driven)]
         found.append(max(limits, default=np.nan))
-    torques = np.array(found)
-    missing, one_way = (
-        ", ".join(name for name, bad in zip(joints, each, strict=True) if bad)
-        for each in (~np.isfinite(torques), torques <= 0.0)
-    )
+    missing = [name for name, torque in zip(joints, found, strict=True) if not torque > 0.0]
     if missing:
-        raise ValueError(f"no actuator with a limited force drives {missing}; add one, or give torque_limit")
-    if one_way:
         raise ValueError(
-            f"the force on {one_way} is limited to one direction; give it a range about 0 in the file, or give "
+            f"no actuator with a force limited to a range about 0 drives {', '.join(missing)}; add one, or give "
             "torque_limit"
         )
-    return torques
+    return np.array(found)
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:

@@ -145,25 +145,17 @@ class Feasibility:
         """Return the reason for which a position is infeasible."""
         if np.abs(hand).max() >= MAX_COORDINATE:
             return f"coordinates must be less than {MAX_COORDINATE} m, where observations end"
-        near = f"comes closer than {1e3 * LINK_MARGIN:.0f} mm to"
-        if hand[2] <= self._hand_radius + LINK_MARGIN:
-            return f"the hand, of radius {self._hand_radius:g} m, {near} the table"
         joints = solve_inverse_kinematics(self.chain, self.hand_offset, self.home, hand[None])
-        ((error,), (rotation,)), (inside, above, apart) = (
-            self._errors(hand[None], joints),
-            self._margins(joints),
+        ((error,), (rotation,)) = self._errors(hand[None], joints)
+        inside, above, apart = self._margins(joints)
+        joint = self._parsed.joints[int(inside[0].argmin())]
+        table = min(above.min(), hand[2] - self._hand_radius)
+        return (
+            f"the nearest configuration misses it by {error:.4f} m and {rotation:.2f} rad (at most "
+            f"{HAND_TOLERANCE} m and {ORIENTATION_TOLERANCE} rad), has {joint} {inside.min():.2f} rad inside its "
+            f"range (more than {JOINT_MARGIN} rad), parts {table:.3f} m above the table and links {apart.min():.3f} m "
+            f"apart (more than {LINK_MARGIN} m)"
         )
-        names = self._parsed.joints
-        if error >= HAND_TOLERANCE or rotation >= ORIENTATION_TOLERANCE:
-            return f"no configuration near home gets nearer than {1e3 * error:.0f} mm and {rotation:.2f} rad"
-        if (inside <= JOINT_MARGIN).any():
-            worst = int(inside[0].argmin())
-            return f"{names[worst]} comes to {joints[0, worst]:.2f} rad, less than {JOINT_MARGIN} rad inside its range"
-        if (above <= LINK_MARGIN).any():
-            off_table = [capsule for capsule in self._capsules if capsule.joint >= FIRST_OFF_TABLE]
-            return f"the link of {names[off_table[int(above[0].argmin())].joint]} {near} the table"
-        first, second = (names[self._capsules[k].joint] for k in self._pairs[int(apart[0].argmin())])
-        return f"the links of {first} and {second} come closer than {1e3 * LINK_MARGIN:.0f} mm to one another"
 
     def _ends(self, joints: Float) -> Float:
         places = tuple((capsule.joint, end) for capsule in self._capsules for end in capsule.ends)
@@ -221,7 +213,7 @@ def check_strength(parsed: ParsedMjcf, chain: Chain, joints: Float, places: Sequ
     weight = np.abs(chain.torques(joints, 0.0 * joints, 0.0 * joints)[1])
     lacking = weight - LIMIT_SHARE * parsed.torque_limit
     if (lacking >= 0.0).any():
-        where, joint = np.unravel_index(lacking.argmax(), lacking.shape)
+        where, joint = (int(i) for i in np.unravel_index(lacking.argmax(), lacking.shape))
         raise ValueError(
             f"torque_limit of {parsed.joints[joint]} is {parsed.torque_limit[joint]:g} N m, of which {LIMIT_SHARE:.0%} "
             f"are used, but to hold the arm {places[where]} against gravity takes {weight[where, joint]:.4g} N m"

@@ -9,21 +9,18 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Box, Float
+from viapoint.envs.common.types import Array, Bool, Box, Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance, hand_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
-from viapoint.primitives.array_api import Array
-
-SELF_MARGIN = 0.002
-"""Distance of links from one another and the table below which a plan touches, [m]: the error of tracking it."""
 
 
 class Arm(Protocol):
     """Arm: its size and reach, forward and inverse kinematics, and the controls that track a movement.
 
-    The functions are batched over leading dimensions and accept NumPy arrays and torch tensors. Joint angles have shape
-    (..., J), [rad]; hand positions have shape (..., D), [m], in the frame of the arm's base, which is the world.
-    Movements are positions, velocities, [m/s], and accelerations, [m/s^2], of the hand at T times, shape (..., T, D).
+    The functions are batched over leading dimensions, and compute in the precision of their arguments. Joint angles
+    have shape (..., J), [rad]; hand positions have shape (..., D), [m], in the frame of the arm's base, which is the
+    world. Movements are positions, velocities, [m/s], and accelerations, [m/s^2], of the hand at T times, shape
+    (..., T, D).
 
     Example:
         >>> import numpy as np
@@ -54,13 +51,6 @@ class Arm(Protocol):
     @property
     def link_joints(self) -> tuple[int, ...]:
         """Index of the joint that each of the L capsules moves with, in increasing order."""
-
-    @property
-    def may_touch_itself(self) -> bool:
-        """True if a configuration within reach may touch the arm itself or the table.
-
-        Then clearances of plans are negative where it does.
-        """
 
     @property
     def joint_range(self) -> tuple[tuple[float, float], ...]:
@@ -109,15 +99,6 @@ class Arm(Protocol):
         do not count.
         """
 
-    def planned_self_clearance(self, links: Array) -> Array:
-        """Return :meth:`self_clearance` of links whose configurations the inverse kinematics gave, shape (...,), [m].
-
-        Pairs of capsules that stay 5 cm apart within reach are left out, so clearances beyond that may be too large.
-
-        Args:
-            links: Axes of the capsules by :meth:`links`, shape (..., L, 2, D), [m].
-        """
-
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return the joint angles that put the hand at a position, shape (..., J), [rad].
 
@@ -125,7 +106,7 @@ class Arm(Protocol):
         position nearby, not an error; check :meth:`reach_margin`.
         """
 
-    def reach_margin(self, hand: Array) -> Array:
+    def reach_margin(self, hand: Array) -> Any:
         """Return the distance of a hand position inside the reach, shape (...,), [m]; negative out of reach."""
 
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
@@ -155,11 +136,6 @@ class CollisionModel:
     whole_arm: bool
     """True if the links must clear the obstacles, too; False for the hand alone."""
 
-    @property
-    def may_touch_itself(self) -> bool:
-        """True if links count, and plans within reach may touch the arm itself or the table."""
-        return self.whole_arm and self.arm.may_touch_itself
-
     def least_clearance(
         self,
         hand: Float,
@@ -170,8 +146,6 @@ class CollisionModel:
     ) -> Float:
         """Return the least clearance over time and obstacles, shape (N,).
 
-        Without joint angles, as for a plan, :meth:`with_self_clearance` applies to arms that may touch themselves.
-
         Args:
             hand: Hand positions, shape (N, T, D), [m].
             obstacles: Obstacles at rest, shape (N, n, 2 D + 1), [m].
@@ -179,25 +153,13 @@ class CollisionModel:
             joints: Joint angles, shape (N, T, J), [rad]; by default those of the inverse kinematics.
             floor: Value below which the result need not be exact, [m].
         """
-        least, checks_itself = np.full(len(hand), MAX_CLEARANCE), self.may_touch_itself and joints is None
-        links = self._links(hand, joints) if obstacles.shape[1] or checks_itself else None
-        if obstacles.shape[1]:
-            if links is not None and self.arm.traced:
-                traced, radii = ends_of(links), self.arm.link_radii
-                least = nearest_approach(traced, radii, obstacles, present, floor=floor)
-            else:
-                least = self._clearance(hand, self.arm.hand_radius, links, obstacles, present).min(axis=-1)
-        return np.asarray(self.with_self_clearance(least, links, time_axis=1) if checks_itself else least)
-
-    def with_self_clearance(self, least: Any, links: Any, time_axis: int | None = None) -> Any:
-        """Return clearances from obstacles, negative where a planned arm comes closer than SELF_MARGIN to itself.
-
-        Elsewhere the clearance from itself does not count: it is small in many configurations that are safe. The
-        minimum is taken over `time_axis`, if that is given.
-        """
-        found = np.asarray(self.arm.planned_self_clearance(links)) - SELF_MARGIN
-        found = found if time_axis is None else found.min(axis=time_axis)
-        return np.where(found < 0.0, np.minimum(least, found), least)
+        if not obstacles.shape[1]:
+            return np.full(len(hand), MAX_CLEARANCE)
+        links = self._links(hand, joints)
+        if links is not None and self.arm.traced:
+            return nearest_approach(ends_of(links), self.arm.link_radii, obstacles, present, floor=floor)
+        each = self._clearance(hand, self.arm.hand_radius, links, obstacles, present)
+        return np.asarray(each.min(axis=-1))
 
     def clearance_profile(
         self, hand: Float, obstacles: Float, present: Bool, joints: Float | None = None
@@ -213,13 +175,10 @@ class CollisionModel:
         if links is not None:
             # The last link of a traced arm ends in the hand.
             radius = self.arm.link_radii[-1] if self.arm.traced else radius
-            every, links = links, links.reshape(-1, 1, *links.shape[2:])
+            links = links.reshape(-1, 1, *links.shape[2:])
         rows, shown = obstacles.reshape(-1, *obstacles.shape[2:]), np.repeat(present, times, axis=0)
         profile = self._clearance(hand.reshape(-1, 1, hand.shape[-1]), radius, links, rows, shown)
-        profile = profile.reshape(number, times, most)
-        if self.may_touch_itself and joints is None:
-            profile = np.moveaxis(self.with_self_clearance(np.moveaxis(profile, -1, 0), every), 0, -1)
-        return profile
+        return profile.reshape(number, times, most)
 
     def _links(self, hand: Float, joints: Float | None) -> Float | None:
         if not self.whole_arm:

@@ -2,7 +2,7 @@
 
 A solver finds configurations at the nodes of a box: the hand at the node, oriented as at home, the joints as near their
 home as that allows. A tensor-product Chebyshev polynomial interpolates them, and a few Newton steps remove the hand's
-remaining error. The result is smooth and fast, and the same in NumPy and torch.
+remaining error. The result is smooth and fast.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Constants
 from viapoint.envs.arms.mjcf import grid
-from viapoint.envs.common.arrays import clamp
-from viapoint.envs.common.types import Box, Float
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.envs.common.types import Array, Box, Float
 
 DEGREE = 5
 """Degree of the polynomials along each axis."""
@@ -49,29 +47,25 @@ class IKTable:
 
     def __call__(self, hand: Array) -> Array:
         """Return joint angles, shape (..., J), [rad], for hand positions of shape (..., 3), [m]."""
-        xp = namespace_of(hand)
-        low, high = (xp.asarray(corner, dtype=hand.dtype) for corner in self.box)
-        inside = xp.minimum(xp.maximum(hand, low), high)
-        joints = xp.asarray(self._table, dtype=hand.dtype)  # first of shape (DEGREE + 1,) * 3 + (J,)
+        low, high = (np.asarray(corner, dtype=hand.dtype) for corner in self.box)
+        inside = np.minimum(np.maximum(hand, low), high)
+        joints = np.asarray(self._table, dtype=hand.dtype)
         for i in range(3):
             terms = _chebyshev(inside[..., i], self.box[0][i], self.box[1][i])
+            parts = np.moveaxis(joints, i - 4, 0)  # one for each term
+            rest = tuple(range(i - 3, 0))
             # Terms are added one by one: a matrix product's last bit would depend on the size of the batch.
-            rest = (None,) * (3 - i)
-            parts = [
-                joints[k] if i == 0 else joints[..., k, *[slice(None)] * (3 - i)] for k in range(DEGREE + 1)
-            ]
-            joints = terms[0][(..., *rest)] * parts[0]
+            joints = np.expand_dims(terms[0], rest) * parts[0]
             for term, part in zip(terms[1:], parts[1:], strict=True):
-                joints = joints + term[(..., *rest)] * part
+                joints = joints + np.expand_dims(term, rest) * part
         for _ in range(NEWTON_STEPS):
             joints = joints + self._newton_step(joints, inside)
         return joints
 
-    def margin(self, hand: Array) -> Array:
+    def margin(self, hand: Array) -> Any:
         """Return the distance of the hand from the nearest face of the box, shape (...,), [m], positive inside."""
-        xp = namespace_of(hand)
-        low, high = (xp.asarray(corner, dtype=hand.dtype) for corner in self.box)
-        return xp.min(xp.minimum(hand - low, high - hand), axis=-1)
+        low, high = (np.asarray(corner, dtype=hand.dtype) for corner in self.box)
+        return np.min(np.minimum(hand - low, high - hand), axis=-1)
 
     @functools.cached_property
     def _table(self) -> Float:
@@ -82,7 +76,6 @@ class IKTable:
 
         With the Jacobian J of the hand's position and its error e the step is J^T (J J^T + damping)^-1 e.
         """
-        xp = namespace_of(joints)
         frames = self.chain.frames(joints)
         tip = frames[-1].transform(self.hand_offset)
         error = [hand[..., i] - tip[i] for i in range(3)]
@@ -98,7 +91,7 @@ class IKTable:
             for i in range(3)
         ]
         force = _solve_symmetric(gram, error)
-        return xp.stack([sum(c[i] * force[i] for i in range(3)) for c in columns], axis=-1)
+        return np.stack([sum(c[i] * force[i] for i in range(3)) for c in columns], axis=-1)
 
 
 def fit_ik_table(chain: Chain, hand_offset: Constants, home: Float, box: Box) -> IKTable:
@@ -178,9 +171,8 @@ def _gauss_newton_step(
 
 def _chebyshev(values: Array, low: float, high: float) -> list[Array]:
     """Return the Chebyshev polynomials of degree 0 to DEGREE over [low, high], by their three-term recurrence."""
-    xp = namespace_of(values)
-    x = clamp((values - low) * (2.0 / (high - low)) - 1.0, -1.0, 1.0)
-    terms = [xp.ones_like(x), x]
+    x = ((values - low) * (2.0 / (high - low)) - 1.0).clip(-1.0, 1.0)
+    terms = [np.ones_like(x), x]
     while len(terms) <= DEGREE:
         terms.append(2.0 * x * terms[-1] - terms[-2])
     return terms

@@ -1,8 +1,8 @@
 """Forward kinematics and inverse dynamics of a serial chain of hinges.
 
-All functions are batched and accept NumPy arrays and torch tensors. A vector is kept as its three components, each an
-array over the batch, so that every operation is one pass over contiguous memory. Products with constants that are 0 or
-1 in a robot's dimensions are skipped: most entries of its link frames are.
+All functions are batched, and compute in the precision of their arguments. A vector is kept as its three components,
+each an array over the batch, so that every operation is one pass over contiguous memory. Products with constants that
+are 0 or 1 in a robot's dimensions are skipped: most entries of its link frames are.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.arrays import cosine_and_sine
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.envs.common.types import Array
 
-Vector = Array
+Vector = Any
 """Three components: an array of shape (3, ...) or three arrays."""
 Constants = tuple[float, float, float]
 """Vector that is the same in the whole batch."""
@@ -91,11 +91,10 @@ class Chain:
 
     def frames(self, joints: Array) -> list[Frame]:
         """Return the world frame of every joint at angles of shape (..., J), [rad]."""
-        xp = namespace_of(joints)
         frames: list[Frame] = []
         cosines, sines = self._cosines_and_sines(joints)
-        units = xp.reshape(xp.asarray(np.eye(3), dtype=joints.dtype), (3, 3, *[1] * (joints.ndim - 1)))
-        previous = Frame(units[0], units[1], units[2], xp.zeros_like(units[0]))
+        units = np.eye(3, dtype=joints.dtype).reshape(3, 3, *[1] * (joints.ndim - 1))
+        previous = Frame(units[0], units[1], units[2], np.zeros_like(units[0]))
         for hinge, cosine, sine in zip(self.hinges, cosines, sines, strict=True):
             x, y, z = (previous.rotate(axis) for axis in hinge.turn)
             origin = previous.transform(hinge.offset)
@@ -105,13 +104,12 @@ class Chain:
 
     def points(self, joints: Array, places: tuple[tuple[int, Constants], ...]) -> Array:
         """Return the world positions of P points in frames of joints (index, point), shape (..., P, 3), [m]."""
-        xp = namespace_of(joints)
         frames = self.frames(joints)
         placed = [frames[index].transform(point) for index, point in places]
         # Each component is contiguous in memory: callers mostly read one component after the other.
         shape = (3, *joints.shape[:-1])
-        whole = [part if part.shape == shape else xp.broadcast_to(part, shape) for part in placed]
-        return xp.moveaxis(xp.stack(whole, axis=0), (0, 1), (-2, -1))
+        whole = [part if part.shape == shape else np.broadcast_to(part, shape) for part in placed]
+        return np.moveaxis(np.stack(whole, axis=0), (0, 1), (-2, -1))
 
     def torques(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
         """Return the torques of the motion without gravity, and those against gravity, shape (..., J) each, [N m].
@@ -130,7 +128,6 @@ class Chain:
             rates: Angular velocities, shape (..., J), [rad/s].
             accelerations: Angular accelerations, shape (..., J), [rad/s^2].
         """
-        xp = namespace_of(joints)
         turns = list(zip(*self._cosines_and_sines(joints), strict=True))
         forces, moments, ups = self._inertial_forces(turns, rates, accelerations)
         moving, holding = [], []
@@ -151,7 +148,7 @@ class Chain:
                     a + mass * b + c
                     for a, b, c in zip(lever, hinge.offset, previous.first_moments, strict=True)
                 ]
-        return xp.stack(moving[::-1], axis=-1), xp.stack(holding[::-1], axis=-1)
+        return np.stack(moving[::-1], axis=-1), np.stack(holding[::-1], axis=-1)
 
     def _inertial_forces(
         self, turns: list[tuple[Array, Array]], rates: Array, accelerations: Array
@@ -196,7 +193,7 @@ class Chain:
     def _cosines_and_sines(self, joints: Array) -> tuple[Array, Array]:
         """Return cosine and sine of every angle, with the joints along the first axis."""
         angles = [joints[..., index] for index in range(len(self.hinges))]
-        return cosine_and_sine(namespace_of(joints).stack(angles, axis=0))
+        return cosine_and_sine(np.stack(angles, axis=0))
 
 
 def _acceleration_rows(spin: Vector, turn: Vector) -> list[Vector]:

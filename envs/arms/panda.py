@@ -27,12 +27,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from viapoint.envs.arms.serial_arm import serial_arm
-from viapoint.envs.common.arrays import clamp, cosine_and_sine, dot
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.envs.common.arrays import cosine_and_sine, dot
+from viapoint.envs.common.types import Array
 
 SHOULDER, UPPER, FORE, ELBOW, WRIST = 0.333, 0.316, 0.384, 0.0825, 0.088
 """Height of the shoulder, lengths of upper arm and forearm, and offsets of the axes of elbow and wrist, [m]."""
@@ -65,15 +66,14 @@ class PandaInverseKinematics:
 
     def __call__(self, hand: Array) -> Array:
         """Return joint angles, shape (..., 7), [rad], for hand positions of shape (..., 3), [m]."""
-        xp = namespace_of(hand)
         x, y = hand[..., 0], hand[..., 1]
         height = hand[..., 2] + (HAND_DROP - SHOULDER)
-        square, azimuth = x * x + y * y, xp.atan2(y, x)
+        square, azimuth = x * x + y * y, np.atan2(y, x)
         roll = ROLL_SHARE * azimuth
         c3, s3 = cosine_and_sine(roll)
-        cos_b, sin_b = xp.ones_like(x), xp.zeros_like(x)
+        cos_b, sin_b = np.ones_like(x), np.zeros_like(x)
         for _ in range(ITERATIONS):
-            reach = xp.sqrt(xp.maximum(square - (WRIST * sin_b) ** 2, 1e-4)) - WRIST * cos_b  # (1)
+            reach = np.sqrt(np.maximum(square - (WRIST * sin_b) ** 2, 1e-4)) - WRIST * cos_b  # (1)
             between, c4, s4 = _elbow(reach * reach + height * height)  # (2)
             fold = ELBOW - ELBOW * c4 - FORE * s4
             rise = UPPER - ELBOW * s4 + FORE * c4
@@ -81,39 +81,38 @@ class PandaInverseKinematics:
             c2, s2, ahead = _shoulder(lean, rise, height)  # (3)
             # Horizontal direction of the forearm in the frame of joint 1, in which the wrist is at (ahead, left).
             fore = c4 * s2 - s4 * c3 * c2, -s4 * s3
-            scale = 1.0 / xp.sqrt((fore[0] ** 2 + fore[1] ** 2) * (ahead**2 + left**2))
+            scale = 1.0 / np.sqrt((fore[0] ** 2 + fore[1] ** 2) * (ahead**2 + left**2))
             cos_b = (fore[0] * ahead + fore[1] * left) * scale  # (4)
             sin_b = (fore[1] * ahead - fore[0] * left) * scale
-        q2, q4 = xp.atan2(s2, c2), xp.acos(between) + ELBOW_ANGLE
-        wrist_azimuth = azimuth - xp.atan2(WRIST * sin_b, reach + WRIST * cos_b)
-        q1 = wrist_azimuth - xp.atan2(left, ahead)
+        q2, q4 = np.atan2(s2, c2), np.acos(between) + ELBOW_ANGLE
+        wrist_azimuth = azimuth - np.atan2(WRIST * sin_b, reach + WRIST * cos_b)
+        q1 = wrist_azimuth - np.atan2(left, ahead)
         # Joint 6 bends the forearm's direction to the vertical. Its axis is horizontal if x5, which is normal to the
         # forearm, lies in the vertical plane through it; joint 5 turns x4 to x5, and y3 is normal to x4 and forearm.
-        level = xp.sqrt(fore[0] ** 2 + fore[1] ** 2)
+        level = np.sqrt(fore[0] ** 2 + fore[1] ** 2)
         upwards = s4 * c3 * s2 + c4 * c2
         along, across = fore[0] / level, fore[1] / level
         x5 = upwards * along, upwards * across, -level
         x4 = c4 * c3 * c2 + s4 * s2, c4 * s3, -c4 * c3 * s2 + s4 * c2
         y3 = -s3 * c2, c3, s3 * s2
-        q5 = xp.atan2(dot(x5, y3), dot(x5, x4))
-        q6 = xp.atan2(level, upwards)
-        q7 = q1 + xp.atan2(fore[1], fore[0]) + np.pi / 4  # keeps the heading
-        return xp.stack((q1, q2, roll, q4, q5, q6, q7), axis=-1)
+        q5 = np.atan2(dot(x5, y3), dot(x5, x4))
+        q6 = np.atan2(level, upwards)
+        q7 = q1 + np.atan2(fore[1], fore[0]) + np.pi / 4  # keeps the heading
+        return np.stack((q1, q2, roll, q4, q5, q6, q7), axis=-1)
 
-    def margin(self, hand: Array) -> Array:
+    def margin(self, hand: Array) -> Any:
         """Return the least distance to the bounds of the reach, shape (...,), [m].
 
         The bounds are a shell about the shoulder, a column and a wedge about the axis of joint 1, the table, and a
         greatest height.
         """
-        xp = namespace_of(hand)
         x, y, height = hand[..., 0], hand[..., 1], hand[..., 2]
-        column = xp.sqrt(x * x + y * y + 1e-12)
-        reach = xp.sqrt((column - WRIST) ** 2 + (height + (HAND_DROP - SHOULDER)) ** 2)
-        arc = (MAX_AZIMUTH - xp.abs(xp.atan2(y, x))) * column
-        shell = xp.minimum(reach - MIN_REACH, MAX_REACH - reach)
-        level = xp.minimum(height - MIN_HEIGHT, MAX_HEIGHT - height)
-        return xp.minimum(xp.minimum(shell, arc), xp.minimum(column - MIN_DISTANCE, level))
+        column = np.sqrt(x * x + y * y + 1e-12)
+        reach = np.sqrt((column - WRIST) ** 2 + (height + (HAND_DROP - SHOULDER)) ** 2)
+        arc = (MAX_AZIMUTH - np.abs(np.atan2(y, x))) * column
+        shell = np.minimum(reach - MIN_REACH, MAX_REACH - reach)
+        level = np.minimum(height - MIN_HEIGHT, MAX_HEIGHT - height)
+        return np.minimum(np.minimum(shell, arc), np.minimum(column - MIN_DISTANCE, level))
 
 
 def _elbow(square: Array) -> tuple[Array, Array, Array]:
@@ -121,10 +120,9 @@ def _elbow(square: Array) -> tuple[Array, Array, Array]:
 
     The argument is the squared distance of shoulder and wrist, [m^2].
     """
-    xp = namespace_of(square)
     cosine = (UPPER_SIDE**2 + FORE_SIDE**2 - square) * (0.5 / (UPPER_SIDE * FORE_SIDE))
-    cosine = clamp(cosine, -0.9999, 0.9999)
-    sine = xp.sqrt(1.0 - cosine * cosine)
+    cosine = cosine.clip(-0.9999, 0.9999)
+    sine = np.sqrt(1.0 - cosine * cosine)
     c, s = math.cos(ELBOW_ANGLE), math.sin(ELBOW_ANGLE)
     return cosine, c * cosine - s * sine, s * cosine + c * sine
 
@@ -134,11 +132,10 @@ def _shoulder(lean: Array, rise: Array, height: Array) -> tuple[Array, Array, Ar
 
     Joint 2 turns (lean, rise) into (ahead, height): height = rise cos q2 - lean sin q2.
     """
-    xp = namespace_of(lean)
     square = lean * lean + rise * rise
-    length = xp.sqrt(square)
-    up = length * clamp(height / length, -0.9999, 0.9999)
-    ahead = xp.sqrt(square - up * up)
+    length = np.sqrt(square)
+    up = length * (height / length).clip(-0.9999, 0.9999)
+    ahead = np.sqrt(square - up * up)
     share = 1.0 / square
     return (up * rise + ahead * lean) * share, (ahead * rise - up * lean) * share, ahead
 
@@ -151,7 +148,6 @@ PANDA = serial_arm(
     ik=PandaInverseKinematics(),
     workspace=((0.36, -0.36, 0.06), (0.64, 0.36, 0.50)),
     hand_gains=(10000.0, 300.0),
-    may_touch_itself=False,
 )
 """Franka Emika Panda on a table, its base at the origin, x forwards and z up.
 

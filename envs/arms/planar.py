@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.mjcf import add_obstacles, read_spec
-from viapoint.envs.common.types import Box
+from viapoint.envs.common.types import Array, Box
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
-from viapoint.primitives.array_api import Array, Namespace, namespace_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,6 @@ class PlanarArm:
     traced: tuple[str, ...] = ()
     velocity_limit: tuple[float, ...] = ()
     link_joints: tuple[int, ...] = (0, 1)
-    may_touch_itself: bool = False
 
     @classmethod
     def from_file(cls, model_file: str) -> PlanarArm:
@@ -123,30 +121,23 @@ class PlanarArm:
 
     def hand_position(self, joints: Array) -> Array:
         """Return hand positions; see :meth:`viapoint.envs.arms.base.Arm.hand_position`."""
-        # Every step asks for this: NumPy arrays save the call.
-        xp = np if isinstance(joints, np.ndarray) else namespace_of(joints)
         upper, both = joints[..., 0], joints[..., 0] + joints[..., 1]
         l1, l2 = self.lengths
-        return xp.stack(
-            (l1 * xp.cos(upper) + l2 * xp.cos(both), l1 * xp.sin(upper) + l2 * xp.sin(both)), axis=-1
+        return np.stack(
+            (l1 * np.cos(upper) + l2 * np.cos(both), l1 * np.sin(upper) + l2 * np.sin(both)), axis=-1
         )
 
     def links(self, joints: Array) -> Array:
         """Return link segments; see :meth:`viapoint.envs.arms.base.Arm.links`."""
-        xp = namespace_of(joints)
         upper, hand = joints[..., 0], self.hand_position(joints)
-        elbow = (self.lengths[0] * xp.cos(upper), self.lengths[0] * xp.sin(upper))
-        zero = xp.zeros_like(upper)
-        ends = xp.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
-        return _batch_first(xp, xp.reshape(ends, (2, 2, 2, *zero.shape)), 3)
-
-    def planned_self_clearance(self, links: Array) -> Array:
-        """Return MAX_CLEARANCE; see :meth:`viapoint.envs.arms.base.Arm.planned_self_clearance`."""
-        return namespace_of(links).full_like(links[..., 0, 0, 0], MAX_CLEARANCE)
+        elbow = (self.lengths[0] * np.cos(upper), self.lengths[0] * np.sin(upper))
+        zero = np.zeros_like(upper)
+        ends = np.stack((zero, zero, *elbow, *elbow, hand[..., 0], hand[..., 1]))
+        return _batch_first(np.reshape(ends, (2, 2, 2, *zero.shape)), 3)
 
     def self_clearance(self, joints: Array) -> Array:
         """Return MAX_CLEARANCE: adjacent links may touch; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
-        return namespace_of(joints).full_like(joints[..., 0], MAX_CLEARANCE)
+        return np.full_like(joints[..., 0], MAX_CLEARANCE)
 
     def links_at(self, hand: Array) -> tuple[tuple[Array, Array], ...]:
         """Return both ends of each link for the hand at `hand`, shape (..., 2), [m], without computing angles.
@@ -155,43 +146,40 @@ class PlanarArm:
         hand, longer or shorter than it is. Joint angles cost more: 1.7 times the time in single precision, 17 times in
         double precision (1,280 positions in each of 64 scenes).
         """
-        xp = namespace_of(hand)
-        (c1, s1), _ = self._directions(hand, xp)
+        (c1, s1), _ = self._directions(hand)
         square = c1 * c1 + s1 * s1
         # With the hand at the shoulder every direction is a solution: take that of the inverse kinematics.
-        c1, square = (xp.where(square > 0.0, each, xp.ones_like(each)) for each in (c1, square))
-        upper = self.lengths[0] / xp.sqrt(square)
-        elbow = _batch_first(xp, xp.stack((c1 * upper, s1 * upper)))
-        return (xp.zeros_like(elbow), elbow), (elbow, hand)
+        c1, square = (np.where(square > 0.0, each, 1.0) for each in (c1, square))
+        upper = self.lengths[0] / np.sqrt(square)
+        elbow = _batch_first(np.stack((c1 * upper, s1 * upper)))
+        return (np.zeros_like(elbow), elbow), (elbow, hand)
 
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`.
 
         Out of reach, the elbow is as straight or as bent as it can be.
         """
-        return self._configurations(hand, namespace_of(hand))[0]
+        return self._configurations(hand)[0]
 
-    def reach_margin(self, hand: Array) -> Array:
+    def reach_margin(self, hand: Array) -> Any:
         """Return the distance inside the reach; see :meth:`viapoint.envs.arms.base.Arm.reach_margin`.
 
         It is the least of the distances to the inner and the outer circle and, along arcs, to the shoulder's limits.
         """
-        xp = np if isinstance(hand, np.ndarray) else namespace_of(hand)
-        distance = xp.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
+        distance = np.sqrt(hand[..., 0] ** 2 + hand[..., 1] ** 2)
         near, far = self.reach
         low, high = self.joint_range[0]
-        (cosine, sine), _ = self._directions(hand, xp)
-        shoulder = xp.atan2(sine, cosine)
-        arc = xp.minimum(shoulder - low, high - shoulder) * distance
-        return xp.minimum(xp.minimum(distance - near, far - distance), arc)
+        (cosine, sine), _ = self._directions(hand)
+        shoulder = np.atan2(sine, cosine)
+        arc = np.minimum(shoulder - low, high - shoulder) * distance
+        return np.minimum(np.minimum(distance - near, far - distance), arc)
 
     def required_time_scale(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return 1: human joints have no velocity limit; see :meth:`viapoint.envs.arms.base.Arm.required_time_scale`.
 
         The simulation enforces the torque limits, which random movements reach twice in ten thousand.
         """
-        xp = namespace_of(position)
-        return xp.ones_like(position[..., 0, 0])
+        return np.ones_like(position[..., 0, 0])
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return computed-torque controls; see :meth:`viapoint.envs.arms.base.Arm.controls`.
@@ -199,18 +187,17 @@ class PlanarArm:
         The actuator's torque is control - stiffness * angle - damping * velocity, limited to `torque_limit`. So the
         control is the torque of the inverse dynamics plus stiffness and damping times the references, [N m].
         """
-        xp = np if isinstance(position, np.ndarray) else namespace_of(position)
-        joints, upper_arm, forearm, sine = self._configurations(position, xp)
+        joints, upper_arm, forearm, sine = self._configurations(position)
         rates = self._rates(position, forearm, sine, velocity)
         centripetal = (self.lengths[0] * rates[0] ** 2, self.lengths[1] * (rates[0] + rates[1]) ** 2)
         # Differentiating J q' = v gives J q'' = a - J' q', and -J' q' is the sum of centripetal terms along the links.
         relative = tuple(
             acceleration[..., i] + centripetal[0] * upper_arm[i] + centripetal[1] * forearm[i] for i in (0, 1)
         )
-        accelerations = self._rates(position, forearm, sine, xp.stack(relative, axis=-1))
+        accelerations = self._rates(position, forearm, sine, np.stack(relative, axis=-1))
         cosine = upper_arm[0] * forearm[0] + upper_arm[1] * forearm[1]
         torques = self._torques(cosine, sine, rates, accelerations)
-        return xp.stack(
+        return np.stack(
             [
                 torques[i]
                 + self.stiffness[i] * joints[..., i]
@@ -220,15 +207,13 @@ class PlanarArm:
             axis=-1,
         )
 
-    def _configurations(
-        self, hand: Array, xp: Namespace
-    ) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
+    def _configurations(self, hand: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array], Array]:
         """Return joint angles, unit vectors along upper arm and forearm, and the sine of the elbow's angle."""
-        (c1, s1), (cosine, sine) = self._directions(hand, xp)
-        joints = _batch_first(xp, xp.stack((xp.atan2(s1, c1), xp.atan2(sine, cosine))))
+        (c1, s1), (cosine, sine) = self._directions(hand)
+        joints = _batch_first(np.stack((np.atan2(s1, c1), np.atan2(sine, cosine))))
         return joints, (c1, s1), (c1 * cosine - s1 * sine, s1 * cosine + c1 * sine), sine
 
-    def _directions(self, hand: Array, xp: Namespace) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def _directions(self, hand: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Return cosine and sine of the shoulder's angle, and of the elbow's, by the law of cosines.
 
         The hand is at `along`, `across` in the frame of the upper arm; the shoulder turns that point to (x, y).
@@ -238,7 +223,7 @@ class PlanarArm:
         x, y = hand[..., 0], hand[..., 1]
         cosine = (x * x + y * y - (l1**2 + l2**2)) * (0.5 / (l1 * l2))
         cosine = cosine.clip(float(np.cos(high)), float(np.cos(low)))
-        sine = xp.sqrt(1.0 - cosine * cosine)
+        sine = np.sqrt(1.0 - cosine * cosine)
         along, across = l1 + l2 * cosine, l2 * sine
         scale = 1.0 / (along * along + across * across)
         shoulder = (along * x + across * y) * scale, (along * y - across * x) * scale
@@ -255,7 +240,11 @@ class PlanarArm:
         return shoulder, elbow
 
     def _torques(
-        self, cosine: Array, sine: Array, rates: tuple[Array, Array], accelerations: tuple[Array, Array]
+        self,
+        cosine: Array,
+        sine: Array,
+        rates: tuple[Array, Array],
+        accelerations: tuple[Array, Array],
     ) -> tuple[Array, Array]:
         """Return the torques of the inverse dynamics of the two links without viscosity, [N m]."""
         a, b, c = self._inertia
@@ -275,9 +264,9 @@ def _pair(values: Any) -> tuple[float, float]:
     return float(first), float(second)
 
 
-def _batch_first(xp: Namespace, array: Array, axes: int = 1) -> Array:
+def _batch_first(array: Array, axes: int = 1) -> Array:
     """Return a view with the first `axes` axes moved behind the batch."""
-    return xp.moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
+    return np.moveaxis(array, tuple(range(axes)), tuple(range(-axes, 0)))
 
 
 def _lower_into_plane(spec: mujoco.MjSpec) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import mujoco
@@ -16,17 +15,16 @@ from viapoint.envs.arms.mjcf import (
     Pose,
     add_obstacles,
     bodies_moved_by,
-    grid,
     in_frame,
     joint_frames,
     kinematic_chain,
     read_spec,
     zero_configuration,
 )
-from viapoint.envs.common.types import Box, Float
+from viapoint.envs.common.types import Array, Box, Float
 from viapoint.envs.geometry.distance import MAX_CLEARANCE
 from viapoint.envs.geometry.segments import segment_axis_squared
-from viapoint.primitives.array_api import Array, namespace_of
+from viapoint.envs.geometry.shape import GUARD
 
 DIFFERENCE_STEP = 1e-3
 """Step of the central differences that give joint rates and accelerations, [s]."""
@@ -42,8 +40,6 @@ HAND_BANDWIDTH, HAND_DAMPING_RATIO = 50.0, 0.75
 """Natural frequency of the hand's servo, [rad/s], and its damping ratio."""
 ORIGIN = "origin"
 """Name of the site at the world's origin, from which the hand's actuators measure."""
-NEAR, REACH_GRID = 0.05, np.linspace(-1.0, 1.0, 41)
-"""Clearance below which pairs of capsules are near, and coordinates of the grid on which these are searched, [m]."""
 MARKER: dict[str, Any] = {"size": (0.001, 0.0, 0.0), "group": 5}
 """Attributes of an invisible site that only marks a point."""
 
@@ -54,7 +50,7 @@ class InverseKinematics(Protocol):
     def __call__(self, hand: Array) -> Array:
         """Return joint angles, shape (..., J), [rad], for hand positions of shape (..., 3), [m]."""
 
-    def margin(self, hand: Array) -> Array:
+    def margin(self, hand: Array) -> Any:
         """Return the distance of the hand inside the reach, shape (...,), [m]; negative out of reach."""
 
 
@@ -127,7 +123,6 @@ class SerialArm:
     """Stiffness of the hand's servo, [N/m]."""
     hand_damping: float
     """Damping of the hand's servo, [N s/m]."""
-    may_touch_itself: bool
     dimension: int = 3
 
     @property
@@ -159,49 +154,30 @@ class SerialArm:
 
     def links(self, joints: Array) -> Array:
         """Return the axes of the capsules; see :meth:`viapoint.envs.arms.base.Arm.links`."""
-        xp = namespace_of(joints)
         places = tuple((capsule.joint, end) for capsule in self.shape for end in capsule.ends)
         points = self.chain.points(joints, places)
-        return xp.reshape(points, (*joints.shape[:-1], len(self.shape), 2, 3))
+        return np.reshape(points, (*joints.shape[:-1], len(self.shape), 2, 3))
 
     def self_clearance(self, joints: Array) -> Array:
         """Return the clearance of the arm from itself; see :meth:`viapoint.envs.arms.base.Arm.self_clearance`."""
-        return self._clearance_of_pairs(self.links(joints), self.self_pairs)
-
-    def planned_self_clearance(self, links: Array) -> Array:
-        """Return the clearance of links; see :meth:`viapoint.envs.arms.base.Arm.planned_self_clearance`."""
-        return self._clearance_of_pairs(links, self._pairs_within_reach)
-
-    def _clearance_of_pairs(self, links: Array, pairs: Sequence[tuple[int, int]]) -> Array:
-        """Return the least clearance of pairs of capsules and of capsules from the table, shape (...,), [m]."""
-        xp, ends = namespace_of(links), links
-        if any(second >= len(self.shape) for _, second in pairs):  # of the base
-            base = xp.asarray(np.array([c.ends for c in self.base]), dtype=links.dtype)
-            ends = xp.concat((links, xp.broadcast_to(base, (*links.shape[:-3], *base.shape))), axis=-3)
+        links = self.links(joints)
+        base = np.array([capsule.ends for capsule in self.base], dtype=links.dtype).reshape(-1, 2, 3)
+        ends = np.concat((links, np.broadcast_to(base, (*links.shape[:-3], *base.shape))), axis=-3)
         radii = np.array([capsule.radius for capsule in (*self.shape, *self.base)])
-        found = [xp.full_like(links[..., 0, 0, :1], MAX_CLEARANCE)]
-        if pairs:
-            found.append(capsule_pair_clearance(ends, radii, pairs))
+        least = np.full_like(links[..., 0, 0, 0], MAX_CLEARANCE)
+        if self.self_pairs:
+            least = np.minimum(least, capsule_pair_clearance(ends, radii, self.self_pairs).min(axis=-1))
         if self.off_table:
             some = list(self.off_table)
-            lowest = xp.min(links[..., 2][..., some, :], axis=-1)
-            found.append(lowest - xp.asarray(radii[some], dtype=links.dtype))
-        return functools.reduce(xp.minimum, [xp.min(each, axis=-1) for each in found])
-
-    @functools.cached_property
-    def _pairs_within_reach(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of capsules that come closer than NEAR to one another in some configuration within reach."""
-        hand = grid([REACH_GRID, REACH_GRID, REACH_GRID[REACH_GRID >= 0.0]]).reshape(-1, 3)
-        joints = self.ik(hand[np.asarray(self.ik.margin(hand)) >= 0.0])
-        alone = (replace(self, self_pairs=(pair,), off_table=()) for pair in self.self_pairs)
-        near = [bool((arm.self_clearance(joints) < NEAR).any()) for arm in alone]
-        return tuple(itertools.compress(self.self_pairs, near))
+            height = links[..., 2][..., some, :].min(axis=-1) - np.asarray(radii[some], dtype=links.dtype)
+            least = np.minimum(least, height.min(axis=-1))
+        return np.asarray(least)
 
     def inverse_kinematics(self, hand: Array) -> Array:
         """Return joint angles; see :meth:`viapoint.envs.arms.base.Arm.inverse_kinematics`."""
         return self.ik(hand)
 
-    def reach_margin(self, hand: Array) -> Array:
+    def reach_margin(self, hand: Array) -> Any:
         """Return the distance inside the reach; see :meth:`viapoint.envs.arms.base.Arm.reach_margin`."""
         return self.ik.margin(hand)
 
@@ -211,15 +187,14 @@ class SerialArm:
         A movement that takes s times as long has 1/s of the rates, 1/s^2 of the torques of motion, and the same torques
         against gravity (J. M. Hollerbach, Dynamic scaling of manipulator trajectories, 1984).
         """
-        xp = namespace_of(position)
         motion = self._joint_motion(position, velocity, acceleration)
         rates = LIMIT_SHARE * _limits(self.velocity_limit, position)
         torques = _limits(self.torque_limit, position)
-        left = xp.maximum(LIMIT_SHARE * torques - xp.abs(motion.weight), LEAST_TORQUE_SHARE * torques)
-        fastest = xp.max(xp.abs(motion.rate) / rates, axis=-1)
-        strongest = xp.sqrt(xp.max(xp.abs(motion.torque) / left, axis=-1))
-        factor = xp.max(xp.maximum(fastest, strongest), axis=-1)
-        return xp.where(factor > 1.0, factor, xp.ones_like(factor))
+        left = np.maximum(LIMIT_SHARE * torques - np.abs(motion.weight), LEAST_TORQUE_SHARE * torques)
+        fastest = np.max(np.abs(motion.rate) / rates, axis=-1)
+        strongest = np.sqrt(np.max(np.abs(motion.torque) / left, axis=-1))
+        factor = np.max(np.maximum(fastest, strongest), axis=-1)
+        return np.where(factor > 1.0, factor, 1.0)
 
     def controls(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return controls; see :meth:`viapoint.envs.arms.base.Arm.controls`.
@@ -227,20 +202,18 @@ class SerialArm:
         An actuator's force is control - stiffness * position - damping * velocity. So its control is stiffness and
         damping times the references, and for a joint also the torque of the inverse dynamics (feedforward).
         """
-        xp = namespace_of(position)
         strided = (part[..., ::CONTROL_STRIDE, :] for part in (position, velocity, acceleration))
         motion = self._joint_motion(*strided)
         stiffness, damping = (_limits(gain, position) for gain in (self.joint_stiffness, self.joint_damping))
         joints = motion.torque + stiffness * motion.angle + damping * motion.rate
         hand = self.hand_stiffness * position + self.hand_damping * velocity
-        return xp.concat((hand, _interpolate(joints, position.shape[-2])), axis=-1)
+        return np.concat((hand, _interpolate(joints, position.shape[-2])), axis=-1)
 
     def _joint_motion(self, position: Array, velocity: Array, acceleration: Array) -> JointMotion:
         """Return the joints' motion by central differences of the inverse kinematics along the hand's parabola."""
-        xp = namespace_of(position)
         ahead, bow = velocity * DIFFERENCE_STEP, acceleration * (0.5 * DIFFERENCE_STEP * DIFFERENCE_STEP)
         before, now, after = self.ik(
-            xp.stack((position - ahead + bow, position, position + ahead + bow), axis=0)
+            np.stack((position - ahead + bow, position, position + ahead + bow), axis=0)
         )
         rate = (after - before) * (0.5 / DIFFERENCE_STEP)
         gain = (after - 2.0 * now + before) * (1.0 / DIFFERENCE_STEP**2)
@@ -282,16 +255,14 @@ def capsule_pair_clearance(ends: Array, radii: Float, pairs: Sequence[tuple[int,
         radii: Radii, shape (C,), [m].
         pairs: Pairs of indices of capsules.
     """
-    xp = namespace_of(ends)
     first, second = (list(each) for each in zip(*pairs, strict=True))
     # Each component is an array (capsules, ...): the operations are passes over contiguous memory.
-    start = [xp.moveaxis(ends[..., 0, i], -1, 0) for i in range(3)]
-    axis = [xp.moveaxis(ends[..., 1, i], -1, 0) - part for i, part in enumerate(start)]
+    start = [np.moveaxis(ends[..., 0, i], -1, 0) for i in range(3)]
+    axis = [np.moveaxis(ends[..., 1, i], -1, 0) - part for i, part in enumerate(start)]
     gap = [part[first] - part[second] for part in start]
     squared = segment_axis_squared(gap, *([part[some] for part in axis] for some in (first, second)))
-    # The small summand keeps gradients of capsules whose axes meet finite.
-    distance = xp.moveaxis(xp.sqrt(squared + 1e-24), 0, -1)
-    return distance - xp.asarray(radii[first] + radii[second], dtype=ends.dtype)
+    distance = np.moveaxis(np.sqrt(squared + GUARD), 0, -1)
+    return np.asarray(distance - np.asarray(radii[first] + radii[second], dtype=ends.dtype))
 
 
 def serial_arm(
@@ -303,11 +274,11 @@ def serial_arm(
     ik: InverseKinematics,
     workspace: Box,
     hand_gains: tuple[float, float] | None = None,
-    may_touch_itself: bool = True,
 ) -> SerialArm:
     """Return the arm of a complete MJCF file: named capsules and spheres for links and base, a sphere `hand`, limits.
 
-    Links touch one another, the base or the table `table` where their contact bits allow it.
+    Links touch one another, the base or the table `table` where their contact bits allow it. Within the reach of the
+    inverse kinematics they must not: plans are not checked for it.
 
     Args:
         model_file: File among the package's assets, a path, or the text of a file.
@@ -318,7 +289,6 @@ def serial_arm(
         workspace: Two opposite corners of the box in which movements start and end, [m].
         hand_gains: Stiffness [N/m] and damping [N s/m] of the hand's servo; by default those of its effective mass in
             the middle of the workspace.
-        may_touch_itself: False if it is known that no configuration within reach touches the arm itself or the table.
     """
     model = read_spec(model_file).compile()
     joints = [model.joint(joint) for joint in joint_names]
@@ -351,7 +321,6 @@ def serial_arm(
         joint_damping=tuple(2.0 * float(m) * JOINT_BANDWIDTH for m in inertias),
         hand_stiffness=hand_gains[0],
         hand_damping=hand_gains[1],
-        may_touch_itself=may_touch_itself,
     )
 
 
@@ -435,15 +404,14 @@ def _add_servo(
 
 
 def _limits(values: tuple[float, ...], like: Array) -> Array:
-    """Return numbers as an array of the library and dtype of another."""
-    return namespace_of(like).asarray(values, dtype=like.dtype)
+    """Return numbers as an array of the precision of another."""
+    return np.asarray(values, dtype=like.dtype)
 
 
 def _interpolate(knots: Array, number: int) -> Array:
     """Return values at `number` steps, linear between knots (..., K, U) at every CONTROL_STRIDE-th; the last holds."""
-    xp = namespace_of(knots)
-    following = xp.concat((knots[..., 1:, :], knots[..., -1:, :]), axis=-2)
-    share = xp.asarray(np.arange(CONTROL_STRIDE)[:, None] / CONTROL_STRIDE, dtype=knots.dtype)
+    following = np.concat((knots[..., 1:, :], knots[..., -1:, :]), axis=-2)
+    share = np.asarray(np.arange(CONTROL_STRIDE)[:, None] / CONTROL_STRIDE, dtype=knots.dtype)
     between = knots[..., :, None, :] + share * (following - knots)[..., :, None, :]
-    flat = xp.reshape(between, (*knots.shape[:-2], -1, knots.shape[-1]))
+    flat = np.reshape(between, (*knots.shape[:-2], -1, knots.shape[-1]))
     return flat[..., :number, :]

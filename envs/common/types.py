@@ -13,6 +13,8 @@ Single = NDArray[np.float32]
 """Array of single precision."""
 Numbers = NDArray[np.floating[Any]]
 """Array of single or double precision."""
+Array = NDArray[Any]
+"""Array of single or double precision where results have that of the arguments."""
 Bool = NDArray[np.bool_]
 """Array of truth values."""
 Int = NDArray[np.int64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, cast
 
@@ -34,16 +34,17 @@ def whole_number(name: str, value: Any, least: int, most: int | None = None) -> 
     return int(value)
 
 
-def check_increasing_pair(name: str, pair: Any) -> None:
-    """Check that a pair is two positive finite numbers in increasing order."""
+def check_increasing_pair(name: str, pair: Any, least: float = 0.0, most: float = np.inf) -> None:
+    """Check that a pair is two positive finite numbers in increasing order, from `least` to `most`."""
     try:
         low, high = pair
     except (TypeError, ValueError):
         low = high = None
-    if not (is_number(low) and is_number(high)):
-        raise ValueError(f"{name} must be two numbers, got {pair!r}")
-    if not (0.0 < low < high < float("inf")):
-        raise ValueError(f"{name} must be two positive numbers in increasing order, got {pair!r}")
+    numbers = is_number(low) and is_number(high)
+    if not numbers or not 0.0 < low < high < np.inf or low < least or high > most:
+        raise ValueError(
+            f"{name} must be two positive numbers in increasing order, from {least:g} to {most:g}, got {pair!r}"
+        )
 
 
 def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,20 +55,33 @@ def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def fewest_and_most(number: Any, name: str = "n_obstacles") -> tuple[int, int]:
-    """Return (fewest, most) from an exact number or such a pair."""
-    pair = (number, number) if isinstance(number, int | np.integer) else number
+def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:
+    """Return (fewest, most) from an exact number or such a pair.
+
+    Args:
+        name: Name of the argument for errors.
+        number: Number or pair.
+        most: Greatest allowed number.
+        most_drawn: Greatest allowed `fewest`.
+    """
     try:
-        fewest, most = pair
-        return whole_number(name, fewest, 0), whole_number(name, most, 0)
+        fewest, greatest = (number, number) if is_whole(number) else number
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a whole number or (fewest, most), got {number!r}") from None
+        fewest = greatest = None
+    whole = is_whole(fewest) and is_whole(greatest)
+    if not whole or not 0 <= fewest <= greatest <= most or fewest > most_drawn:
+        raise ValueError(
+            f"{name} must be a whole number from 0 to {most_drawn} or (fewest, most) with most up to {most}, "
+            f"got {number!r}"
+        )
+    return int(fewest), int(greatest)
 
 
-def number_of_at_least(name: str, value: Any, least: float, why: str = "") -> float:
-    """Return a finite real number that is at least `least`; `why` explains the bound in the error."""
-    if not is_number(value) or not least <= float(value) < np.inf:
-        raise ValueError(f"{name} must be a finite number, {least:g} or more{why}, got {value!r}")
+def number_of_at_least(name: str, value: Any, least: float, below: float = np.inf) -> float:
+    """Return a finite real number that is at least `least` and less than `below`."""
+    if not is_number(value) or not least <= float(value) < below:
+        allowed = f"{least:g} or more" if below == np.inf else f"from {least:g} to less than {below:g}"
+        raise ValueError(f"{name} must be a finite number, {allowed}, got {value!r}")
     return float(value)
 
 
@@ -96,29 +110,15 @@ def as_real_array(values: Any) -> NDArray[Any] | None:
     """Return real numbers as an array, or None for anything else."""
     try:
         array = np.asarray(values)
-    except (TypeError, ValueError):  # for example rows of different lengths
+    except (TypeError, ValueError, RuntimeError):
+        # Rows of different lengths, or tensors that require a gradient.
         return None
     return array if array.dtype.kind in "fiu" else None
 
 
-def real_numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return actions as an array of real numbers; the error names their shape, which is not checked."""
-    array = as_real_array(actions)
-    if array is None:
-        raise ValueError(f"action must be real numbers of shape {shape}, got {actions!r}")
-    return array
-
-
 def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
     """Return finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
-    shape = (num_envs, len(names))
-    array = real_numbers(actions, shape).astype(np.float64, copy=False)
-    if array.shape != shape:
-        raise ValueError(f"action must have shape {shape} ({', '.join(names)}), got {array.shape}")
-    if not np.isfinite(array).all():
-        env, component = np.argwhere(~np.isfinite(array))[0]
-        value = array[env, component]
-        raise ValueError(f"action must be finite, got {value} for {names[component]} of environment {env}")
+    array = finite_array(f"actions of all environments ({', '.join(names)})", actions, (num_envs, len(names)))
     return np.clip(array, -1.0, 1.0)
 
 
@@ -137,20 +137,33 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     return seeds
 
 
-def as_constants(name: str, values: Any, wanted: str, fits: Callable[..., bool]) -> Float:
-    """Return real numbers as a new array, without a gradient.
+def finite_array(name: str, values: Any, *shapes: tuple[Any, ...]) -> Float:
+    """Return finite real numbers as an array of double precision; an array that is one already is not copied.
 
     Args:
         name: Name of the argument for errors.
         values: Array or nested lists.
-        wanted: Description of the shape for errors.
-        fits: Function that returns True for an allowed shape, given as its lengths.
+        *shapes: Allowed shapes; None stands for any length but 0, and an ellipsis in front for any leading axes.
+            Without shapes, all are allowed.
     """
-    try:
-        array = as_real_array(values)
-    except RuntimeError:  # of torch, which converts no tensors with a gradient
-        raise ValueError(f"{name} must not require a gradient, use {name}.detach()") from None
-    if array is None or not fits(*array.shape):
-        got = "no real numbers" if array is None else f"shape {array.shape}"
-        raise ValueError(f"{name} must have shape {wanted}, got {got}")
-    return array.astype(np.float64)
+    array = as_real_array(values)
+    if array is None:
+        raise ValueError(f"{name} must be an array of real numbers, got {values!r:.60}")
+    if shapes and not any(_fits(array.shape, shape) for shape in shapes):
+        allowed = " or ".join(map(str, shapes)).replace("Ellipsis", "...").replace("None", "n")
+        raise ValueError(f"{name} must have shape {allowed}, got {array.shape}")
+    finite = np.isfinite(array)
+    if not finite.all():
+        raise ValueError(f"{name} must be finite, got {array[~finite][0]}")
+    return array.astype(np.float64, copy=False)
+
+
+def _fits(shape: tuple[int, ...], allowed: tuple[Any, ...]) -> bool:
+    """Return True if a shape is an allowed one; see :func:`finite_array`."""
+    if allowed[:1] == (...,):
+        allowed = allowed[1:]
+        shape = shape[max(len(shape) - len(allowed), 0) :]
+    if len(shape) != len(allowed):
+        return False
+    pairs = zip(shape, allowed, strict=True)
+    return all(size > 0 if wanted is None else size == wanted for size, wanted in pairs)

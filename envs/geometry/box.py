@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import clamp, dot, safe_ratio, spread
+from viapoint.envs.common.arrays import dot, safe_ratio
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.segments import lowest_of_lines
-from viapoint.envs.geometry.shape import CONTACT, GUARD, Components, Geom, Shape
-from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+from viapoint.envs.geometry.shape import CONTACT, Components, Geom, Shape, length
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +30,13 @@ class Box(Shape):
     kind: ClassVar[str] = "box"
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"size": (3,)}
 
-    size: Array
+    size: Any
     """Half lengths along the axes of the frame, shape (..., 3), [m]."""
 
     @property
-    def bounding_sphere(self) -> tuple[Array, Array]:
+    def bounding_sphere(self) -> tuple[Float, Float]:
         """Centre and radius, [m]."""
-        return self.position, namespace_of(self.size).sqrt(dot(self._half, self._half))
+        return self.position, np.sqrt(dot(self._half, self._half))
 
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo box."""
@@ -47,10 +46,10 @@ class Box(Shape):
     def _half(self) -> Components:
         return [self.size[..., i] for i in range(3)]
 
-    def _signed(self, points: Components) -> Array:
+    def _signed(self, points: Components) -> Float:
         return _signed(points, self._half)
 
-    def _nearest(self, start: Components, along: Components) -> Array:
+    def _nearest(self, start: Components, along: Components) -> Float:
         """Return t in [0, 1] for which the signed distance is least, exactly.
 
         Outside, half the derivative of the squared distance is sum_i along_i excess_i(t), where excess_i is how far the
@@ -58,10 +57,9 @@ class Box(Shape):
         line crosses a plane of a face, so its root follows from the two of these values around it. A segment that
         enters the box has its deepest point where two of the planes are equally far: a problem of six lines.
         """
-        xp = namespace_of(start[0])
-        vectors = spread(*start, *along, *self._half)
+        vectors = list(np.broadcast_arrays(*start, *along, *self._half))
         falling, rising = _rise(vectors, 0.0), _rise(vectors, 1.0)
-        t = xp.where(falling >= 0.0, xp.zeros_like(falling), xp.ones_like(falling))
+        t = np.where(falling >= 0.0, 0.0, 1.0)
         between = (falling < 0.0) & (rising > 0.0)
         if between.any():
             t[between] = _root([each[between] for each in vectors], falling[between], rising[between])
@@ -71,39 +69,37 @@ class Box(Shape):
             some = [each[inside] for each in (*start, *along, *half)]
             lines = [(u, p - h) for p, u, h in zip(some[:3], some[3:6], some[6:], strict=True)]
             lines += [(-u, -p - h) for p, u, h in zip(some[:3], some[3:6], some[6:], strict=True)]
-            t[inside] = lowest_of_lines(*(xp.stack(each) for each in zip(*lines, strict=True)))
+            t[inside] = lowest_of_lines(*(np.stack(each) for each in zip(*lines, strict=True)))
         return t
 
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
-        return np.asarray(np.sign(directions) * to_numpy(self.size))
+        return np.asarray(np.sign(directions) * self.size)
 
 
-def _rise(vectors: Components, t: Array | float) -> Array:
+def _rise(vectors: Components, t: Any) -> Float:
     """Return half the derivative by t of the squared distance from a box; components of start, along and half sizes."""
     start, along, half = vectors[:3], vectors[3:6], vectors[6:]
     places = [p + t * u for p, u in zip(start, along, strict=True)]
-    return dot(along, [q - clamp(q, -h, h) for q, h in zip(places, half, strict=True)])
+    return np.asarray(dot(along, [q - q.clip(-h, h) for q, h in zip(places, half, strict=True)]))
 
 
-def _root(vectors: Components, falling: Array, rising: Array) -> Array:
+def _root(vectors: Components, falling: Float, rising: Float) -> Float:
     """Return where :func:`_rise` is 0, if it is `falling` < 0 at t = 0 and `rising` > 0 at t = 1."""
-    xp = namespace_of(falling)
-    low, high = xp.zeros_like(falling), xp.ones_like(falling)
+    low, high = np.zeros_like(falling), np.ones_like(falling)
     for p, u, h in zip(vectors[:3], vectors[3:6], vectors[6:], strict=True):
         for face in (-h, h):
-            t = clamp(safe_ratio(face - p, u), 0.0, 1.0)
+            t = safe_ratio(face - p, u).clip(0.0, 1.0)
             at = _rise(vectors, t)
             later, sooner = (at < 0.0) & (t > low), (at >= 0.0) & (t < high)
-            low, falling = xp.where(later, t, low), xp.where(later, at, falling)
-            high, rising = xp.where(sooner, t, high), xp.where(sooner, at, rising)
-    return clamp(low + (high - low) * safe_ratio(falling, falling - rising), 0.0, 1.0)
+            low, falling = np.where(later, t, low), np.where(later, at, falling)
+            high, rising = np.where(sooner, t, high), np.where(sooner, at, rising)
+    return (low + (high - low) * safe_ratio(falling, falling - rising)).clip(0.0, 1.0)
 
 
-def _signed(points: Components, half: Components) -> Array:
+def _signed(points: Components, half: Components) -> Float:
     """Return the signed distance of points from a box with given half lengths."""
-    xp = namespace_of(points[0])
-    x, y, z = (xp.abs(p) - h for p, h in zip(points, half, strict=True))
-    outside = [xp.maximum(each, 0.0) for each in (x, y, z)]
-    inside = xp.minimum(xp.maximum(xp.maximum(x, y), z), 0.0)
-    return xp.sqrt(dot(outside, outside) + GUARD) + inside
+    x, y, z = (np.abs(p) - h for p, h in zip(points, half, strict=True))
+    outside = [np.maximum(each, 0.0) for each in (x, y, z)]
+    inside = np.minimum(np.maximum(np.maximum(x, y), z), 0.0)
+    return length(outside) + inside

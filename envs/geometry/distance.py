@@ -2,8 +2,8 @@
 
 An obstacle is a row (centre D, half-axis vector D, radius 1) of a capsule in [m], a link a segment with a radius, and
 the hand a point with one. The clearance of two capsules is the distance of their axes less both radii. The functions
-are batched over leading dimensions and accept NumPy arrays and torch tensors; those that return clearance accept rows
-with other shapes, too (:mod:`viapoint.envs.geometry.rows`), as NumPy arrays. They share these arguments:
+are batched over leading dimensions, and take single and double precision. Those that return clearance accept rows with
+other shapes, too (:mod:`viapoint.envs.geometry.rows`). They share these arguments:
 
     obstacles   rows of n obstacles, shape (..., n, 2 D + 1), [m]
     present     True for rows that are obstacles, shape (..., n)
@@ -21,47 +21,49 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.arrays import in_space
-from viapoint.envs.common.types import Bool, Float, Index
+from viapoint.envs.common.types import Array, Bool, Float, Index
 from viapoint.envs.geometry.rows import has_shapes, pair_distance
 from viapoint.envs.geometry.segments import point_axis_squared, segment_axis_squared
-from viapoint.primitives.array_api import Array, Namespace, namespace_of
+from viapoint.envs.geometry.shape import GUARD
 
 MAX_CLEARANCE = 1.0
 """Greatest clearance that is reported, also without obstacles, [m]."""
 
 
-def hand_clearance(points: Array, radius: float, obstacles: Array, present: Array) -> Array:
+def hand_clearance(points: Array, radius: float, obstacles: Array, present: Bool) -> Array:
     """Return the least clearance of the hand at points (..., T, D) from each obstacle, shape (..., n), [m]."""
     if has_shapes(obstacles):
         return _shape_clearance(points, None, radius, obstacles, present)
-    xp = np if isinstance(points, np.ndarray) else namespace_of(points)  # mostly NumPy: without a call
-    nearest = xp.min(point_distance_squared(points, obstacles), axis=-1)
-    return _clearance(xp, nearest, obstacles[..., -1] + radius, present)
+    nearest = np.min(point_distance_squared(points, obstacles), axis=-1)
+    return _clearance(nearest, obstacles[..., -1] + radius, present)
 
 
-def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, present: Array) -> Array:
+def arm_clearance(links: Array, radii: tuple[float, ...], obstacles: Array, present: Bool) -> Array:
     """Return the least clearance of links with ends (..., T, L, 2, D) from each obstacle, shape (..., n), [m]."""
     if has_shapes(obstacles):
         ends = np.reshape(links, (*links.shape[:-4], -1, 2, links.shape[-1]))
         every = np.tile(radii, links.shape[-4])
         return _shape_clearance(ends[..., 0, :], ends[..., 1, :], every, obstacles, present)
-    xp, each = namespace_of(links), []
+    each = []
     for i, radius in enumerate(radii):
         # Only the least squared distance needs its root: 6 to 10 % faster than all clearances first.
         squared = segment_distance_squared(links[..., i, 0, :], links[..., i, 1, :], obstacles)
-        each.append(_clearance(xp, xp.min(squared, axis=-1), obstacles[..., -1] + radius, present))
-    return functools.reduce(xp.minimum, each)
+        each.append(_clearance(np.min(squared, axis=-1), obstacles[..., -1] + radius, present))
+    return functools.reduce(np.minimum, each)
 
 
-def point_distance_squared(points: Array, obstacles: Array, drift: Array = None) -> Array:
+def point_distance_squared(points: Array, obstacles: Array, drift: Array | None = None) -> Array:
     """Return the squared distance of points (..., T, D) from the obstacles' axes, shape (..., n, T), [m^2]."""
     dimension = points.shape[-1]
     offset = [points[..., None, :, i] - obstacles[..., :, None, i] for i in range(dimension)]
     offset = offset if drift is None else [o - drift[..., i] for i, o in enumerate(offset)]
-    return point_axis_squared(offset, [obstacles[..., :, None, dimension + i] for i in range(dimension)])
+    axis = [obstacles[..., :, None, dimension + i] for i in range(dimension)]
+    return np.asarray(point_axis_squared(offset, axis))
 
 
-def segment_distance_squared(first: Array, second: Array, obstacles: Array, drift: Array = None) -> Array:
+def segment_distance_squared(
+    first: Array, second: Array, obstacles: Array, drift: Array | None = None
+) -> Array:
     """Return the squared distance of segments, ends (..., T, D), from the obstacles' axes, shape (..., n, T), [m^2]."""
     dimension = first.shape[-1]
     link = [second[..., None, :, i] - first[..., None, :, i] for i in range(dimension)]
@@ -71,13 +73,13 @@ def segment_distance_squared(first: Array, second: Array, obstacles: Array, drif
         for i in range(dimension)
     ]
     gap = gap if drift is None else [g - drift[..., i] for i, g in enumerate(gap)]
-    return segment_axis_squared(gap, link, axis)
+    return np.asarray(segment_axis_squared(gap, link, axis))
 
 
-def _clearance(xp: Namespace, squared: Array, radii: Array, present: Array) -> Array:
-    """Return clearance from squared distances of axes; the small summand keeps gradients at distance 0 finite."""
-    distance = xp.sqrt(squared + 1e-24) - radii
-    return xp.where(present, xp.minimum(distance, MAX_CLEARANCE), xp.full_like(distance, MAX_CLEARANCE))
+def _clearance(squared: Array, radii: Array, present: Bool) -> Array:
+    """Return clearance from squared distances of axes, as :func:`~viapoint.envs.geometry.shape.length` of distances."""
+    distance = np.sqrt(squared + GUARD) - radii
+    return np.where(present, np.minimum(distance, MAX_CLEARANCE), MAX_CLEARANCE)
 
 
 def pair_clearance(first: Float, second: Float, rows: Float, radii: Float) -> Float:

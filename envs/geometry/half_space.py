@@ -10,9 +10,8 @@ import numpy as np
 
 from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_constants
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.shape import FLAT, Components, Geom, Shape
-from viapoint.primitives.array_api import Array, namespace_of, to_numpy
 
 EXTENT = 1.0
 """Half length of the cube that stands for a half-space in rows of numbers, [m]."""
@@ -46,25 +45,22 @@ class HalfSpace(Shape):
             position: A point of the surface, shape (3,), [m].
             name: Name for error messages.
         """
-        try:
-            outward = as_constants("normal", normal, "(3,)", lambda *shape: shape == (3,))
-        except ValueError as error:
-            raise cls._refusal(name, str(error)) from None
+        outward = finite_array("normal", normal, (3,))
         longest = np.abs(outward).max()
-        if not 0.0 < longest < np.inf:
-            raise cls._refusal(name, f"normal must be finite and not zero, got {outward.tolist()}")
+        if longest == 0.0:
+            raise ValueError(f"normal must not be zero, got {outward.tolist()}")
         return cls(position=position, quaternion=quaternion_to(outward / longest), name=name)
 
     @property
-    def bounding_sphere(self) -> tuple[Array, Array]:
+    def bounding_sphere(self) -> tuple[Float, Float]:
         """Position and infinity: no sphere contains a half-space."""
-        return self.position, namespace_of(self.position).full_like(self.position[..., 0], np.inf)
+        return self.position, np.full_like(self.position[..., 0], np.inf)
 
     def footprint(self, extent: float = 2.0) -> list[Float]:
         """Return the part of a square of half length `extent` that is solid at the height 0; nothing if it is empty."""
         corners = extent * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-        normal, at = self.rotation[:, 2], to_numpy(self.position)
-        height = corners @ normal[:2] - normal @ at
+        normal = self.rotation[:, 2]
+        height = corners @ normal[:2] - normal @ self.position
         outline = []
         for i in range(4):  # Sutherland & Hodgman, Reentrant polygon clipping, 1974
             if height[i] <= 0.0:
@@ -77,15 +73,15 @@ class HalfSpace(Shape):
     def box(self) -> tuple[Float, Float]:
         """Return the cube of half length EXTENT below the point of the surface that is nearest to the origin."""
         normal = self.rotation[:, 2]
-        return (to_numpy(self.position) @ normal - EXTENT) * normal, np.full(3, EXTENT)
+        return (self.position @ normal - EXTENT) * normal, np.full(3, EXTENT)
 
     @classmethod
-    def from_box(cls, centre: Array, quaternion: Array, half: Array) -> Self:
+    def from_box(cls, centre: Float, quaternion: Float, half: Float) -> Self:
         """Return half-spaces from the cubes of :meth:`box`; see :meth:`Shape.from_box`."""
         own = super().from_box(centre, quaternion, half)
         depth = half[..., 2]
         position = [centre[..., i] + depth * axis for i, axis in enumerate(own._axes[2])]
-        object.__setattr__(own, "position", namespace_of(centre).stack(position, -1))
+        object.__setattr__(own, "position", np.stack(position, axis=-1))
         return own
 
     @classmethod
@@ -102,7 +98,7 @@ class HalfSpace(Shape):
         return self.box()
 
     @classmethod
-    def _of_half(cls, half: Array) -> dict[str, Array]:
+    def _of_half(cls, half: Float) -> dict[str, Float]:
         del half
         return {}
 
@@ -110,13 +106,12 @@ class HalfSpace(Shape):
         """Return one MuJoCo plane."""
         return self._geom(mujoco.mjtGeom.mjGEOM_PLANE, 0.0, 0.0, 0.01)
 
-    def _relative(self, points: Array) -> Components:
+    def _relative(self, points: Float) -> Components:
         offset, normal = self._offset(points), self._axes[2]
         return [offset[0] * normal[0] + offset[1] * normal[1] + offset[2] * normal[2]]
 
-    def _signed(self, points: Components) -> Array:
+    def _signed(self, points: Components) -> Float:
         return points[0]
 
-    def _nearest(self, start: Components, along: Components) -> Array:
-        xp = namespace_of(along[0])
-        return xp.where(along[0] < 0.0, xp.ones_like(along[0]), xp.zeros_like(along[0]))
+    def _nearest(self, start: Components, along: Components) -> Float:
+        return np.where(along[0] < 0.0, 1.0, 0.0)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import TINY, frozen, spread
+from viapoint.envs.common.arrays import TINY, frozen
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_constants
+from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.shape import (
     OUTLINE_POINTS,
     Components,
@@ -21,7 +20,9 @@ from viapoint.envs.geometry.shape import (
     bounds_of_points,
     length,
 )
-from viapoint.primitives.array_api import Array, like, namespace_of, to_numpy
+
+LEAST_SPACING = 1e-6
+"""Least edge of the cubes of :meth:`PointCloud.covering`, [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +45,9 @@ class PointCloud(Shape):
     in_scenes: ClassVar[bool] = False
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
 
-    points: Array
+    points: Any
     """Shape (K, 3), [m]."""
-    radius: Array = 0.01
+    radius: Any = 0.01
     """Radius of the spheres, [m]."""
 
     @classmethod
@@ -61,19 +62,14 @@ class PointCloud(Shape):
             radius: Radius of the spheres around the given points, [m].
             **pose: `position`, `quaternion` and `name`.
         """
-        for name, value, allowed in (
-            ("spacing", spacing, "greater than 0"),
-            ("radius", radius, "0 or greater"),
-        ):
-            number = isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= value < np.inf
-            if not number or (value == 0.0 and name == "spacing"):
-                raise cls._refusal(pose.get("name", ""), f"{name} must be {allowed}, got {value!r:.60}")
+        number_of_at_least("spacing", spacing, LEAST_SPACING)
+        number_of_at_least("radius", radius, 0.0)
         given = cls(points, **pose).points
         cubes = np.unique(np.floor(given / spacing), axis=0)
         return cls((cubes + 0.5) * spacing, radius=0.5 * np.sqrt(3.0) * spacing + radius, **pose)
 
     @property
-    def bounding_sphere(self) -> tuple[Array, Array]:
+    def bounding_sphere(self) -> tuple[Float, Float]:
         """Centre and radius, [m]."""
         centre, size = bounds_of_points(self.points)
         return self._placed(centre, size + self.radius)
@@ -81,7 +77,7 @@ class PointCloud(Shape):
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo sphere for each point."""
         (geom,) = self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, self.radius)
-        places = self.points @ self.rotation.T + to_numpy(self.position)
+        places = self.points @ self.rotation.T + self.position
         return [geom._replace(position=place) for place in places]
 
     def footprint(self, extent: float = 2.0) -> list[Float]:
@@ -92,30 +88,16 @@ class PointCloud(Shape):
         return [geom.position[:2] + circle for geom in self.geoms()]
 
     def _check(self) -> None:
-        if tuple(self.radius.shape):
-            raise self._error(
-                f"radius must be one number for all points, got shape {tuple(self.radius.shape)}"
-            )
-        wanted = "(K, 3) with K at least 1"
-        try:
-            array = as_constants("points", self.points, wanted, lambda *s: s[1:] == (3,) and s[0] > 0)
-        except ValueError as error:
-            raise self._error(str(error)) from None
-        if not (finite := np.isfinite(array).all(axis=1)).all():
-            wrong = int(finite.argmin())
-            raise self._error(
-                f"points must be finite, got {array[wrong].tolist()} at index {wrong} ({(~finite).sum()} of "
-                f"{len(array)} points); remove them: points[np.isfinite(points).all(axis=1)]"
-            )
-        object.__setattr__(self, "points", frozen(array))
+        if self.radius.shape:
+            raise ValueError(f"radius must be one number for all points, got shape {self.radius.shape}")
+        points = finite_array("points", self.points, (None, 3))
+        object.__setattr__(self, "points", frozen(points.copy()))
 
-    def _signed(self, points: Components) -> Array:
-        xp = namespace_of(points[0])
-        *parts, _ = spread(*points, points[0])
-        flat = [p.reshape(-1) for p in parts]
-        nearest = self._nearest_points(np.stack([to_numpy(p) for p in flat]).astype(np.float64, copy=False))
-        offset = [p - like(xp, c, flat[0]) for p, c in zip(flat, nearest, strict=True)]
-        return length(offset).reshape(parts[0].shape) - self.radius
+    def _signed(self, points: Components) -> Float:
+        parts = np.stack(np.broadcast_arrays(*points))
+        flat = parts.reshape(3, -1)
+        offset = flat - self._nearest_points(flat)
+        return np.asarray(length(list(offset)).reshape(parts.shape[1:]) - self.radius)
 
     def _nearest_points(self, points: Float) -> Float:
         """Return the points of the cloud that are nearest to other points, shape (3, M) both."""
@@ -127,11 +109,10 @@ class PointCloud(Shape):
             nearest[:, some] = self.points[index].T
         return nearest
 
-    def _nearest(self, start: Components, along: Components) -> Array:
+    def _nearest(self, start: Components, along: Components) -> Float:
         """Return t in [0, 1] for which the segment is nearest to a point of the cloud, exactly."""
-        xp = namespace_of(start[0])
-        *vectors, first = spread(*start, *along, start[0] + along[0])
-        flat = np.stack([to_numpy(v).astype(np.float64).reshape(-1) for v in vectors])
+        vectors = np.stack(np.broadcast_arrays(*start, *along))
+        flat = vectors.reshape(6, -1)
         found = np.zeros(flat.shape[1])
         for some in blocks(len(found), 8 * len(self.points)):
             gap = [q[:, None] - p for q, p in zip(self.points.T, flat[:3, some], strict=True)]
@@ -140,7 +121,7 @@ class PointCloud(Shape):
             t = (sum(g * u for g, u in zip(gap, link, strict=True)) / square).clip(0.0, 1.0)
             squared = sum(np.square(g - t * u) for g, u in zip(gap, link, strict=True))
             found[some] = t[squared.argmin(axis=0), np.arange(t.shape[1])]
-        return like(xp, found.reshape(first.shape), first)
+        return found.reshape(vectors.shape[1:])
 
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""

@@ -10,17 +10,9 @@ import numpy as np
 
 from viapoint.envs.common.arrays import in_space, norm, quaternion_to
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_constants
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.segments import nearest_to_origin, point_axis_squared, segment_axis_squared
-from viapoint.envs.geometry.shape import (
-    FLAT,
-    GUARD,
-    Components,
-    Geom,
-    Shape,
-    length,
-)
-from viapoint.primitives.array_api import Array, namespace_of, to_numpy
+from viapoint.envs.geometry.shape import FLAT, GUARD, Components, Geom, Shape, length
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +30,11 @@ class Sphere(Shape):
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
     round: ClassVar[bool] = True
 
-    radius: Array
+    radius: Any
     """Shape (...,), [m]."""
 
     @property
-    def bounding_sphere(self) -> tuple[Array, Array]:
+    def bounding_sphere(self) -> tuple[Float, Float]:
         """Centre and radius, [m]."""
         return self.position, self.radius
 
@@ -63,24 +55,24 @@ class Sphere(Shape):
         return centre, half
 
     @classmethod
-    def _of_half(cls, half: Array) -> dict[str, Array]:
+    def _of_half(cls, half: Float) -> dict[str, Float]:
         return {"radius": half[..., 0]}
 
-    def _relative(self, points: Array) -> Components:
+    def _relative(self, points: Float) -> Components:
         offset = self._offset(points)
-        if len(self.quaternion.shape) == 1:
+        if self.quaternion.ndim == 1:
             return offset
         return [part + 0.0 * self.quaternion[..., 0] for part in offset]  # they turn nothing, but are a batch
 
-    def _signed(self, points: Components) -> Array:
-        return length(points) - self.radius
+    def _signed(self, points: Components) -> Float:
+        return np.asarray(length(points) - self.radius)
 
-    def _nearest(self, start: Components, along: Components) -> Array:
+    def _nearest(self, start: Components, along: Components) -> Float:
         return nearest_to_origin(start, along)
 
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
-        return np.asarray(to_numpy(self.radius) * directions)
+        return np.asarray(self.radius * directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +92,9 @@ class Capsule(Shape):
     sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
     round: ClassVar[bool] = True
 
-    radius: Array
+    radius: Any
     """Shape (...,), [m]."""
-    half_length: Array
+    half_length: Any
     """Half length of the segment, shape (...,), [m]."""
 
     @classmethod
@@ -115,39 +107,35 @@ class Capsule(Shape):
             radius: [m].
             name: Name for error messages.
         """
-        sizes = ((3,), (2,))
-        try:
-            first, second = (
-                in_space(as_constants("ends", end, "(3,) or (2,)", lambda *shape: shape in sizes))
-                for end in (first, second)
-            )
-        except ValueError as error:
-            raise cls._refusal(name, str(error)) from None
+        first = in_space(finite_array("first", first, (3,), (2,)))
+        second = in_space(finite_array("second", second, (3,), (2,)))
         half = 0.5 * (second - first)
         turn, size = quaternion_to(half), norm(half)
         if not 0.0 < size < np.inf:
-            reason = f"ends must be finite and different, got {first.tolist()} and {second.tolist()}"
-            raise cls._refusal(name, f"{reason}; a capsule without a length is a Sphere")
+            raise ValueError(
+                f"ends must be different, got {first.tolist()} and {second.tolist()}; a capsule without a length is a "
+                "Sphere"
+            )
         return cls(radius, size, position=0.5 * (first + second), quaternion=turn, name=name)
 
     @property
-    def half_axis(self) -> Array:
+    def half_axis(self) -> Float:
         """Vector from the centre to one end of the segment, shape (..., 3), [m]."""
-        return namespace_of(self.position).stack(self._half_axis, -1)
+        return np.stack(self._half_axis, axis=-1)
 
     @property
-    def bounding_sphere(self) -> tuple[Array, Array]:
+    def bounding_sphere(self) -> tuple[Float, Float]:
         """Centre and radius, [m]."""
         return self.position, self.radius + self.half_length
 
-    def segment_distance(self, first: Array, second: Array, radius: Array = 0.0) -> Array:
+    def segment_distance(self, first: Any, second: Any, radius: Any = 0.0) -> Any:
         """Return the distance from segments; see :meth:`Shape.segment_distance`."""
-        own, (first, second), radius = self._matched(radius, first=first, second=second)
-        start, half = own._offset(first), own._half_axis
+        (first, second), radius = self._arguments(radius, first=first, second=second)
+        start, half = self._offset(first), self._half_axis
         gap = [p + h for p, h in zip(start, half, strict=True)]
         link = [second[..., i] - first[..., i] for i in range(3)]
         squared = segment_axis_squared(gap, link, [2.0 * h for h in half])
-        return namespace_of(squared).sqrt(squared + GUARD) - own.radius - radius
+        return np.sqrt(squared + GUARD) - self.radius - radius
 
     def geoms(self) -> list[Geom]:
         """Return one MuJoCo capsule."""
@@ -169,21 +157,21 @@ class Capsule(Shape):
         return centre, half
 
     @classmethod
-    def _of_half(cls, half: Array) -> dict[str, Array]:
+    def _of_half(cls, half: Float) -> dict[str, Float]:
         return {"radius": half[..., 0], "half_length": half[..., 2] - half[..., 0]}
 
     @property
     def _half_axis(self) -> Components:
         return [self.half_length * c for c in self._axes[2]]
 
-    def _relative(self, points: Array) -> Components:
+    def _relative(self, points: Float) -> Components:
         return self._offset(points)
 
-    def _signed(self, points: Components) -> Array:
+    def _signed(self, points: Components) -> Float:
         squared = point_axis_squared(points, self._half_axis)
-        return namespace_of(squared).sqrt(squared + GUARD) - self.radius
+        return np.asarray(np.sqrt(squared + GUARD) - self.radius)
 
     def support(self, directions: Float) -> Float:
         """Return the farthest points; see :meth:`Shape.support`."""
         ends = np.sign(directions[:, 2:]) * np.array([0.0, 0.0, float(self.half_length)])
-        return np.asarray(to_numpy(self.radius) * directions + ends)
+        return np.asarray(self.radius * directions + ends)

@@ -18,14 +18,13 @@ import numpy as np
 
 from viapoint.envs.common.arrays import frame_axes, in_space, norm
 from viapoint.envs.common.types import Float, Int, Numbers, Single
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import as_real_array, whole_number
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.segments import segment_axis_squared
 from viapoint.envs.geometry.shape import Shape
 from viapoint.envs.geometry.shapes import LISTS, MESH_HINT, SHAPES, as_obstacles, refuse_single
-from viapoint.primitives.array_api import Array, to_numpy
 
 CAPSULES = ("capsule",)
 """Shapes of scenes whose rows are capsules; spheres are capsules without a length."""
@@ -58,12 +57,12 @@ def row_size(dimension: int, shapes: Sequence[str] = CAPSULES) -> int:
     return 2 * dimension + 1 + (0 if tuple(shapes) == CAPSULES else SHAPE_SIZE)
 
 
-def has_shapes(rows: Array) -> bool:
+def has_shapes(rows: Numbers) -> bool:
     """Return True for rows with other shapes than capsules."""
     return int(rows.shape[-1]) > 2 * 3 + 1
 
 
-def dimension_of(rows: Array) -> int:
+def dimension_of(rows: Numbers) -> int:
     """Return the dimension D of rows."""
     return (int(rows.shape[-1]) - 1 - SHAPE_SIZE * has_shapes(rows)) // 2
 
@@ -241,21 +240,18 @@ def _checked_numbers(obstacles: Any) -> Any:
     Raises:
         ValueError: The obstacles are something else, or a row that is not zero has no positive radius.
     """
-    try:
-        array = np.asarray(obstacles)
-        real = array.dtype.kind in "fiu"
-    except (TypeError, ValueError, RuntimeError):  # torch: a tensor that follows a gradient
-        real = False
-    if not real:
+    array = as_real_array(obstacles)
+    if array is None:
         raise ValueError(f"obstacles must be {LISTS}, got {obstacles!r:.80}")
     if array.ndim > 1 and array.size:
         wrong = ~np.isfinite(array).all(axis=-1) | ((array != 0.0).any(axis=-1) & ~(array[..., -1] > 0.0))
         if wrong.any():
-            index = tuple(int(i) for i in np.argwhere(wrong)[0])
-            place = f"scene {index[0]}: " if len(index) > 1 else ""
-            finite = np.isfinite(array[index]).all()
-            what = "has no positive radius (last number)" if finite else "must be finite"
-            raise ValueError(f"{place}obstacle {index[-1]} {what}: {array[index].tolist()}")
+            *scene, row = np.argwhere(wrong)[0]
+            place = f"scene {scene[0]}: " if scene else ""
+            raise ValueError(
+                f"{place}obstacle {row} must have finite numbers, the last of which is a positive radius, got "
+                f"{array[wrong][0].tolist()}"
+            )
     return obstacles
 
 
@@ -388,24 +384,17 @@ def check_shapes(shapes: Any, dimension: int = 3) -> tuple[str, ...]:
     Raises:
         ValueError: A name is unknown or repeated, a mesh is in the plane, or no named shape is one of random scenes.
     """
-    known = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
     names = (shapes,) if isinstance(shapes, str) else tuple(shapes) if isinstance(shapes, Sequence) else ()
-    if (
-        not all(isinstance(name, str) for name in names)
-        or not names
-        or len(set(names)) < len(names)
-        or not set(names) <= set(known)
-    ):
+    allowed = []
+    for name, shape in SHAPES.items():
+        if shape.in_scenes and (dimension == 3 or not issubclass(shape, ConvexMesh)):
+            allowed.append(name)
+    drawn = [name for name in allowed if SHAPES[name].only_half is None]
+    known = all(isinstance(name, str) and name in allowed for name in names)
+    if not known or len(set(names)) < len(names) or not set(names) & set(drawn):
         raise ValueError(
-            f"shapes must be some of {', '.join(known)}, without repetition, got {shapes!r}; {MESH_HINT}"
-        )
-    meshes = [name for name in names if issubclass(SHAPES[name], ConvexMesh)]
-    if meshes and dimension == 2:
-        raise ValueError(f"shapes of arms in the plane may not be meshes, got {', '.join(meshes)}")
-    drawn = [name for name in known if SHAPES[name].only_half is None]
-    if not set(names) & set(drawn):
-        raise ValueError(
-            f"shapes must have one of {', '.join(drawn)}, as random scenes have no others, got {shapes!r}"
+            f"shapes must be some of {', '.join(allowed)}, without repetition, and at least one of {', '.join(drawn)}, "
+            f"got {shapes!r}; {MESH_HINT}"
         )
     return names
 
@@ -413,11 +402,7 @@ def check_shapes(shapes: Any, dimension: int = 3) -> tuple[str, ...]:
 def _parts_of_scenes(obstacles: Any) -> list[Shape]:
     """Return a list of shapes and dictionaries as single shapes that scenes hold; a point cloud becomes its spheres."""
     found = list[Shape]()
-    for i, each in enumerate(as_obstacles(obstacles)):
-        try:
-            each.require_single()
-        except ValueError as error:
-            raise ValueError(f"obstacle {i}: {error}") from None
+    for each in as_obstacles(obstacles, single=True):
         if isinstance(each, PointCloud):
             name = each.name or each.kind
             found += [
@@ -439,11 +424,8 @@ def _with_name(mesh: ConvexMesh, shapes: tuple[str, ...]) -> ConvexMesh:
 
 def _kind_among(obstacle: Shape, shapes: Sequence[str]) -> str:
     """Return the kind of an obstacle; a sphere is a capsule where spheres have no name of their own."""
-    return (
-        "capsule"
-        if obstacle.kind == "sphere" and "sphere" not in shapes and "capsule" in shapes
-        else obstacle.kind
-    )
+    as_capsule = obstacle.kind == "sphere" and "sphere" not in shapes and "capsule" in shapes
+    return "capsule" if as_capsule else obstacle.kind
 
 
 def _numbered(index: int, obstacle: Shape) -> str:
@@ -457,19 +439,15 @@ def _row(index: int, obstacle: Shape, dimension: int, shapes: tuple[str, ...]) -
         obstacle = _with_name(obstacle, shapes)
     kind = _kind_among(obstacle, shapes)
     if kind not in shapes and not (dimension == 2 and isinstance(obstacle, ConvexMesh)):
-        also = ", sphere" if "capsule" in shapes and "sphere" not in shapes else ""
-        reason = f"the scenes of this environment have the shapes {', '.join(shapes)}{also}, not {kind}"
-        if type(obstacle).in_scenes:
-            reason += f"; make it with shapes={(*shapes, kind)!r} (an agent must be trained with them)"
-        else:
-            reason += "; register_mesh names a mesh of these vertices, and shapes must have the name"
-        raise ValueError(f"{_numbered(index, obstacle)}: {reason}")
+        raise ValueError(
+            f"{_numbered(index, obstacle)}: the scenes of this environment have the shapes {', '.join(shapes)}, not "
+            f"{kind}; make it with other shapes, with which an agent must be trained; {MESH_HINT}"
+        )
     try:
         centre, half = obstacle.box() if dimension == 3 else obstacle.in_plane()
     except ValueError as error:
         raise ValueError(f"{_numbered(index, obstacle)}: {error}") from None
-    quaternion = to_numpy(obstacle.quaternion).astype(np.float64)
     if shapes == CAPSULES:
-        axis = to_numpy(obstacle.half_axis) if isinstance(obstacle, Capsule) else np.zeros(3)
+        axis = obstacle.half_axis if isinstance(obstacle, Capsule) else np.zeros(3)
         return np.concatenate((centre[:dimension], axis[:dimension], half[:1]))
-    return shape_rows(kind, centre[:dimension], quaternion, half)
+    return shape_rows(kind, centre[:dimension], obstacle.quaternion, half)

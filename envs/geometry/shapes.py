@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
-import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
-from numbers import Real
+from dataclasses import MISSING, fields
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, is_number
 from viapoint.envs.geometry.box import Box
 from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
 from viapoint.envs.geometry.cylinder import Cylinder
@@ -21,7 +19,7 @@ from viapoint.envs.geometry.half_space import HalfSpace
 from viapoint.envs.geometry.point_cloud import PointCloud
 from viapoint.envs.geometry.round_shapes import Capsule, Sphere
 from viapoint.envs.geometry.shape import Shape, checked_radius
-from viapoint.primitives.array_api import Array, as_floats, like, namespace_of, to_numpy
+from viapoint.primitives.array_api import broadcast_batch
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
@@ -87,7 +85,7 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         0.18
         >>> as_obstacle({"shape": "box", "sizes": (0.1, 0.2, 0.02)})
         Traceback (most recent call last):
-        ValueError: box: unknown parameter 'sizes', did you mean 'size'? Parameters are size, position, quaternion, name
+        ValueError: box: parameters are size, position, quaternion, name; unknown are ['sizes'], missing are ['size']
     """
     if isinstance(value, Shape):
         return value
@@ -95,28 +93,24 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         raise ValueError(f"an obstacle must be a shape of viapoint.envs or a dictionary, got {value!r:.80}")
     values = dict(value)
     kind = values.pop("shape", None)
-    shape, name = SHAPES.get(kind) if isinstance(kind, str) else None, values.get("name")
-    named = f"{name!r}: " if isinstance(name, str) and name else ""
+    shape = SHAPES.get(kind) if isinstance(kind, str) else None
     if shape is None:
-        known = f"Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
-        if kind is None:
-            raise ValueError(f"{named}the key 'shape' is missing. {known}")
-        raise ValueError(f"{named}unknown shape {kind!r}{_meant(kind, SHAPES)} {known}")
+        raise ValueError(f"shape must be one of {', '.join(SHAPES)}, got {kind!r}; {MESH_HINT}")
     allowed = shape.parameters()
-    named = f"{kind} {named}".rstrip(": ")
-    for name in values:
-        if name not in allowed:
-            known = f"Parameters are {', '.join(allowed)}"
-            raise ValueError(f"{named}: unknown parameter {name!r}{_meant(name, allowed)} {known}")
-    try:
-        return shape(**values)
-    except TypeError:
-        missing = [f.name for f in fields(shape) if f.name not in values and f.default is f.default_factory]
-        raise ValueError(f"{named}: missing {', '.join(missing)}") from None
+    unknown = [name for name in values if name not in allowed]
+    needed = [each.name for each in fields(shape) if each.init and each.default is MISSING]
+    missing = [name for name in needed if name not in values]
+    if unknown or missing:
+        raise ValueError(
+            f"{kind}: parameters are {', '.join(allowed)}; unknown are {unknown}, missing are {missing}"
+        )
+    return shape(**values)
 
 
-def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
+def as_obstacles(values: Iterable[Shape | Mapping[str, Any]], *, single: bool = False) -> list[Shape]:
     """Return shapes from a list of shapes and dictionaries; an error names the index of the obstacle.
+
+    Batches of shapes are refused if each must be a `single` one.
 
     Example:
         >>> from viapoint.envs import as_obstacles
@@ -131,6 +125,8 @@ def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
     for i, value in enumerate(values):
         try:
             found.append(as_obstacle(value))
+            if single:
+                found[-1].require_single()
         except ValueError as error:
             raise ValueError(f"obstacle {i}: {error}") from None
     return found
@@ -178,11 +174,8 @@ def refuse_single(obstacles: Any) -> None:
 
 
 def signed_distances(
-    obstacles: Sequence[Shape | Mapping[str, Any]],
-    first: Array,
-    second: Array | None = None,
-    radius: Array = 0.0,
-) -> Array:
+    obstacles: Sequence[Shape | Mapping[str, Any]], first: Any, second: Any = None, radius: Any = 0.0
+) -> Float:
     """Return the signed distance of spheres or capsules from each of n obstacles, shape (..., n), [m].
 
     Args:
@@ -198,40 +191,39 @@ def signed_distances(
         [0.02, 0.12]
     """
     obstacles = as_obstacles(obstacles)
-    start, end = _like_tensors(obstacles, first, second)
-    xp = namespace_of(start)
+    ends = _checked_ends(first, second)
     if not obstacles:
-        return xp.zeros_like(start[..., :0])
-    each = [
-        o.distance(start, radius) if end is None else o.segment_distance(start, end, radius)
-        for o in obstacles
-    ]
-    shape = np.broadcast_shapes(*(tuple(one.shape) for one in each))
-    return xp.stack([xp.broadcast_to(one, shape) for one in each], -1)
+        return np.zeros((*ends[0].shape[:-1], 0))
+    each = [_distance(obstacle, ends, radius) for obstacle in obstacles]
+    return np.stack(np.broadcast_arrays(*each), axis=-1)
 
 
-def _like_tensors(obstacles: Sequence[Shape], first: Array, second: Array | None) -> list[Any]:
-    """Return points in one array library: that of torch tensors among them or among the obstacles, else NumPy."""
-    given = {"first": first} if second is None else {"first": first, "second": second}
-    xp, arrays = as_floats(**given)
-    tensors = [each for o in obstacles if hasattr(each := o.position, "requires_grad")]
-    if xp is np and tensors:
-        arrays = [like(namespace_of(tensors[0]), each, tensors[0]) for each in arrays]
-    return [*arrays, None][:2]
+def _checked_ends(first: Any, second: Any) -> list[Float]:
+    """Return the ends of segments, or points alone where there is no second end."""
+    ends = [finite_array("first", first, (..., 3))]
+    if second is not None:
+        ends.append(finite_array("second", second, (..., 3)))
+    return ends
+
+
+def _distance(obstacle: Shape, ends: Sequence[Float], radius: Any) -> Any:
+    """Return the distance of spheres or capsules from one obstacle."""
+    if len(ends) == 1:
+        return obstacle.distance(ends[0], radius)
+    return obstacle.segment_distance(ends[0], ends[1], radius)
 
 
 def nearest_distance(
     obstacles: Sequence[Shape | Mapping[str, Any]],
-    first: Array,
-    second: Array | None = None,
+    first: Any,
+    second: Any = None,
     radius: Any = 0.0,
     most: float = np.inf,
-) -> Array:
+) -> Any:
     """Return the least signed distance of spheres or capsules from all obstacles, shape (...,), at most `most`, [m].
 
     Broad phase: bounding spheres bound every distance from below. Narrow phase: obstacles in the order of their bounds;
-    distances are only computed where the bound is below the least distance so far. With torch tensors, all distances
-    are computed, and the result is a tensor with their gradient.
+    distances are only computed where the bound is below the least distance so far.
 
     Args:
         obstacles: Shapes or dictionaries.
@@ -245,45 +237,25 @@ def nearest_distance(
         >>> nearest_distance([HalfSpace(), Sphere(0.1, position=(0.5, 0.0, 0.3))], [0.5, 0.0, 0.6], most=1.0).round(3)
         np.float64(0.2)
     """
-    obstacles = as_obstacles(obstacles)
-    if isinstance(most, bool) or not isinstance(most, Real) or most != most:
+    obstacles = as_obstacles(obstacles, single=True)
+    if not is_number(most) or np.isnan(most):
         raise ValueError(f"most must be a number, got {most!r:.60}")
-    ends = [end for end in _like_tensors(obstacles, first, second) if end is not None]
-    xp = namespace_of(ends[0])
-    radius = checked_radius(radius, ends[0])
-    if xp is not np:
-        each = signed_distances(obstacles, first, second, radius)
-        nearest = xp.full(each.shape[:-1], float(most), dtype=each.dtype, device=each.device)
-        return functools.reduce(xp.minimum, (each[..., i] for i in range(len(obstacles))), nearest)
-    ends = [end.astype(np.float64, copy=False) for end in ends]
-    for end in ends:
-        if end.shape[-1:] != (3,):
-            raise ValueError(f"points must have shape (..., 3), got shape {end.shape}")
-    for i, each in enumerate(obstacles):
-        try:
-            each.require_single()
-        except ValueError as error:
-            raise ValueError(f"obstacle {i}: {error}") from None
-    try:
-        shape = np.broadcast_shapes(*(end.shape[:-1] for end in ends), np.shape(radius))
-    except ValueError:
-        sizes = ", ".join(map(str, (*(end.shape for end in ends), np.shape(radius))))
-        raise ValueError(f"points and radius must broadcast, got the shapes {sizes}") from None
+    ends, radius = _checked_ends(first, second), checked_radius(radius)
+    leading = {f"end {i}": end.shape[:-1] for i, end in enumerate(ends)}
+    shape = broadcast_batch(**leading, radius=np.shape(radius))
     flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
     size = np.broadcast_to(radius, shape).reshape(-1)
-    middle = flat[0] if second is None else 0.5 * (flat[0] + flat[1])
-    reach = size + (0.0 if second is None else _length(flat[1] - middle))
+    middle = 0.5 * (flat[0] + flat[-1])
+    reach = size + _length(flat[-1] - middle)
     least = np.full(len(middle), float(most))
     if not obstacles or not len(middle):
         return least.reshape(shape)
-    spheres = [(to_numpy(c), float(to_numpy(r))) for c, r in (o.bounding_sphere for o in obstacles)]
+    spheres = [each.bounding_sphere for each in obstacles]
     bounds = np.stack([_length(middle - centre) - wide - reach for centre, wide in spheres])
     for which in np.argsort(bounds.min(axis=1), kind="stable"):
         some = np.flatnonzero(bounds[which] < least)
         if some.size:
-            found = signed_distances(
-                [obstacles[which]], flat[0][some], None if second is None else flat[1][some], size[some]
-            )[:, 0]
+            found = _distance(obstacles[which], [end[some] for end in flat], size[some])
             least[some] = np.minimum(least[some], found)
     return least.reshape(shape)
 
@@ -335,9 +307,3 @@ def add_to_model(
 
 def _length(vectors: Float) -> Any:
     return np.sqrt((vectors * vectors) @ np.ones(3))
-
-
-def _meant(name: Any, known: Iterable[str]) -> str:
-    """Return a suggestion for a misspelled name."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
-    return f", did you mean {close[0]!r}?" if close else "."

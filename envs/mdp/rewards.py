@@ -54,14 +54,17 @@ class RewardWeights:
         Raises:
             ValueError: The argument is something else, or names an unknown term.
         """
-        if weights is not None and not isinstance(weights, RewardWeights | Mapping):
-            raise ValueError(f"reward_weights must be a mapping of names to numbers, got {weights!r}")
-        given = dict(vars(weights) if isinstance(weights, RewardWeights) else weights or {})
-        known = [field.name for field in dataclasses.fields(cls)]
-        unknown = sorted(repr(name) for name in given if name not in known)
-        if unknown:
-            raise ValueError(f"reward_weights knows {', '.join(known)}, not {', '.join(unknown)}")
-        return weights if isinstance(weights, RewardWeights) else cls(**given)
+        if weights is None:
+            return cls()
+        known = {field.name for field in dataclasses.fields(cls)}
+        if isinstance(weights, Mapping) and known >= set(weights):
+            return cls(**weights)
+        if isinstance(weights, RewardWeights) and known == set(vars(weights)):
+            return weights
+        raise ValueError(
+            f"reward_weights must be {cls.__name__} or a mapping with some of {', '.join(sorted(known))}, "
+            f"got {weights!r}"
+        )
 
 
 class RewardTerms(NamedTuple):

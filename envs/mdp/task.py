@@ -11,12 +11,20 @@ from typing import Any
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import REGISTER_HINT
 from viapoint.envs.arms.base import Arm, CollisionModel
+from viapoint.envs.geometry.rows import CAPSULES
 from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import RewardWeights
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.sampler import SceneSampler, sampler_of_family, scene_sampler
+from viapoint.envs.scenes.families import scene_families
+from viapoint.envs.scenes.feasible_path import DRAW_ORDER
+from viapoint.envs.scenes.planar_families import FAMILY_ROWS
+from viapoint.envs.scenes.planar_obstacles import FamilyObstacles
+from viapoint.envs.scenes.sampler import SceneSampler
 
 AnyDistribution = SceneDistribution | SpaceDistribution
+
+FAMILY_ATTEMPTS = 2000
+"""Attempts at a scene of a family in the plane; few of them succeed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +58,7 @@ class Task:
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        return scene_sampler(self.collision_model, self.scenes)
+        return SceneSampler(self.collision_model, self.scenes)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON."""
@@ -106,4 +114,19 @@ def family_sampler(task: Task, family: str) -> SceneSampler:
         >>> scenes = family_sampler(env.unwrapped.task, "shelf")([np.random.default_rng(0)])
         >>> observation, _ = env.reset(options=scenes.as_options())
     """
-    return sampler_of_family(task.collision_model, task.scenes, family)
+    model, scenes = task.collision_model, task.scenes
+    families, most = scene_families(scenes.dimension), scenes.n_obstacles[1]
+    if family not in families:
+        raise ValueError(f"family must be one of {', '.join(families)}, got {family!r}")
+    record = families[family]
+    if most < record.n_obstacles or not set(record.shapes) <= {*scenes.shapes, *CAPSULES}:
+        raise ValueError(
+            f"{family} needs a task with up to {record.n_obstacles} obstacles and the shapes {record.shapes}, this one "
+            f"has {most} obstacles and the shapes {scenes.shapes}"
+        )
+    if isinstance(scenes, SpaceDistribution):
+        return SceneSampler(model, dataclasses.replace(scenes, families=(family,)))
+    planar = dataclasses.replace(scenes, n_obstacles=(1, min(FAMILY_ROWS, most)))
+    obstacles = FamilyObstacles(model, planar, record.build)
+    order = DRAW_ORDER[2]._replace(groups=(1,) * FAMILY_ATTEMPTS)
+    return SceneSampler(model, planar, obstacles=obstacles, order=order)

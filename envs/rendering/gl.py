@@ -1,6 +1,6 @@
-"""OpenGL contexts: pictures in memory, which need no display, and a window on the screen.
+"""Pictures in memory, which need no display, and a window on the screen.
 
-OpenGL is loaded with the first picture. The environment variables are never changed.
+OpenGL is loaded with the first picture.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 
 from viapoint.envs.common.types import Frame
 
-OFF = ("disable", "disabled", "off", "false", "0")
-"""Values of MUJOCO_GL that disable rendering."""
 MAX_SIDE = 8192
 """Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones."""
+MAX_GEOMS = 2000
+"""Greatest number of shapes in a scene."""
 INSTALL = "on Debian and Ubuntu: apt-get install libegl1 libgl1"
 
 
@@ -31,14 +32,10 @@ class GLUnavailableError(gym.error.DependencyNotInstalled):
 
 
 class Canvas:
-    """Offscreen buffer that scenes are rendered to.
-
-    `mujoco.Renderer` is not used because it takes the OpenGL platform of MUJOCO_GL at the import of MuJoCo, by default
-    GLFW, which needs a display, and leaves its context current in the thread that rendered.
-    """
+    """Offscreen renderer of pictures of one size."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, supersampling: int = 1) -> None:
-        """Open a context for pictures of a size in pixels, independent of the model's own offscreen size.
+        """Open a renderer for pictures of a size in pixels, independent of the model's own offscreen size.
 
         Pictures are rendered larger in both directions by the factor `supersampling`, and then averaged. The samples
         per pixel, `vis.quality.offsamples` of the model, smooth the edges of bodies, but not those of shadows.
@@ -46,34 +43,44 @@ class Canvas:
         Raises:
             GLUnavailableError: No OpenGL library can be used.
         """
-        self._context: Any = None
         self._factor = supersampling if supersampling * max(width, height) <= MAX_SIDE else 1
-        self._rectangle = mujoco.MjrRect(0, 0, self._factor * width, self._factor * height)
-        size = model.vis.global_
-        size.offwidth, size.offheight = self._rectangle.width, self._rectangle.height
-        self._context, self._mjr = _open(model)
+        columns, rows = self._factor * width, self._factor * height
+        model.vis.global_.offwidth, model.vis.global_.offheight = columns, rows
+        _import_triton()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # GLFW warns before the exception with the same message
+                self._context = _gl_context()
+                with self._context.as_current():
+                    self._renderer = mujoco.Renderer(model, rows, columns, MAX_GEOMS)
+        except Exception as error:  # platforms raise errors of many kinds, among them MuJoCo's FatalError
+            platform = os.environ.get("MUJOCO_GL", "not set")
+            raise GLUnavailableError(
+                f"no picture can be rendered ({error}). Install OpenGL ({INSTALL}), or choose a library that is there "
+                f"by starting Python with MUJOCO_GL=egl, osmesa or glfw; MUJOCO_GL is {platform}"
+            ) from error
 
-    def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Render a scene to a picture, shape (height, width, 3)."""
-        rows, columns, factor = self._rectangle.height, self._rectangle.width, self._factor
-        pixels = np.empty((rows, columns, 3), dtype=np.uint8)
+    @property
+    def scene(self) -> mujoco.MjvScene:
+        """Scene that is rendered."""
+        return self._renderer.scene
+
+    def draw(self) -> Frame:
+        """Render the scene to a picture, shape (height, width, 3)."""
+        # MuJoCo's renderer leaves its context current, and then no other thread could render or close. Here, what was
+        # current before becomes current again.
         with self._context.as_current():
-            mujoco.mjr_render(self._rectangle, scene, self._mjr)
-            mujoco.mjr_readPixels(pixels, None, self._rectangle, self._mjr)
-        upright = pixels[::-1].reshape(rows // factor, factor, columns // factor, factor, 3)
-        total = upright.sum(axis=(1, 3), dtype=np.uint16)
+            pixels: Frame = self._renderer.render()
+        rows, columns = pixels.shape[:2]
+        factor = self._factor
+        parts = pixels.reshape(rows // factor, factor, columns // factor, factor, 3)
+        total = parts.sum(axis=(1, 3), dtype=np.uint16)
         return np.asarray(total // factor**2, dtype=np.uint8)
 
     def close(self) -> None:
-        """Free the context; a second call changes nothing."""
-        context, self._context = self._context, None
-        if context is not None:
-            with context.as_current():
-                self._mjr.free()
-            context.free()
-
-    def __del__(self) -> None:
-        self.close()
+        """Free the renderer and its contexts; a second call changes nothing."""
+        self._renderer.close()
+        self._context.free()
 
 
 class Window:
@@ -95,7 +102,7 @@ class Window:
         _import_triton()
         import glfw
 
-        self._glfw = glfw
+        self._glfw: Any = glfw
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if not glfw.init():
@@ -107,18 +114,24 @@ class Window:
             self._window = glfw.create_window(width, height, title, None, None)
         if not self._window:
             raise GLUnavailableError(f"render_mode='human' cannot open a window: no OpenGL there; {INSTALL}")
-        glfw.make_context_current(self._window)
+        self._glfw.make_context_current(self._window)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._glfw.make_context_current(
+            None
+        )  # a thread may have the context of one platform alone, GLFW or EGL
+        self.scene = mujoco.MjvScene(model, MAX_GEOMS)
+        """Scene that is shown."""
 
-    def show(self, scene: mujoco.MjvScene) -> bool:
-        """Show a scene; return False after the window has been closed."""
+    def draw(self) -> bool:
+        """Show the scene; return False after the window has been closed."""
         if self._window is None or self._glfw.window_should_close(self._window):
             self.close()
             return False
         self._glfw.make_context_current(self._window)
         width, height = self._glfw.get_framebuffer_size(self._window)
-        mujoco.mjr_render(mujoco.MjrRect(0, 0, width, height), scene, self._mjr)
+        mujoco.mjr_render(mujoco.MjrRect(0, 0, width, height), self.scene, self._mjr)
         self._glfw.swap_buffers(self._window)
+        self._glfw.make_context_current(None)
         self._glfw.poll_events()
         return True
 
@@ -134,37 +147,14 @@ class Window:
         self.close()
 
 
-def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
-    """Return an offscreen context on the platform of MUJOCO_GL, or else on the first that works."""
-    wish = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if wish in OFF:
-        raise GLUnavailableError(f"rendering is disabled by MUJOCO_GL={wish}: unset it, or set it to egl")
-    _import_triton()
-    reasons = []
-    for platform in _platforms(wish):
-        try:
-            return _open_on(platform, model)
-        except AttributeError:  # raised by PyOpenGL if it finds no library
-            reasons.append(f"{platform}: library not found")
-        except Exception as error:  # platforms raise errors of many kinds, including MuJoCo's FatalError
-            reasons.append(f"{platform}: {error}")
-    raise GLUnavailableError(
-        f"no OpenGL library could be used to render ({'; '.join(reasons)}). Install one ({INSTALL}), "
-        "or choose another by setting MUJOCO_GL to egl, osmesa or glfw"
-    )
-
-
-def _open_on(platform: str, model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # GLFW warns before the exception with the same message
-        size = model.vis.global_.offwidth, model.vis.global_.offheight
-        context = importlib.import_module(f"mujoco.{platform}").GLContext(*size)
-        with context.as_current():
-            if platform == "glfw" and not importlib.import_module("glfw").get_current_context():
-                raise OSError("no window could be opened")  # MuJoCo would end the process
-            mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, mjr)
-    return context, mjr
+def _gl_context() -> Any:
+    """Return a new OpenGL context of the kind that MuJoCo's renderer opens."""
+    if sys.platform == "linux" and os.environ.get("MUJOCO_GL", "").lower() in ("", "egl"):
+        # MuJoCo takes GLFW by default, which needs a display. It reads MUJOCO_GL when it is imported, and then cannot
+        # be imported without the library of that name; so the variable is not set, and EGL is used where it is found.
+        with contextlib.suppress(ImportError, AttributeError):  # PyOpenGL raises both if it finds no library
+            gl_context.GLContext = importlib.import_module("mujoco.egl").GLContext
+    return gl_context.GLContext(1, 1)
 
 
 def _import_triton() -> None:
@@ -176,17 +166,6 @@ def _import_triton() -> None:
     if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
         with contextlib.suppress(Exception):  # a broken triton concerns torch only
             importlib.import_module("triton")
-
-
-def _platforms(wish: str) -> tuple[str, ...]:
-    """Return MuJoCo's OpenGL platforms in the order in which to try them."""
-    if wish in ("egl", "osmesa", "glfw", "cgl"):
-        return (wish,)
-    if sys.platform == "darwin":
-        return ("cgl", "glfw")
-    if sys.platform == "win32":
-        return ("glfw",)
-    return ("glfw", "egl") if _has_display() else ("egl",)
 
 
 def _has_display() -> bool:

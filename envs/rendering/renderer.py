@@ -20,18 +20,12 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Rollout
 from viapoint.envs.sim.simulator import Simulator
 
-__all__ = ["GLUnavailableError", "MovementRenderer", "check_render_mode", "frame_steps"]
+__all__ = ["GLUnavailableError", "MovementRenderer", "frame_steps"]
 
-
+RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]
+"""Values of `render_mode` besides None."""
 STILL_SUPERSAMPLING = 2
 """Supersampling of single pictures; frames of films have none, because it takes time."""
-
-
-def check_render_mode(mode: str | None, known: Sequence[str]) -> str | None:
-    """Return a render mode after checking that it is None or known."""
-    if mode is not None and mode not in known:
-        raise ValueError(f"render_mode must be None or one of {', '.join(known)}, got {mode!r}")
-    return mode
 
 
 def frame_steps(time: Float, fps: int) -> Int:
@@ -60,13 +54,14 @@ class MovementRenderer:
     """
 
     def __init__(self, simulator: Simulator, mode: str | None, width: int, height: int, fps: int) -> None:
+        if mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be None or one of {', '.join(RENDER_MODES)}, got {mode!r}")
         self._simulator = simulator
         self.mode = mode
         self._size = whole_number("width", width, 1), whole_number("height", height, 1)
         self._fps = fps
         self._view: SceneView | None = None
-        self._canvas: Canvas | None = None
-        self._window: Window | None = None
+        self._screen: Canvas | Window | None = None
 
     def still(self, scene: Scenes) -> Any:
         """Render the scene before the movement."""
@@ -105,31 +100,29 @@ class MovementRenderer:
 
     def close(self) -> None:
         """Close window and OpenGL context; the next picture opens them again."""
-        for screen in (self._canvas, self._window):
-            if screen is not None:
-                screen.close()
-        self._view = self._canvas = self._window = None
+        if self._screen is not None:
+            self._screen.close()
+        self._view = self._screen = None
 
-    def _ready(self) -> SceneView:
-        """Return the scene view, after opening a canvas or a window for it."""
-        if self._view is None:
+    def _open(self) -> tuple[SceneView, Canvas | Window]:
+        """Return the scene view, and the canvas or window for it, which the first picture opens."""
+        if self._view is None or self._screen is None:
             view = SceneView(self._simulator, *self._size)
             if self.mode == "human":
-                self._window = Window(view.model, *self._size, title="Viapoint")
+                self._screen = Window(view.model, *self._size, title="Viapoint")
             else:
                 factor = STILL_SUPERSAMPLING if self.mode == "rgb_array" else 1
-                self._canvas = Canvas(view.model, *self._size, supersampling=factor)
+                self._screen = Canvas(view.model, *self._size, supersampling=factor)
+            view.scene = self._screen.scene
             self._view = view
-        return self._view
+        return self._view, self._screen
 
     def _draw(self, scene: Scenes, movement: Movement | None, replaced: Sequence[Float], step: int) -> Any:
         """Return a picture, or show it in the window and return False after the window has been closed."""
-        view = self._ready()
+        view, screen = self._open()
         still = self._simulator.arm.inverse_kinematics(scene.start) if movement is None else movement.joints
         view.set(scene, still[step], movement, step, replaced)
-        screen = self._window or self._canvas
-        assert screen is not None
-        return screen.show(view.scene) if isinstance(screen, Window) else screen.draw(view.scene)
+        return screen.draw()
 
     def _play(self, at: Callable[[int], Moment], steps: Int) -> None:
         """Play the film in the window in real time; late frames are left out."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from viapoint.envs.common.validation import check_increasing_pair, is_number
+from viapoint.envs.common.validation import check_increasing_pair, fewest_and_most
 from viapoint.envs.geometry.rows import CAPSULES, check_shapes
 from viapoint.envs.scenes.families import MOST_DRAWN, MOST_OBSTACLES, scene_families
 from viapoint.envs.scenes.spatial_families import SpatialSizes
@@ -26,9 +25,6 @@ class SceneDistribution:
     """Fewest and most obstacles."""
     shapes: tuple[str, ...] = CAPSULES
     """Names of the shapes that obstacles may have; spheres are capsules without a length."""
-    uniform_share: float = 0.0
-    """Share of scenes with ends and obstacles that are uniform in the workspace, see
-    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     distance: tuple[float, float] = (0.25, 0.45)
     """Distance from start to goal, [m]."""
     post_radius: tuple[float, float] = (0.012, 0.045)
@@ -61,9 +57,9 @@ class SceneDistribution:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
+        number = fewest_and_most("n_obstacles", self.n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        object.__setattr__(self, "n_obstacles", number)
         check_shapes(self.shapes, self.dimension)
-        check_share(self.uniform_share, "uniform_share")
         for name in ("distance", "post_radius", "bar_radius", "bar_half_length"):
             check_increasing_pair(name, getattr(self, name))
 
@@ -78,9 +74,6 @@ class SpaceDistribution(SpatialSizes):
     """Fewest and most obstacles; a scene has at least as many as its family needs."""
     shapes: tuple[str, ...] = CAPSULES
     """Names of the shapes that obstacles may have; spheres are capsules without a length."""
-    uniform_share: float = 0.0
-    """Share of scenes with ends and obstacles that are uniform in the workspace, see
-    :class:`~viapoint.envs.scenes.uniform.UniformScenes`."""
     families: tuple[str, ...] = TRAINED
     """Names of families, drawn with equal chances; a repeated name is drawn more often. Families that need more than
     the greatest number of obstacles are left out."""
@@ -99,9 +92,9 @@ class SpaceDistribution(SpatialSizes):
 
     def __post_init__(self) -> None:
         """Check the ranges and the families."""
-        check_count(self.n_obstacles, "n_obstacles", MOST_OBSTACLES, MOST_DRAWN)
+        number = fewest_and_most("n_obstacles", self.n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        object.__setattr__(self, "n_obstacles", number)
         check_shapes(self.shapes, self.dimension)
-        check_share(self.uniform_share, "uniform_share")
         unknown = sorted(set(self.families) - set(scene_families(3)))
         if unknown or not self.families:
             raise ValueError(
@@ -137,26 +130,3 @@ class SpaceDistribution(SpatialSizes):
             name for name, family in families if family.trained and set(family.shapes) <= set(shapes)
         )
         return {"shapes": shapes, "families": TRAINED + others}
-
-
-def check_count(pair: Sequence[int], name: str, limit: int, fewest_limit: int | None = None) -> None:
-    """Check a pair of fewest and most.
-
-    Raises:
-        ValueError: The numbers are out of range.
-    """
-    fewest, most = pair
-    least = limit if fewest_limit is None else fewest_limit
-    if not 0 <= fewest <= most <= limit or fewest > least:
-        also = f" and fewest <= {least}" if least < limit else ""
-        raise ValueError(f"{name} must be (fewest, most), 0 <= fewest <= most <= {limit}{also}, got {pair}")
-
-
-def check_share(share: float, name: str) -> None:
-    """Check a share.
-
-    Raises:
-        ValueError: The value is no number from 0 to 1.
-    """
-    if not is_number(share) or not 0.0 <= share <= 1.0:
-        raise ValueError(f"{name} must be a number from 0 to 1, got {share!r}")

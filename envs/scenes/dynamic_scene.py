@@ -9,7 +9,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.scenes.scene import FASTEST, Problem, Scenes, rest_clearance
+from viapoint.envs.scenes.scene import FASTEST, Problem, Scenes, problem, rest_clearance
 
 if TYPE_CHECKING:
     from viapoint.envs.arms.base import CollisionModel
@@ -117,42 +117,41 @@ def problems_of_changes(
     """Yield the faults that the changes of N scenes can have; the scenes are possible at the start."""
     d = scenes.start.shape[-1]
     given, turns = (scenes.jumps != 0.0).any(axis=-1), scenes.turns
-    for there, time, what in (
-        (given, scenes.jumps[..., 0], "jump"),
-        (turns, scenes.courses[..., d], "the change of course"),
-    ):
-        yield _first(there & (time <= 0.0), time, what, "s lies in the past (a time over 0 is needed)")
-        yield _first(
-            there & (time >= time_limit), time, what, f"s is not before the time limit, {time_limit:g} s"
+
+    def jump(_: int, row: int) -> str:
+        return f"jump {row}"
+
+    def course(_: int, row: int) -> str:
+        return f"course {row}"
+
+    lost = (scenes.courses != 0.0).any(axis=-1) & ~scenes.present
+    yield problem(lost, "must belong to an obstacle", part=course)
+    timed = ((given, scenes.jumps[..., 0], jump), (turns, scenes.courses[..., d], course))
+    for there, time, part in timed:
+        yield problem(there & (time <= 0.0), "must change after 0 s", time, part)
+        yield problem(
+            there & (time >= time_limit), f"must change before the time limit, {time_limit:g} s", time, part
         )
     late = np.zeros_like(given)
     late[:, 1:] = scenes.jump_times[:, 1:] <= scenes.jump_times[:, :-1]
-    yield _first(given & late, scenes.jumps[..., 0], "jump", "s is not after the one before it")
+    yield problem(given & late, "must be later than the one before it", scenes.jumps[..., 0], jump)
     for first in (0, d + 1):
         speed = np.sqrt((scenes.courses[..., first : first + d] ** 2).sum(axis=-1))
-        yield _first(scenes.present & (speed > FASTEST), speed, "course", f"m/s is faster than {FASTEST} m/s")
+        yield problem(
+            scenes.present & (speed > FASTEST), f"must be at most {FASTEST} m/s fast", speed, course
+        )
     for k in range(scenes.jumps.shape[1]):
         goal = np.where(given[:, k, None], scenes.jumps[:, k, 1:], scenes.goal)
         margin = np.asarray(collision_model.arm.reach_margin(goal))
-        yield (
+        yield problem(
             given[:, k] & (margin < 0.0),
-            lambda i, k=k, m=margin: (  # type: ignore[misc]
-                f"the target of jump {k} is {-m[i]:.4f} m out of the arm's reach"
-            ),
+            f"the target of jump {k} must be within the arm's reach: its margin must be 0 m or more",
+            margin,
         )
         then = scenes.at(np.where(given[:, k], scenes.jumps[:, k, 0], 0.0))
         least = rest_clearance(then, goal, collision_model).min(axis=-1)
-        yield (
+        yield problem(
             given[:, k] & (least <= 0.0),
-            lambda i, k=k, c=least: (  # type: ignore[misc]
-                f"an obstacle touches the arm at the target of jump {k} when it appears (clearance {c[i]:.4f} m)"
-            ),
+            f"the target of jump {k} must be free when it appears: the arm's clearance must be over 0 m",
+            least,
         )
-
-
-def _first(wrong: Bool, values: Float, what: str, why: str) -> Problem:
-    """Return a fault of some rows, described for the first of them."""
-    return (
-        np.asarray(wrong.any(axis=-1)),
-        lambda i: f"{what} {wrong[i].argmax()} at {values[i, wrong[i].argmax()]:g} {why}",
-    )

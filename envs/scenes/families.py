@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.rows import CAPSULES
 from viapoint.envs.scenes.draws import FeasiblePath, Site, Uniforms, unit
 from viapoint.envs.scenes.planar_families import FAMILY_ROWS, PLANAR_BUILDERS
@@ -163,17 +163,14 @@ def _checked(name: str, build: SiteBuilder, n_obstacles: int) -> SiteBuilder:
 
     def checked(uniforms: Uniforms, site: Site) -> Float:
         number, dimension = site.start.shape
-        rows = np.asarray(build(uniforms, site))
         size = 2 * dimension + 1
-        right = rows.ndim == 3 and rows.shape[::2] == (number, size) and rows.shape[1] <= n_obstacles
-        if not right or rows.dtype.kind not in "fiu":
+        rows = finite_array(f"obstacles of the family {name!r}", build(uniforms, site))
+        if rows.ndim != 3 or rows.shape[::2] != (number, size) or rows.shape[1] > n_obstacles:
             raise ValueError(
-                f"family {name!r} must return numbers of shape ({number}, n, {size}) with n at most {n_obstacles}, "
-                f"got {rows.dtype} of shape {rows.shape}"
+                f"obstacles of the family {name!r} must have shape ({number}, n, {size}) with n at most {n_obstacles}, "
+                f"got {rows.shape}"
             )
-        if not np.isfinite(rows).all():
-            raise ValueError(f"family {name!r} must return finite numbers, got {rows[~np.isfinite(rows)][0]}")
-        return rows.astype(np.float64)
+        return rows.copy()
 
     return checked
 

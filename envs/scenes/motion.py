@@ -10,7 +10,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.scenes.config import check_count
+from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.scenes.draws import Uniforms, between, directions, whole_between
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.scene import FARTHEST_CENTRE, Scenes, rest_clearance
@@ -54,7 +54,8 @@ class ChangeDistribution:
 
     def __post_init__(self) -> None:
         """Check the number of jumps."""
-        check_count(self.n_jumps, "n_jumps", MOST_JUMPS)
+        number = fewest_and_most("n_jumps", self.n_jumps, MOST_JUMPS, MOST_JUMPS)
+        object.__setattr__(self, "n_jumps", number)
 
 
 class ChangeSampler:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.rows import (
     CAPSULES,
     dimension_of,
@@ -47,94 +47,68 @@ def draw_given(
     Sampled obstacles stand in the way of the given ends; with given obstacles, start and goal are only sampled clear of
     them.
 
+    Args:
+        options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
+            (N, n, 2 D + 1), [m]; or a list of shapes, or of their dictionaries, for all scenes, or N such lists.
+        sampler: Sampler of the task's scenes.
+        generators: N random generators.
+        n_rows: Greatest number of obstacles in a scene.
+
     Raises:
-        ValueError: A scene is impossible, with the reason.
+        ValueError: An array is not finite or has another shape, a name is unknown, or a scene is impossible.
     """
-    collision_model, arm, number = sampler.collision_model, sampler.collision_model.arm, len(generators)
-    shapes = sampler.distribution.shapes
-    asked, options = options, _with_rows(options, arm.dimension, shapes)
-    names = obstacle_names(asked.get("obstacles", []))
-    nothing = Scenes(
-        np.full((number, arm.dimension), np.nan),
-        np.full((number, arm.dimension), np.nan),
-        np.zeros((number, n_rows, row_size(arm.dimension, shapes))),
-    )
-    given = given_scenes(options, nothing, arm, shapes)
+    refuse_unknown_options(options, GIVEN)
+    collision_model, shapes, number = sampler.collision_model, sampler.distribution.shapes, len(generators)
+    dimension = collision_model.arm.dimension
+    point = (number, dimension)
+    sizes = {"start": point, "goal": point, "obstacles": (number, n_rows, row_size(dimension, shapes))}
+    parts = {}
+    for name, value in options.items():
+        rows = _rows_of(value, dimension, shapes) if name == "obstacles" else value
+        parts[name] = _parse(name, rows, sizes[name])
+    names = obstacle_names(options.get("obstacles", []))
+    nowhere = np.full(point, np.nan)
+    given = Scenes(nowhere, nowhere, np.zeros(sizes["obstacles"]))._replace(**parts)
+    if has_shapes(given.obstacles):
+        given = given._replace(obstacles=_with_unit_quaternions(given.obstacles))
     with np.errstate(invalid="ignore"):
         # Parts that are not given are NaN: comparisons with them are false.
         check_scenes(given, collision_model, names)
-    if set(options) >= set(GIVEN):
+    if set(parts) >= set(GIVEN):
         return given
-    scenes = _sample(options, sampler, generators, given)
+
+    def sample(rows: Int) -> Scenes:
+        some = given.take(rows)
+        try:
+            sampled = sampler([generators[int(i)] for i in rows], (some.start, some.goal))
+        except RuntimeError as error:
+            raise ValueError(
+                f"{error}; give the obstacles too, or ends farther inside the arm's reach"
+            ) from None
+        return sampled._replace(**{name: getattr(some, name) for name in parts})
+
+    scenes = sample(np.arange(number))
     for _ in range(ATTEMPTS):
         wrong = np.zeros(number, dtype=bool)
         for these, _ in problems(scenes, collision_model):
             wrong |= these
-        if not wrong.any() or "obstacles" not in options:
+        if not wrong.any() or "obstacles" not in parts:
             break
         again = np.flatnonzero(wrong)
-        some = {name: _rows(options[name], again, number, 2 + (name == "obstacles")) for name in options}
-        scenes.put(again, _sample(some, sampler, [generators[int(i)] for i in again], given.take(again)))
+        scenes.put(again, sample(again))
     check_scenes(scenes, collision_model, names)
     return scenes
 
 
-def _sample(
-    options: Mapping[str, Any],
-    sampler: SceneSampler,
-    generators: Sequence[np.random.Generator],
-    given: Scenes,
-) -> Scenes:
-    """Return sampled scenes with the parts that `options` gives."""
+def _rows_of(obstacles: Any, dimension: int, shapes: Sequence[str]) -> Any:
+    """Return given obstacles as rows of scenes that may have some shapes."""
     try:
-        sampled = sampler(generators, (given.start, given.goal))
-    except RuntimeError as error:
-        raise ValueError(f"{error}; give the obstacles too, or ends farther inside the arm's reach") from None
-    return given_scenes(options, sampled, sampler.collision_model.arm, sampler.distribution.shapes)
-
-
-def _rows(value: Any, rows: Int, number: int, batched: int) -> Any:
-    """Return the rows of an option that has one for each of `number` scenes; an option for all stays as it is."""
-    array = np.asarray(value)
-    return array[rows] if array.ndim == batched and len(array) == number else array
-
-
-def given_scenes(
-    options: Mapping[str, Any], sampled: Scenes, arm: Arm, shapes: Sequence[str] = CAPSULES
-) -> Scenes:
-    """Return sampled scenes with the parts that `options` gives in their place.
-
-    Args:
-        options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
-            (N, n, 2 D + 1), with at most as many rows as the sampled ones, [m]; or a list of shapes, or of their
-            dictionaries, for all scenes, or N such lists.
-        sampled: Scenes to overwrite.
-        arm: Arm, for the dimension D.
-        shapes: Names of the shapes that the scenes may have.
-
-    Raises:
-        ValueError: An array is not finite or has another shape, or a name is unknown.
-    """
-    refuse_unknown_options(options, GIVEN)
-    options = _with_rows(options, arm.dimension, shapes)
-    fields = sampled._asdict()
-    given = {name: _parse(name, options[name], fields[name].shape) for name in options}
-    if "obstacles" in given and has_shapes(given["obstacles"]):
-        given["obstacles"] = _with_unit_quaternions(given["obstacles"])
-    return Scenes(**{**{name: field.copy() for name, field in fields.items()}, **given})
-
-
-def _with_rows(options: Mapping[str, Any], dimension: int, shapes: Sequence[str]) -> Mapping[str, Any]:
-    """Return options with obstacles as rows of scenes that may have some shapes."""
-    if "obstacles" not in options:
-        return options
-    try:
-        rows = obstacle_rows(options["obstacles"], dimension, shapes)
+        rows = obstacle_rows(obstacles, dimension, shapes)
     except ValueError as error:
         raise ValueError(f"options['obstacles']: {error}") from None
     if tuple(shapes) != CAPSULES and np.shape(rows)[-1:] == (row_size(dimension),):
         rows = widened(_numbers("obstacles", rows))
-    return {**options, "obstacles": rows}
+    return rows
 
 
 def _with_unit_quaternions(rows: Float) -> Float:
@@ -184,7 +158,6 @@ def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
             if batched and len(array) != 1:
                 raise ValueError(f"options[{name!r}] must be those of one scene, got {len(array)} scenes")
             array = array[0] if batched else array
-            _require_finite(name, array)
             if name == "obstacles" and array.ndim == 2 and has_shapes(array):
                 # Rows hold indices into this table, which is another one where other meshes are registered.
                 record["shapes"] = list(SHAPES)
@@ -291,7 +264,7 @@ def given_changes(
         Jumps, shape (N, MOST_JUMPS, D + 1), and courses, shape (N, n, 2 D + 1).
 
     Raises:
-        ValueError: An array is not finite or has another shape, a course belongs to no obstacle, or a name is unknown.
+        ValueError: An array is not finite or has another shape, or a name is unknown.
     """
     refuse_unknown_options(options, (*GIVEN, *CHANGES))
     jumps, courses = None, None
@@ -308,71 +281,34 @@ def given_changes(
     return jumps, courses
 
 
-def check_owners(courses: Float, present: Bool) -> None:
-    """Check that all courses belong to obstacles.
-
-    Raises:
-        ValueError: A course belongs to no obstacle.
-    """
-    lost = (courses != 0.0).any(axis=-1) & ~present
-    if lost.any():
-        scene, row = np.argwhere(lost)[0]
-        raise ValueError(
-            f"scene {scene}: course {row} belongs to no obstacle; there are {present[scene].sum()}"
-        )
-
-
 def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
-    """Return an option as an array of a shape: (N, D), or (N, n, .) with rows of zeros behind the given ones."""
+    """Return an option as an array of a shape: (N, D), or (N, n, .) with rows of zeros behind the given ones.
+
+    The option may be one for all scenes.
+    """
     array = _numbers(name, value)
-    result, size = np.zeros(shape), shape[-1]
-    # Empty lists, one for each scene.
-    lists = len(array) if array.ndim == 2 and array.shape[1] == 0 else shape[0]
-    if len(shape) == 3 and array.size == 0 and lists == shape[0]:
-        array = array.reshape((0, size))
-    rows = len(shape) == 3 and array.ndim in (2, 3) and array.shape[-1] == size
-    if rows and array.shape[-2] > shape[1]:
-        number = array.shape[-2]
-        hint = f"; make the environment with n_obstacles=(0, {number})" if name == "obstacles" else ""
-        if number > MOST_OBSTACLES and hint:
-            hint = f"; an environment may have at most {MOST_OBSTACLES}, and PointCloud.covering makes fewer spheres"
-        raise ValueError(f"options[{name!r}] must have at most {shape[1]} {name}, got {number}{hint}")
-    try:
-        if len(shape) == 2 and array.shape in (shape, shape[1:], (1, size)):
-            result[:] = array
-        elif rows:
-            result[:, : array.shape[-2]] = array
-        else:
-            raise ValueError
-    except ValueError:
-        number, *most = shape[:-1]
-        many = f"(n, {size}) or ({number}, n, {size}) with n at most {most[0]}" if most else ""
-        allowed = many or f"{shape} or {shape[1:]}"
-        raise ValueError(f"options[{name!r}] must have shape {allowed}, got {array.shape}") from None
-    _require_finite(name, array)
+    result, (number, *most, size) = np.zeros(shape), shape
+    if not most:
+        if array.shape not in (shape, shape[1:], (1, size)):
+            raise ValueError(f"options[{name!r}] must have shape {shape} or {shape[1:]}, got {array.shape}")
+        result[:] = array
+        return result
+    if array.shape in ((0,), (number, 0)):
+        return result
+    one, several = array.ndim == 2, array.ndim == 3 and len(array) in (1, number)
+    if array.shape[-1:] != (size,) or not (one or several):
+        raise ValueError(
+            f"options[{name!r}] must have shape (n, {size}) or ({number}, n, {size}), got {array.shape}"
+        )
+    if array.shape[-2] > most[0]:
+        hint = ""
+        if name == "obstacles":
+            hint = f"; make the environment with n_obstacles=(0, n) and n up to {MOST_OBSTACLES}"
+        raise ValueError(f"options[{name!r}] must have at most {most[0]} {name}, got {array.shape[-2]}{hint}")
+    result[:, : array.shape[-2]] = array
     return result
 
 
-def _require_finite(name: str, array: Float) -> None:
-    """Check that the numbers of an option are finite.
-
-    Raises:
-        ValueError: One is not.
-    """
-    if not np.isfinite(array).all():
-        raise ValueError(f"options[{name!r}] must be finite, got {array[~np.isfinite(array)][0]}")
-
-
 def _numbers(name: str, value: Any) -> Float:
-    """Return an option as real numbers.
-
-    Raises:
-        ValueError: The option is no array of real numbers.
-    """
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiu":
-            raise TypeError
-        return array.astype(np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"options[{name!r}] must be real numbers, got {value!r}") from None
+    """Return an option as finite real numbers."""
+    return finite_array(f"options[{name!r}]", value)

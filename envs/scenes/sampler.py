@@ -8,42 +8,51 @@ computed at once, or with which others: those at many scenes are computed togeth
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Index, Int
+from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.geometry.rows import CAPSULES, has_shapes, row_size, shape_columns, shape_number
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.draws import RESHAPE_NUMBERS, ObstacleSampler, Uniforms, reshaped
-from viapoint.envs.scenes.families import MOST_DRAWN, scene_families
+from viapoint.envs.scenes.draws import (
+    IN_THE_WAY,
+    RESHAPE_NUMBERS,
+    ObstacleSampler,
+    Uniforms,
+    reshaped,
+    rotate,
+    whole_between,
+)
+from viapoint.envs.scenes.families import MOST_DRAWN
 from viapoint.envs.scenes.feasible_path import DRAW_ORDER, DrawOrder, Ends, sample_ends, sample_paths
-from viapoint.envs.scenes.planar_families import FAMILY_ROWS
-from viapoint.envs.scenes.planar_obstacles import FamilyObstacles, HandObstacles, WholeArmObstacles
-from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.scenes.planar_obstacles import HandObstacles, WholeArmObstacles, draw_shapes
+from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS, Scenes, rest_clearance
+from viapoint.envs.scenes.spatial_families import draw_obstacles
 from viapoint.envs.scenes.spatial_obstacles import SpatialObstacles
-from viapoint.envs.scenes.uniform import UniformScenes, blocks_straight_movement
 
 Distribution = SceneDistribution | SpaceDistribution
 
-FAMILY_ATTEMPTS = 2000
-"""Attempts at a scene of a family in the plane; few of them succeed."""
 TOGETHER = 1024
 """Attempts that are computed at once: more take as much time each."""
 MOST = 24
 """Attempts at one scene for which further groups are begun: those after the first good one are in vain."""
 SHARED_GROUPS = 8
 """Groups of attempts at a scene that share the number :attr:`SceneSampler.fixed`."""
-AHEAD = 4
-"""Scenes of each generator that may wait in a queue."""
 UNIFORM_GROUPS = (4, 8, *[16] * 400)
 """Attempts at a uniform scene that are drawn one after the other."""
+DRAWN = 3
+"""Obstacles of a uniform scene that are drawn for each row; the first ones that leave start and goal free are taken."""
+UNIFORM_NUMBERS = {2: 6, 3: 9}
+"""Uniform numbers that make one obstacle of a uniform scene, by the dimension."""
+N_TIMES = 24
+"""Positions along the straight line at which its clearance and reach are computed."""
 
 
 class SceneSampler:
@@ -83,34 +92,25 @@ class SceneSampler:
         Raises:
             RuntimeError: No scene was found in many attempts, for example with given ends at the border of the reach.
         """
-        scenes, pending = self.empty(len(generators)), np.arange(len(generators))
+        number = len(generators)
+        start, goal = np.zeros((2, number, self.arm.dimension))
+        scenes = Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
+        pending = np.arange(number)
         attempts = [Attempts(self, each) for each in generators]
-        apart = len({id(each.bit_generator) for each in generators}) == len(generators)
+        apart = len({id(each.bit_generator) for each in generators}) == number
         while len(pending):
             left = np.ones(len(pending), dtype=bool)
             for begin in range(0, len(pending), TOGETHER):
                 some = pending[begin : begin + TOGETHER]
                 given = None if ends is None else (ends[0][some], ends[1][some])
-                for which, found, _ in next_attempts([attempts[k] for k in some], given, apart=apart):
-                    scenes.put(some[which], found)
-                    left[begin + which] = False
+                which, found = next_attempts([attempts[k] for k in some], given, apart=apart)
+                scenes.put(some[which], found)
+                left[begin + which] = False
             pending = pending[left]
-        return self.with_spare_rows(scenes)
-
-    def empty(self, number: int) -> Scenes:
-        """Return arrays of zeros for scenes, without spare rows."""
-        start, goal = np.zeros((2, number, self.arm.dimension))
-        return Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
-
-    def with_spare_rows(self, scenes: Scenes) -> Scenes:
-        """Return scenes with empty rows for given obstacles, of which there may be more than are drawn."""
         if not self._spare:
             return scenes
+        # Empty rows for given obstacles, of which there may be more than are drawn.
         return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0))))
-
-    def part(self, generator: np.random.Generator) -> SceneSampler:
-        """Return the sampler of a generator's next scene, which the generator may draw among several."""
-        return self
 
     def not_found(self, attempts: int, ends: Ends) -> str:
         """Return the message for a scene, with given ends or not, of which no attempt was good."""
@@ -187,50 +187,103 @@ class SceneSampler:
 
 
 class UniformSampler(SceneSampler):
-    """Rejection sampler of scenes that are uniform in the workspace, see :class:`UniformScenes`."""
+    """Rejection sampler of scenes that are uniform in the workspace, without a feasible path to begin with.
+
+    Start and goal are uniform in the box :attr:`~viapoint.envs.arms.base.Arm.workspace`, `reach_margin` inside the
+    reach, and may have any distance from each other; the straight line between them is within reach. The number of
+    obstacles is uniform between its limits. Their centres are uniform in the same box, their directions are uniform in
+    the plane, and their kinds and sizes are those of the distribution's other scenes. Obstacles that come closer to the
+    resting arm at start or goal than `end_margin` are left out. A scene is good if the straight movement cuts into an
+    obstacle, or if it has none. A few of the scenes have no solution.
+    """
 
     def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
         order = DRAW_ORDER[distribution.dimension]._replace(groups=UNIFORM_GROUPS)
         super().__init__(collision_model, distribution, order=order)
-        self._uniform = UniformScenes(collision_model, _drawn(distribution))
+        self._drawn = _drawn(distribution)
+        self._rows = self._drawn.n_obstacles[1]
 
     @property
     def size(self) -> int:
         """See :attr:`SceneSampler.size`."""
-        return self._uniform.size + self._reshape_size
+        dimension = self.arm.dimension
+        return 2 * dimension + 1 + DRAWN * self._rows * UNIFORM_NUMBERS[dimension] + self._reshape_size
 
     def attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
         """See :meth:`SceneSampler.attempt`."""
-        rows, scenes = self._uniform(uniforms, ends)
+        start, goal, good = self._ends(uniforms, ends)
+        count = whole_between(self._drawn.n_obstacles, uniforms.take(1)[:, 0])
+        rows = np.flatnonzero(good)
+        start, goal, count = start[rows], goal[rows], count[rows]
+        drawn = Scenes(start, goal, self._draw_obstacles(uniforms.at(rows), len(rows)))
+        obstacles, enough = self._first(drawn, self._free(drawn), count)
+        some = np.flatnonzero(enough)
+        rows, scenes = rows[some], Scenes(start[some], goal[some], obstacles[some])
+        blocked = blocks_straight_movement(self.collision_model, scenes)
+        some = np.flatnonzero(blocked | (count[some] == 0))
+        rows, scenes = rows[some], scenes.take(some)
         return self._reshaped(uniforms.at(rows), rows, scenes)
 
+    def _ends(self, uniforms: Uniforms, ends: Ends) -> tuple[Float, Float, Bool]:
+        """Return starts and goals, shape (N, D), [m], and which are apart and joined within reach, shape (N,)."""
+        arm = self.arm
+        low, high = (np.array(corner) for corner in arm.workspace)
+        u = uniforms.take(2 * arm.dimension).reshape(-1, 2, arm.dimension)
+        points = low + (high - low) * u
+        if ends is not None:
+            given = np.stack(ends, axis=1)
+            points = np.where(np.isnan(given), points, given)
+        inside = np.asarray(arm.reach_margin(points)) > self._drawn.reach_margin
+        if ends is not None:
+            inside |= np.isfinite(given[..., 0])
+        start, goal = points[:, 0], points[:, 1]
+        good = np.asarray(inside.all(axis=-1) & (norm(goal - start) >= MIN_GOAL_DISTANCE))
+        good[good] = np.asarray(arm.reach_margin(_lines(start[good], goal[good]))).min(axis=-1) > 0.0
+        return start, goal, good
 
-class MixedSampler(SceneSampler):
-    """Sampler of scenes of which a share is uniform in the workspace.
+    def _draw_obstacles(self, uniforms: Uniforms, n_scenes: int) -> Float:
+        """Return obstacles anywhere in the workspace, shape (N, DRAWN rows, 2 D + 1), [m]."""
+        arm, distribution, number = self.arm, self._drawn, DRAWN * self._rows
+        if not number:
+            return np.zeros((n_scenes, 0, 2 * arm.dimension + 1))
+        low, high = (np.array(corner) for corner in arm.workspace)
+        centre = low + (high - low) * uniforms.take_table(number, arm.dimension)
+        if isinstance(distribution, SpaceDistribution):
+            return draw_obstacles(distribution, centre, uniforms.take_table(number, 6))
+        every_way = dataclasses.replace(distribution, bar_tilt=0.5 * np.pi)
+        half, radius, angle = draw_shapes(uniforms, every_way, number)
+        axis = half[..., None] * rotate(np.broadcast_to((1.0, 0.0), centre.shape), angle)
+        return np.concatenate((centre, axis, radius[..., None]), axis=-1)
 
-    The first random number of each scene says from which of the two samplers it comes.
-    """
+    def _free(self, scenes: Scenes) -> Bool:
+        """Return which obstacles leave room for the arm at start and goal and are within bounds, shape (N, n)."""
+        d = scenes.start.shape[-1]
+        free = np.abs(scenes.obstacles[..., :d]).max(axis=-1, initial=0.0) < FARTHEST_CENTRE
+        free &= norm(scenes.obstacles[..., d : 2 * d]) < LARGEST_HALF_AXIS
+        for point in (scenes.start, scenes.goal):
+            clearance = rest_clearance(scenes, point, self.collision_model)[:, : free.shape[1]]
+            free &= clearance > self._drawn.end_margin
+        return np.asarray(free)
 
-    def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
-        super().__init__(collision_model, distribution)
-        self._uniform = UniformSampler(collision_model, distribution)
-
-    def part(self, generator: np.random.Generator) -> SceneSampler:
-        """Return the sampler of a generator's next scene, as its first number says."""
-        return self._uniform if generator.random() < self.distribution.uniform_share else self
+    def _first(self, scenes: Scenes, free: Bool, count: Float) -> tuple[Float, Bool]:
+        """Return the first `count` free obstacles of each scene, shape (N, rows, 2 D + 1), and which have as many."""
+        first = np.argsort(~free, axis=-1, kind="stable")[:, : self._rows]
+        chosen = np.take_along_axis(scenes.obstacles, first[..., None], axis=1)
+        chosen[np.arange(self._rows) >= count[:, None]] = 0.0
+        return chosen, free.sum(axis=-1) >= count
 
 
 class Attempts:
     """Attempts at the next scene of one random generator, until one is good."""
 
     def __init__(self, sampler: SceneSampler, generator: np.random.Generator) -> None:
-        self.generator, self.sampler = generator, sampler.part(generator)
-        self._shared = 0.0 if self.sampler.fixed is None else generator.random()
+        self.generator, self.sampler = generator, sampler
+        self._shared = 0.0 if sampler.fixed is None else generator.random()
         self.made = 0
         """Attempts that were taken."""
-        self._rest = np.empty((0, self.sampler.size))
+        self._rest = np.empty((0, sampler.size))
         # Attempts up to the end of each group that was drawn, and the generator's state there.
-        self._groups: list[tuple[int, Any]] = []
+        self._groups: list[tuple[int, Mapping[str, Any]]] = []
 
     def take(self, least: int, most: int) -> Float:
         """Return the numbers of the next attempts, shape (n, size); n = 0 after the last.
@@ -251,117 +304,47 @@ class Attempts:
         self.made += len(taken)
         return taken
 
-    def end(self, attempt: int) -> Any:
-        """Set the generator back to the end of the group that holds an attempt, and return its state there."""
+    def end(self, attempt: int) -> None:
+        """Set the generator back to the end of the group that holds an attempt."""
         state = next(state for end, state in self._groups if attempt < end)
         if state is not self._groups[-1][1]:
             self.generator.bit_generator.state = state
-        return state
 
 
 def next_attempts(
     attempts: Sequence[Attempts], ends: Ends = None, *, apart: bool = True
-) -> Iterator[tuple[Int, Scenes, list[Any]]]:
+) -> tuple[Int, Scenes]:
     """Compute the next attempts at several scenes.
 
     Args:
-        attempts: Attempts at N scenes, at most TOGETHER.
+        attempts: Attempts of one sampler at N scenes, at most TOGETHER.
         ends: Starts and goals of the N scenes, see :meth:`SceneSampler.__call__`.
         apart: False if scenes share a generator: whole groups are then drawn in turn.
 
-    Yields:
-        Indices of scenes with a good attempt, the scenes, and the states of their generators.
+    Returns:
+        Indices of scenes with a good attempt, and the scenes; their generators are at the next scene.
 
     Raises:
         RuntimeError: There are no further attempts at a scene.
     """
-    number, order = len(attempts), attempts[0].sampler.order
+    number, sampler = len(attempts), attempts[0].sampler
+    order = sampler.order
     least = min(max(order.ahead // number, 1), MOST) if apart else 1
     most = max(TOGETHER // number, least) if apart else max(order.groups)
     taken = [each.take(least, most) for each in attempts]
     for k, each in enumerate(attempts):
         if not len(taken[k]):
-            raise RuntimeError(
-                each.sampler.not_found(each.made, None if ends is None else (ends[0][k], ends[1][k]))
-            )
-    for sampler in dict.fromkeys(each.sampler for each in attempts):
-        some = np.array([k for k, each in enumerate(attempts) if each.sampler is sampler])
-        counts = np.array([len(taken[k]) for k in some])
-        owner, begin = np.repeat(some, counts), np.repeat(np.cumsum(counts) - counts, counts)
-        given = None if ends is None else (ends[0][owner], ends[1][owner])
-        found, scenes = sampler.attempt(Uniforms(np.concatenate([taken[k] for k in some])), given)
-        first = np.flatnonzero(np.diff(owner[found], prepend=-1))
-        which, place = owner[found[first]], found[first] - begin[found[first]]
-        states = [
-            attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
-            for k, at in zip(which, place, strict=True)
-        ]
-        yield which, scenes.take(first), states
-
-
-class SceneQueue:
-    """Scenes of N random generators that are sampled ahead, so that attempts at many scenes are computed together.
-
-    The scenes are those that the sampler returns, and the generators end in the same states: each scene waits with the
-    states of its generator before and after it, and is discarded if the generator has been used in the meantime.
-    """
-
-    def __init__(self, sampler: SceneSampler, number: int) -> None:
-        self._sampler = sampler
-        self._scenes = sampler.empty(number * AHEAD)
-        self._first, self._waiting = np.zeros((2, number), dtype=np.int64)
-        self._attempts: dict[int, Attempts] = {}
-        self._before: dict[int, Any] = {}
-        self._after: dict[int, deque[Any]] = {}
-
-    def __call__(self, generators: Sequence[np.random.Generator], rows: Int) -> Scenes:
-        """Return the next scenes of the generators at `rows`.
-
-        Raises:
-            RuntimeError: No scene was found in many attempts.
-        """
-        for k in rows:
-            if not _same(self._before.get(k), generators[k].bit_generator.state):
-                self._restart(k, generators[k])
-        while not self._waiting[rows].all():
-            self._sample()
-        scenes = self._scenes.take(rows * AHEAD + self._first[rows])
-        self._first[rows] = (self._first[rows] + 1) % AHEAD
-        self._waiting[rows] -= 1
-        for k in rows:
-            self._before[k] = generators[k].bit_generator.state = self._after[k].popleft()
-        return self._sampler.with_spare_rows(scenes)
-
-    def _restart(self, k: int, generator: np.random.Generator) -> None:
-        """Begin anew where a generator is."""
-        self._before[k], self._after[k], self._waiting[k] = generator.bit_generator.state, deque(), 0
-        self._attempts[k] = Attempts(self._sampler, copy.deepcopy(generator))
-
-    def _sample(self) -> None:
-        """Compute attempts for the generators with the fewest scenes waiting."""
-        some = np.array([k for k in self._attempts if self._waiting[k] < AHEAD])
-        some = some[np.argsort(self._waiting[some], kind="stable")[:TOGETHER]]
-        for which, scenes, states in next_attempts([self._attempts[k] for k in some]):
-            rows = some[which]
-            self._scenes.put(rows * AHEAD + (self._first[rows] + self._waiting[rows]) % AHEAD, scenes)
-            self._waiting[rows] += 1
-            for k, state in zip(rows, states, strict=True):
-                self._after[k].append(state)
-                self._attempts[k] = Attempts(self._sampler, self._attempts[k].generator)
-
-
-def _same(first: Any, second: Any) -> bool:
-    """Return True if states of bit generators are equal; those with arrays count as different."""
-    try:
-        return bool(first == second)
-    except ValueError:
-        return False
-
-
-def scene_sampler(collision_model: CollisionModel, distribution: Distribution) -> SceneSampler:
-    """Return the sampler of a distribution."""
-    kind = MixedSampler if distribution.uniform_share else SceneSampler
-    return kind(collision_model, distribution)
+            given = None if ends is None else (ends[0][k], ends[1][k])
+            raise RuntimeError(sampler.not_found(each.made, given))
+    counts = np.array([len(each) for each in taken])
+    owner, begin = np.repeat(np.arange(number), counts), np.repeat(np.cumsum(counts) - counts, counts)
+    given = None if ends is None else (ends[0][owner], ends[1][owner])
+    found, scenes = sampler.attempt(Uniforms(np.concatenate(taken)), given)
+    first = np.flatnonzero(np.diff(owner[found], prepend=-1))
+    which, place = owner[found[first]], found[first] - begin[found[first]]
+    for k, at in zip(which, place, strict=True):
+        attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
+    return which, scenes.take(first)
 
 
 def _has_boxes(obstacles: Float) -> Bool:
@@ -378,30 +361,15 @@ def _drawn(distribution: Distribution) -> Distribution:
     return dataclasses.replace(distribution, n_obstacles=(fewest, min(most, MOST_DRAWN)))
 
 
-def sampler_of_family(
-    collision_model: CollisionModel, distribution: Distribution, family: str
-) -> SceneSampler:
-    """Return a sampler of one family of scenes.
+def blocks_straight_movement(collision_model: CollisionModel, scenes: Scenes) -> Bool:
+    """Return in which of N scenes the straight movement cuts into an obstacle, shape (N,)."""
+    if not scenes.obstacles.size:
+        return np.zeros(len(scenes.start), dtype=bool)
+    lines = _lines(scenes.start, scenes.goal)
+    least = collision_model.least_clearance(lines, scenes.obstacles, scenes.present, floor=-IN_THE_WAY)
+    return np.asarray(least < -IN_THE_WAY)
 
-    Raises:
-        ValueError: There is no such family, or it needs more obstacles than the task has.
-    """
-    families, most = scene_families(distribution.dimension), distribution.n_obstacles[1]
-    if family not in families:
-        raise ValueError(f"family must be one of {', '.join(families)}, got {family!r}")
-    record = families[family]
-    if not set(record.shapes) <= {*distribution.shapes, *CAPSULES}:
-        raise ValueError(
-            f"{family} needs a task with the shapes {', '.join(record.shapes)}, this one has "
-            f"{', '.join(distribution.shapes)}"
-        )
-    if most < record.n_obstacles:
-        raise ValueError(
-            f"{family} needs a task with up to {record.n_obstacles} obstacles, this one has {most} at most"
-        )
-    if isinstance(distribution, SpaceDistribution):
-        return SceneSampler(collision_model, dataclasses.replace(distribution, families=(family,)))
-    planar = dataclasses.replace(distribution, n_obstacles=(1, min(FAMILY_ROWS, most)))
-    obstacles = FamilyObstacles(collision_model, planar, record.build)
-    order = DRAW_ORDER[2]._replace(groups=(1,) * FAMILY_ATTEMPTS)
-    return SceneSampler(collision_model, planar, obstacles=obstacles, order=order)
+
+def _lines(start: Float, goal: Float) -> Float:
+    """Return positions along straight lines, shape (N, N_TIMES, D), [m]."""
+    return np.asarray(start[:, None] + (goal - start)[:, None] * np.linspace(0.0, 1.0, N_TIMES)[:, None])

@@ -25,7 +25,7 @@ from viapoint.envs.geometry.shape import UNIT_TOLERANCE
 from viapoint.envs.geometry.shapes import SHAPES
 
 if TYPE_CHECKING:
-    from viapoint.envs.arms.base import Arm, CollisionModel
+    from viapoint.envs.arms.base import CollisionModel
 
 LARGEST_HALF_AXIS = 0.3
 """Greatest half length of a bar, [m]."""
@@ -120,6 +120,27 @@ Names = Sequence[Sequence[str]]
 """Names of obstacles, empty where there is none: one list for all scenes, or one for each."""
 
 
+def problem(
+    wrong: Any, why: str, values: Any = None, part: Callable[[int, int], str] | None = None
+) -> Problem:
+    """Return a fault of scenes.
+
+    Args:
+        wrong: True for scenes, shape (N,), or for parts of them, shape (N, n), that have the fault.
+        why: Description of the fault with what is allowed.
+        values: Wrong numbers, of the shape of `wrong`.
+        part: Function that names one of n parts of a scene.
+    """
+    wrong = np.asarray(wrong)
+
+    def reason(scene: int) -> str:
+        index = (scene,) if part is None else (scene, int(wrong[scene].argmax()))
+        got = "" if values is None else f", got {values[index]:.4g}"
+        return f"{why}{got}" if part is None else f"{part(*index)} {why}{got}"
+
+    return wrong if part is None else wrong.any(axis=-1), reason
+
+
 def check_scenes(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> None:
     """Check that a movement can start and end in each scene.
 
@@ -144,53 +165,37 @@ def refuse(faults: Iterator[Problem]) -> None:
 
 def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> Iterator[Problem]:
     """Yield the faults that N scenes can have; see :func:`check_scenes`."""
-    yield from _problems_of_ends(scenes, collision_model.arm)
-    yield from _problems_of_sizes(scenes, names)
-    if scenes.present.any() and (base := getattr(collision_model.arm, "base", ())):
-        inside = _contain(scenes, base)
-        yield (
-            np.asarray(inside.any(axis=-1)),
-            lambda i: (
-                f"{_obstacle(scenes, names, i, inside[i].argmax())} contains the base of the arm; it may overlap the "
-                "base, but not contain it"
-            ),
-        )
-    for name, point in (("start", scenes.start), ("goal", scenes.goal)):
-        clearance = rest_clearance(scenes, point, collision_model)
-        touched, least = clearance.argmin(axis=-1), clearance.min(axis=-1)
-        yield (
-            least <= 0.0,
-            lambda i, n=name, t=touched, c=least: (  # type: ignore[misc]
-                f"{_obstacle(scenes, names, i, t[i])} touches the arm at the {n} "
-                f"(clearance {c[i]:.4f} m; more than 0 is needed)"
-            ),
-        )
+    d = scenes.start.shape[-1]
 
+    def obstacle(scene: int, row: int) -> str:
+        known = names[scene if len(names) > 1 else 0]
+        name = f" {known[row]!r}" if row < len(known) and known[row] else ""
+        return f"obstacle {row}{name} at {scenes.obstacles[scene, row, :d].round(4).tolist()} m"
 
-def _problems_of_ends(scenes: Scenes, arm: Arm) -> Iterator[Problem]:
-    """Yield the faults of starts and goals."""
+    arm, ends = collision_model.arm, (("start", scenes.start), ("goal", scenes.goal))
     apart = norm(scenes.goal - scenes.start)
-    yield (
-        apart < MIN_GOAL_DISTANCE,
-        lambda i: f"start and goal are {apart[i]:.4f} m apart; at least {MIN_GOAL_DISTANCE} m is needed",
+    yield problem(
+        apart < MIN_GOAL_DISTANCE, f"start and goal must be {MIN_GOAL_DISTANCE} m or more apart", apart
     )
-    for name, point in (("start", scenes.start), ("goal", scenes.goal)):
+    for name, point in ends:
         margin = np.asarray(arm.reach_margin(point))
-        yield (
-            margin < 0.0,
-            lambda i, n=name, p=point, m=margin: (  # type: ignore[misc]
-                f"{n} {_shown(p[i])} m is {-m[i]:.4f} m out of the arm's reach"
-            ),
+        yield problem(
+            margin < 0.0, f"{name} must be within the arm's reach: its margin must be 0 m or more", margin
         )
-
-
-def _problems_of_sizes(scenes: Scenes, names: Names) -> Iterator[Problem]:
-    """Yield the faults of single obstacles."""
     faults = _problems_of_shapes(scenes) if has_shapes(scenes.obstacles) else _problems_of_capsules(scenes)
-    for wrong, what in faults:
-        yield (
-            wrong.any(axis=-1),
-            lambda i, w=wrong, x=what: f"{_obstacle(scenes, names, i, w[i].argmax())} {x}",  # type: ignore[misc]
+    for wrong, why in faults:
+        yield problem(wrong, why, part=obstacle)
+    if scenes.present.any() and (base := getattr(arm, "base", ())):
+        yield problem(
+            _contain(scenes, base), "may overlap the base of the arm, but not contain it", part=obstacle
+        )
+    for name, point in ends:
+        clearance = rest_clearance(scenes, point, collision_model)[:, :-1]
+        yield problem(
+            clearance <= 0.0,
+            f"touches the arm at the {name}: its clearance must be over 0 m",
+            clearance,
+            obstacle,
         )
 
 
@@ -258,28 +263,3 @@ def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel
     return np.concatenate(
         (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
     )
-
-
-def _obstacle(scenes: Scenes, names: Names, scene: int, number: int) -> str:
-    """Return an obstacle of a scene as text: its number, its name if it has one, and its shape."""
-    known = names[scene if len(names) > 1 else 0]
-    name = f" {known[number]!r}" if number < len(known) and known[number] else ""
-    return f"obstacle {number}{name} {_described(scenes.obstacles[scene, number])}"
-
-
-def _described(row: Float) -> str:
-    """Return the shape of an obstacle as text."""
-    if not has_shapes(row):
-        return f"{_shown(row)} m"
-    kind, centre, quaternion, half = shape_columns(row)
-    names = list(SHAPES)
-    name = names[int(kind)] if 0 <= kind < len(names) else "?"
-    if name == HalfSpace.kind:
-        normal = rotation_axes(quaternion)[2]
-        return f"({name} through {_shown(centre + EXTENT * normal)} m with normal {_shown(normal)})"
-    return f"({name} at {_shown(centre)} m, half lengths {_shown(half)} m)"
-
-
-def _shown(values: Float) -> str:
-    """Return numbers as text, without rounding errors and negative zeros."""
-    return "(" + ", ".join(f"{round(float(v), 6) + 0.0:.4g}" for v in values) + ")"

@@ -87,7 +87,7 @@ class ReplanTriggers:
         known = not isinstance(triggers, str) and isinstance(triggers, Iterable)
         if not known or any(each not in TRIGGERS for each in triggers):
             raise ValueError(f"decide_at must be some of {', '.join(TRIGGERS)}, got {triggers!r}")
-        number_of_at_least("horizon", horizon, timestep, " (a control step)")
+        number_of_at_least("horizon", horizon, timestep)
         self.triggers, self.margin = frozenset(triggers), number_of_at_least("margin", margin, 0.0)
         self.horizon, self.limit = self.steps(min(horizon, time_limit)), self.steps(time_limit)
 

@@ -19,7 +19,6 @@ from viapoint.envs.geometry.rows import (
     CAPSULES,
     ShapeColumns,
     dimension_of,
-    has_shapes,
     rotation_axes,
     shape_columns,
 )
@@ -129,17 +128,8 @@ class Simulator:
     ) -> None:
         """Place the arms of n simulations at rest with joint angles (n, J), [rad], and obstacles.
 
-        Obstacles are rows of either kind, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
-
-        Raises:
-            ValueError: The rows name shapes, but the simulator was made for capsules, or the other way round.
+        Obstacles are rows for the simulator's shapes, shape (n, rows, .), [m], see :mod:`viapoint.envs.geometry.rows`.
         """
-        named = self._types is not None
-        if self._geoms and has_shapes(obstacles) is not named:
-            raise ValueError(
-                f"obstacles must be rows {'that name shapes' if named else 'of capsules'}, got {obstacles.shape[-1]} "
-                "numbers each"
-            )
         self.batch.state[sims] = self._rest_state
         self.batch.bind("qpos")[sims] = joints
         if not self._geoms:

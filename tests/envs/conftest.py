@@ -1,4 +1,4 @@
-"""What several files of tests begin with lies beside them; here is how pictures are made in them."""
+"""Paths of helpers and benchmarks that tests import, and how pictures are made."""
 
 import sys
 from pathlib import Path
@@ -8,10 +8,17 @@ import pytest
 
 from viapoint.envs.rendering import renderer
 from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.envs.scenes import families
 
-sys.path.append(str(Path(__file__).parent))
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[2] / "benchmarks")]
 
 OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    """Families of scenes that a test registers are gone afterwards."""
+    monkeypatch.setattr(families, "_FAMILIES", {d: dict(names) for d, names in families._FAMILIES.items()})
 
 
 @pytest.fixture

@@ -88,65 +88,6 @@ def test_bigger_duration_component_means_longer_between_the_stated_bounds():
     np.testing.assert_allclose(layout.decode(action, start, goal).durations.sum(axis=-1), (0.5, 1.0, 2.0))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"n_via": -1}, "n_via"),
-        ({"n_via": 1.5}, "n_via"),
-        ({"n_via": 17}, "n_via must be a whole number, from 0 to 16, got 17"),
-        ({"n_via": 10**9}, "n_via must be a whole number, from 0 to 16, got 1000000000"),
-        ({"via_scale": (np.inf, 0.1)}, r"via_scale must be 2 positive finite numbers, got \(inf, 0.1\)"),
-        ({"via_scale": (np.nan, 0.1)}, "via_scale"),
-        ({"via_scale": (0.1,)}, "via_scale"),
-        ({"via_scale": ("far", 0.1)}, "via_scale"),
-        ({"via_scale": 0.1}, "via_scale"),
-        ({"dimension": 4}, "dimension"),
-        ({"timing": "free"}, "optimal, learned"),
-        ({"duration_range": (1.0, 0.5)}, "duration_range"),
-        ({"duration_range": (0.0, 0.5)}, "duration_range"),
-    ],
-)
-def test_what_cannot_be_meant_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        ActionLayout(**arguments)
-
-
-@pytest.mark.parametrize("kind", [np.zeros, torch.zeros])
-@pytest.mark.parametrize(
-    ("action", "start", "goal", "message"),
-    [
-        ((5,), (2,), (2,), r"action must have shape \(\.\.\., 3\) \(via_1_along, .*, got \(5,\)"),
-        ((2,), (2,), (2,), r"action must have shape \(\.\.\., 3\)"),
-        ((4, 2), (4, 2), (4, 2), r"action must have shape \(\.\.\., 3\)"),
-        ((), (2,), (2,), r"action must have shape \(\.\.\., 3\)"),
-        ((3,), (3,), (3,), r"start and goal must both have shape \(\.\.\., 2\), got \(3,\) and \(3,\)"),
-        ((3,), (2,), (3,), r"start and goal must both have shape"),
-        ((4, 3), (4, 2), (2,), r"start and goal must both have shape"),
-        ((4, 3), (5, 2), (5, 2), r"a start and a goal for each action: .*\(4, 3\), starts \(5, 2\)"),
-        ((4, 3), (2,), (2,), r"a start and a goal for each action"),
-    ],
-)
-def test_decode_refuses_what_would_be_read_as_something_else(kind, action, start, goal, message):
-    with pytest.raises(ValueError, match=message):
-        ActionLayout().decode(kind(action), kind(start), kind(goal) + 1.0)
-
-
-@pytest.mark.parametrize("kind", [np.ones, torch.ones])
-@pytest.mark.parametrize(
-    ("waypoints", "durations", "message"),
-    [
-        ((4, 2), (3,), r"waypoints must have shape \(\.\.\., 3, 2\), .*1 via-points and goal, got \(4, 2\)"),
-        ((3, 3), (2,), r"waypoints must have shape \(\.\.\., 3, 2\)"),
-        ((2,), (1,), r"waypoints must have shape \(\.\.\., 3, 2\)"),
-        ((3, 2), (3,), r"durations must have shape \(2,\), one for each segment, got \(3,\)"),
-        ((7, 3, 2), (2,), r"durations must have shape \(7, 2\)"),
-    ],
-)
-def test_encode_refuses_movements_of_another_layout(kind, waypoints, durations, message):
-    with pytest.raises(ValueError, match=message):
-        ActionLayout().encode(Plan(kind(waypoints), kind(durations)))
-
-
 def test_lists_are_arrays():
     layout = ActionLayout()
     plan = layout.decode([0.1, 0.2, 0.3], [0.0, 0.0], (0.3, 0.1))
@@ -155,5 +96,5 @@ def test_lists_are_arrays():
     np.testing.assert_array_equal(plan.durations, same.durations)
     listed = Plan(same.waypoints.tolist(), same.durations.tolist())
     np.testing.assert_array_equal(layout.encode(listed), layout.encode(same))
-    with pytest.raises(ValueError, match="must be arrays of numbers"):
+    with pytest.raises(ValueError):
         layout.decode([[0.1], 0.2, 0.3], [0.0, 0.0], [0.3, 0.1])

@@ -1,4 +1,4 @@
-"""The scenes of a generator do not depend on how many attempts are computed at once, or on scenes sampled ahead."""
+"""The scenes of a generator do not depend on how many attempts are computed at once."""
 
 import gymnasium as gym
 import numpy as np
@@ -9,24 +9,21 @@ from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.scenes import sampler as sampling
 from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
 from viapoint.envs.scenes.feasible_path import DRAW_ORDER
-from viapoint.envs.scenes.sampler import AHEAD, SceneQueue, SceneSampler, scene_sampler
+from viapoint.envs.scenes.sampler import SceneSampler, UniformSampler
 
 SAMPLERS = {
-    "space": lambda: scene_sampler(CollisionModel(PANDA, True), SpaceDistribution()),
-    "plane": lambda: scene_sampler(CollisionModel(ADULT, True), SceneDistribution()),
-    "mixed": lambda: scene_sampler(CollisionModel(ADULT, False), SceneDistribution(uniform_share=0.5)),
-    "with room for given obstacles": lambda: scene_sampler(
-        CollisionModel(ADULT, True), SceneDistribution(n_obstacles=(1, 40), uniform_share=0.5)
-    ),
-    "without obstacles": lambda: scene_sampler(
-        CollisionModel(PANDA, True), SpaceDistribution(n_obstacles=(0, 0))
-    ),
+    "space": (SceneSampler, PANDA, SpaceDistribution()),
+    "plane": (SceneSampler, ADULT, SceneDistribution()),
+    "uniform": (UniformSampler, ADULT, SceneDistribution()),
+    "with room for given obstacles": (SceneSampler, ADULT, SceneDistribution(n_obstacles=(1, 40))),
+    "without obstacles": (SceneSampler, PANDA, SpaceDistribution(n_obstacles=(0, 0))),
 }
 
 
 @pytest.fixture(params=SAMPLERS, scope="module")
 def sampler(request):
-    return SAMPLERS[request.param]()
+    kind, arm, distribution = SAMPLERS[request.param]
+    return kind(CollisionModel(arm, True), distribution)
 
 
 def seeded(number, bits=np.random.PCG64):
@@ -64,43 +61,22 @@ def test_scenes_do_not_depend_on_how_many_attempts_are_computed_at_once(monkeypa
     assert equal(*found)
 
 
-def test_a_queue_returns_the_scenes_of_its_sampler_and_leaves_generators_in_the_same_states(sampler):
-    queue, mine, theirs = SceneQueue(sampler, 12), seeded(12), seeded(12)
-    chance = np.random.default_rng(0)
-    for _ in range(3 * AHEAD):
-        rows = np.flatnonzero(chance.random(12) < 0.6)
-        assert equal(queue(mine, rows), sampler([theirs[row] for row in rows]))
+@pytest.mark.parametrize("bits", [np.random.PCG64, np.random.MT19937])
+def test_scenes_are_those_that_each_generator_gives_alone(sampler, bits):
+    mine, theirs = (seeded(6, bits) for _ in range(2))
+    for _ in range(3):
+        together = sampler(mine)
+        alone = [sampler([each]) for each in theirs]
+        assert equal(together, [np.concatenate(parts) for parts in zip(*alone, strict=True)])
         assert following(mine) == following(theirs)
 
 
-def test_a_queue_follows_generators_that_are_used_or_replaced_between_its_scenes(sampler):
-    queue, mine, theirs, rows = SceneQueue(sampler, 4), seeded(4), seeded(4), np.arange(4)
-    for _ in range(3):
-        assert equal(queue(mine, rows), sampler(theirs))
-        for generators in (mine, theirs):
-            generators[1].random()
-            sampler(generators[2:3])
-            generators[3] = np.random.default_rng(9)
-
-
-def test_a_queue_serves_generators_whose_states_hold_arrays(sampler):
-    mine, theirs = (seeded(3, np.random.MT19937) for _ in range(2))
-    queue = SceneQueue(sampler, 3)
-    for _ in range(3):
-        assert equal(queue(mine, np.arange(3)), sampler(theirs))
-        assert following(mine) == following(theirs)
-
-
-def test_scenes_that_cannot_be_found_are_refused_by_sampler_and_queue_with_the_number_of_attempts():
+def test_scenes_that_cannot_be_found_are_refused():
     order = DRAW_ORDER[3]._replace(groups=(1, 2))
     distribution = SpaceDistribution(families=("tunnel",), n_obstacles=(8, 8))
     sampler = SceneSampler(CollisionModel(PANDA, True), distribution, order=order)
-    with pytest.raises(
-        RuntimeError, match=r"no scene with \(8, 8\) obstacles was found in 3 attempts in the"
-    ):
+    with pytest.raises(RuntimeError):
         sampler(seeded(20))
-    with pytest.raises(RuntimeError, match="in 3 attempts"):
-        SceneQueue(sampler, 20)(seeded(20), np.arange(20))
 
 
 @pytest.mark.parametrize(

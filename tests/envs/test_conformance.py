@@ -1,13 +1,9 @@
 """What every registered environment keeps to."""
 
-import os
 import pickle
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
@@ -63,58 +59,14 @@ def test_both_checkers_pass_without_a_warning(env_id):
         sb3_check(gym.make(env_id), warn=True, skip_render_check=True)
 
 
-def test_make_imports_and_makes_in_one_call(env_id):
-    env = gym.make(f"viapoint.envs:{env_id}")
-    observation, info = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    assert info == {}
-
-
-def test_info_is_complete_finite_and_scalar(env_id):
-    for *_, info in episodes(env_id, range(20), actions_for(env_id, 20)):
+def test_info_is_complete_finite_and_scalar_and_holds_the_terms_of_the_reward(env_id):
+    for *_, reward, info in episodes(env_id, range(20), actions_for(env_id, 20)):
         assert set(info) >= INFO
         assert set(info) >= {f"reward_{name}" for name in RewardTerms._fields}
         for name, value in info.items():
             assert isinstance(value, bool | float | (int if env_id in REPLANNING_TASKS else float)), name
             assert np.isfinite(value), name
-
-
-def test_reward_is_the_sum_of_its_terms(env_id):
-    for *_, reward, info in episodes(env_id, range(20), actions_for(env_id, 20)):
         assert reward == pytest.approx(sum(v for k, v in info.items() if k.startswith("reward_")), abs=1e-12)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_single_equals_batch_bit_for_bit(env_id, threads):
-    number = 70  # more than one group
-    actions = actions_for(env_id, number)
-    env = gym.make_vec(env_id, num_envs=number, threads=threads)
-    first, _ = env.reset(seed=5)
-    alone = episodes(env_id, 5 + np.arange(number), actions)
-    running = np.ones(number, dtype=bool)
-    while running.any():
-        _, reward, terminated, truncated, info = env.step(actions)
-        ended = terminated | truncated
-        assert (ended == info.get("_final_info", np.zeros(number, dtype=bool))).all()
-        for i in np.flatnonzero(ended & running):
-            start, last, r, single = alone[i]
-            assert r == reward[i]
-            for name in start:
-                np.testing.assert_array_equal(start[name], first[name][i])
-                np.testing.assert_array_equal(last[name], info["final_obs"][i][name])
-            assert single == {k: info["final_info"][k][i].item() for k in single}
-            assert single == {k: info[k][i].item() for k in single}
-        running &= ~ended
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", sorted(TASKS))
-def test_one_decision_ends_the_episode(env_id):
-    env = gym.make_vec(env_id, num_envs=4)
-    env.reset(seed=0)
-    _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-    assert terminated.all()
-    assert not truncated.any()
 
 
 def test_the_next_episodes_are_those_of_a_reset(env_id):
@@ -132,19 +84,16 @@ def test_the_next_episodes_are_those_of_a_reset(env_id):
         np.testing.assert_array_equal(part, following[name][2])
 
 
-def test_equal_seeds_give_equal_episodes_and_others_do_not(env_id):
-    env = gym.make(env_id)
-    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
-    assert all(np.array_equal(first[name], again[name]) for name in first)
-    assert not all(np.array_equal(first[name], other[name]) for name in first)
-
-
 def test_observations_share_no_memory_and_stay_in_their_space(env_id):
     env = gym.make_vec(env_id, num_envs=16)
     before, _ = env.reset(seed=0)
     kept = {name: part.copy() for name, part in before.items()}
     for action in actions_for(env_id, 8):
-        after, *_, info = env.step(np.tile(action, (16, 1)))
+        after, _, terminated, truncated, info = env.step(np.tile(action, (16, 1)))
+        ended = terminated | truncated
+        assert (info.get("_final_info", np.zeros(16, dtype=bool)) == ended).all()
+        for name, value in info.get("final_info", {}).items():
+            np.testing.assert_array_equal(value[ended], info[name][ended])
         assert env.observation_space.contains(after)
         last = [each for each in info.get("final_obs", ()) if each is not None]
         assert all(env.single_observation_space.contains(each) for each in last)
@@ -155,10 +104,9 @@ def test_observations_share_no_memory_and_stay_in_their_space(env_id):
 
 def test_no_element_of_the_observation_is_constant(env_id):
     env = gym.make_vec(env_id, num_envs=64)
-    seen = [
-        env.reset(seed=0)[0],
-        *(env.step(np.tile(action, (64, 1)))[0] for action in actions_for(env_id, 2)),
-    ]
+    seen = [env.reset(seed=0)[0]]
+    for action in actions_for(env_id, 2):
+        seen.append(env.step(np.tile(action, (64, 1)))[0])
     for name, part in seen[0].items():
         assert part.dtype == np.float32
         assert (np.ptp(np.concatenate([each[name] for each in seen]), axis=0) > 0.0).all(), name
@@ -166,32 +114,23 @@ def test_no_element_of_the_observation_is_constant(env_id):
 
 def test_everything_in_the_model_has_a_name(env_id):
     model = gym.make(env_id).unwrapped.model
-    for kind, count in (
-        ("body", model.nbody),
-        ("geom", model.ngeom),
-        ("joint", model.njnt),
-        ("actuator", model.nu),
-    ):
+    counts = {"body": model.nbody, "geom": model.ngeom, "joint": model.njnt, "actuator": model.nu}
+    for kind, count in counts.items():
         for index in range(count):
             assert getattr(model, kind)(index).name, f"{kind} {index}"
-    assert isinstance(model, mujoco.MjModel)
-
-
-def test_pickles(env_id):
-    env = pickle.loads(pickle.dumps(gym.make(env_id).unwrapped))
-    native = pickle.loads(pickle.dumps(gym.make_vec(env_id, num_envs=2)))
-    assert env.reset(seed=4)[0].keys() == native.reset(seed=4)[0].keys()
 
 
 def test_a_pickled_environment_is_as_it_was_made_whatever_becomes_of_the_arguments(env_id):
     weights = {"smoothness": 0.2}
-    for env in (
-        gym.make(env_id, reward_weights=weights).unwrapped,
-        gym.make_vec(env_id, num_envs=2, reward_weights=weights),
-    ):
-        weights["smoothness"] = 5.0
-        assert pickle.loads(pickle.dumps(env)).task.weights == env.task.weights
-        weights["smoothness"] = 0.2
+    made = gym.make(env_id, reward_weights=weights).unwrapped
+    several = gym.make_vec(env_id, num_envs=2, reward_weights=weights)
+    weights["smoothness"] = 5.0
+    for env in (made, several):
+        again = pickle.loads(pickle.dumps(env))
+        assert again.task.weights == env.task.weights
+        wanted = env.reset(seed=4)[0]
+        for name, part in again.reset(seed=4)[0].items():
+            np.testing.assert_array_equal(part, wanted[name])
 
 
 def test_what_a_step_returns_may_be_written_to(env_id):
@@ -211,7 +150,8 @@ def test_vector_environment_names_its_autoreset_mode_and_counts_physics_steps(en
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     env.reset(seed=0)
     assert env.physics_steps == 0
-    *_, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    assert env_id not in TASKS or (terminated.all() and not truncated.any())
     assert env.physics_steps >= info["duration"].sum() / env.model.opt.timestep
 
 
@@ -223,50 +163,3 @@ def test_a_reset_mask_resets_only_those(env_id):
     for name, part in before.items():
         np.testing.assert_array_equal(part[~mask], after[name][~mask])
     assert not np.array_equal(before["goal"][mask], after["goal"][mask])
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [(np.nan, "finite"), (np.inf, "finite")],
-)
-def test_non_finite_actions_are_refused(env_id, action, message):
-    env = gym.make(env_id, disable_env_checker=True)
-    env.reset(seed=0)
-    bad = np.zeros(env.action_space.shape, dtype=np.float32)
-    bad[-1] = action
-    with pytest.raises(ValueError, match=message):
-        env.step(bad)
-
-
-@pytest.mark.filterwarnings("ignore:.*render_mode='rgb' that is not")  # Gymnasium's, before our error
-def test_wrong_shapes_and_unknown_arguments_are_refused(env_id):
-    env = gym.make(env_id, disable_env_checker=True)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="shape"):
-        env.step(np.zeros(env.action_space.shape[0] + 1, dtype=np.float32))
-    with pytest.raises(TypeError, match=r"'speed'; allowed are .*n_obstacles"):
-        gym.make(env_id, speed=3)
-    if env_id in TASKS:
-        with pytest.raises(ValueError, match="timing must be one of optimal, learned"):
-            gym.make(env_id, timing="fast")
-    with pytest.raises(ValueError, match="render_mode must be"):
-        gym.make(env_id, render_mode="rgb")
-
-
-def test_stepping_before_a_reset_is_refused(env_id):
-    env = gym.make(env_id).unwrapped
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-
-
-def test_a_missing_opengl_library_is_named_where_mujoco_asks_for_it():
-    """Where the library is there, everything works; where not, one error says what to do."""
-    code = "import gymnasium, viapoint.envs; gymnasium.make('viapoint/PlanarReach-v0'); print('made')"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "MUJOCO_GL": "osmesa"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert "made" in done.stdout or "unset MUJOCO_GL, or install the library" in done.stderr.splitlines()[-1]

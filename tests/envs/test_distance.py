@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from viapoint.envs.arms import ADULT
 from viapoint.envs.arms.base import CollisionModel
@@ -36,16 +35,6 @@ def test_segment_distance_is_the_least_of_all_point_distances(dimension):
     brute = np.linalg.norm(on_link[:, :, None] - on_axis[:, None], axis=-1).min(axis=(1, 2))
     assert (exact <= brute + 1e-12).all()
     np.testing.assert_allclose(exact, brute, atol=3e-3)
-
-
-def test_parallel_and_degenerate_segments():
-    link = np.array([[[0.0, 0.0]]]), np.array([[[1.0, 0.0]]])
-    obstacles = np.array(
-        [[[0.5, 0.2, 0.1, 0.0, 0.01], [2.0, 0.0, 0.3, 0.0, 0.01], [0.5, 0.0, 0.0, 0.0, 0.01]]]
-    )
-    np.testing.assert_allclose(
-        np.sqrt(segment_distance_squared(*link, obstacles))[0, :, 0], [0.2, 0.7, 0.0], atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("whole_arm", [False, True])
@@ -103,20 +92,6 @@ def test_absent_obstacles_are_far_and_order_is_irrelevant():
     there = np.ones((5, 4), dtype=bool)
     forwards = hand_clearance(points, 0.015, obstacles, there)
     np.testing.assert_array_equal(hand_clearance(points, 0.015, obstacles[:, ::-1], there), forwards[:, ::-1])
-
-
-def test_torch_gives_the_same_and_finite_gradients_even_inside_an_obstacle():
-    points = np.random.default_rng(5).uniform(-0.5, 0.5, (5, 30, 2))
-    obstacles = rows(2, (5, 4))
-    points[:, 0] = obstacles[:, 0, :2]  # on an axis, where the distance has a kink
-    there = np.ones((5, 4), dtype=bool)
-    tensor = torch.as_tensor(points).requires_grad_()
-    clearance = hand_clearance(tensor, 0.015, torch.as_tensor(obstacles), torch.as_tensor(there))
-    np.testing.assert_allclose(
-        clearance.detach().numpy(), hand_clearance(points, 0.015, obstacles, there), atol=1e-9
-    )
-    clearance.sum().backward()
-    assert torch.isfinite(tensor.grad).all()
 
 
 def test_what_an_obstacle_has_drifted_counts_as_if_it_stood_there():

@@ -1,14 +1,8 @@
 """Whatever is asked, an environment does it or says why not; and broken physics ends an episode and no more."""
 
-import sys
-from pathlib import Path
-
 import gymnasium as gym
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
 import reliability_fuzz as fuzz
 
 
@@ -27,19 +21,6 @@ def test_nothing_but_documented_errors_and_finite_numbers(env_id, kind):
     assert "refused without a reason" not in found
     if kind is fuzz.fuzz_scenes:
         assert min(found["played"], found["refused"]) > 2  # both sides of the border are tried
-
-
-def test_the_check_itself_sees_what_is_wrong(env_id):
-    env = gym.make_vec(env_id, num_envs=2)
-    observation, _ = env.reset(seed=0)
-    fuzz.check(env, observation, np.zeros(2), {})
-    with pytest.raises(AssertionError, match="reward"):
-        fuzz.check(env, observation, np.array([0.0, np.nan]), {})
-    with pytest.raises(AssertionError, match="jerk_cost"):
-        fuzz.check(env, observation, np.zeros(2), {"final_info": {"jerk_cost": np.array([1.0, np.inf])}})
-    observation["hand"] = observation["hand"] + 5.0
-    with pytest.raises(AssertionError, match="space"):
-        fuzz.check(env, observation, np.zeros(2), {})
 
 
 @pytest.mark.parametrize("broken", [1e9, np.nan])

@@ -1,7 +1,5 @@
 """Errors of given obstacles name them, and the options of a scene survive JSON."""
 
-import re
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -30,7 +28,6 @@ ENDS = {"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4)}
 HOUSE = Box((0.3, 0.3, 0.3), position=(0.2, 0.0, 0.4), name="house")
 PLINTH = Box((0.15, 0.12, 0.12), position=(-0.04, 0.0, 0.05), name="plinth")
 CRATE = Box((0.03, 0.03, 0.03), position=(0.2, 0.6, 0.4))
-LISTS = "obstacles must be a list of shapes, dictionaries or rows of numbers"
 
 
 @pytest.fixture(scope="module")
@@ -47,44 +44,36 @@ def several():
     made.close()
 
 
-def reset(env, obstacles, reason, ends):
-    with pytest.raises(ValueError, match=re.escape(reason)) as caught:
-        env.reset(seed=0, options={**ends, "obstacles": obstacles})
-    assert "-0," not in str(caught.value)
-    assert "-0)" not in str(caught.value)
+CUBE = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
 
 
 @pytest.mark.parametrize("ends", [ENDS, {}], ids=["ends given", "ends drawn"])
 @pytest.mark.parametrize(
-    ("obstacles", "reason"),
+    "obstacles",
     [
-        ([HOUSE], "obstacle 0 'house' (box at (0.2, 0, 0.4) m, half lengths (0.3, 0.3, 0.3) m) touches"),
-        ([[CRATE, HOUSE.to_dict()]], "obstacle 1 'house' (box at"),
-        ([CRATE, Box((1.5, 0.1, 0.1), name="long")], "obstacle 1 'long' (box at"),
-        ([Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0), name="far")], "obstacle 0 'far' (box at (3, 0, 0) m"),
-        ([Cylinder(0.1, 0.1, name="can")], "obstacle 0 'can': the scenes of this environment have the shapes"),
-        ([ConvexMesh([*np.eye(3), (0, 0, 0)], name="mesh")], "obstacle 0 'mesh': the scenes of this"),
-        (
-            [HalfSpace(position=(0.3, 0.0, -1.5))],
-            "obstacle 0 (half_space through (0, 0, -1.5) m with normal (0, 0, 1)) has its surface over 1 m from",
-        ),
-        (
-            [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0), name="wall")],
-            "obstacle 0 'wall' (half_space through (3.5, 0, 0) m with normal (-1, 0, 0)) has its surface over 1 m",
-        ),
-        ([HalfSpace(position=(0.0, 0.0, 0.9))], "half_space through (0, 0, 0.9) m with normal (0, 0, 1)) contains"),
-        ([CRATE, PLINTH], "obstacle 1 'plinth' (box at (-0.04, 0, 0.05) m, half lengths (0.15, 0.12, 0.12) m) contain"),
+        [HOUSE], [[CRATE, HOUSE.to_dict()]], [CRATE, PLINTH], [HalfSpace(position=(0.0, 0.0, 0.9))],  # touch the arm
+        [Box((1.5, 0.1, 0.1))], [Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0))],  # too large, too far
+        [HalfSpace(position=(0.3, 0.0, -1.5))], [HalfSpace.facing((-1.0, 0.0, 0.0), position=(3.5, 0.0, 0.0))],
+        [Cylinder(0.1, 0.1)], [ConvexMesh(CUBE)], [{"shape": "pyramid"}],  # not among the shapes
+        [PointCloud([*CUBE, *CUBE])], [PointCloud(np.full((300, 3), 0.3))], [CRATE] * 9,  # too many
+        np.zeros((1, 9, 15)),
+        CRATE, CRATE.to_dict(), None, obstacles_to_json([CRATE]), np.array([CRATE]), (each for each in [CRATE]),
+        [[0.1, 0.2], [0.3]], [[0.5, 0.0, 0.3, 0.0, 0.0, 0.1, -0.03]], np.zeros((1, 7), dtype=bool),
+        np.full((1, 7), np.nan), np.full((1, 15), 0.1),  # no row of a shape
     ],
 )  # fmt: skip
-def test_errors_name_the_obstacle_as_the_user_gave_it(env, obstacles, reason, ends):
-    reset(env, obstacles, reason, ends)
+def test_impossible_obstacles_are_refused(env, obstacles, ends):
+    with pytest.raises(ValueError):
+        env.reset(seed=0, options={**ends, "obstacles": obstacles})
 
 
-def test_each_scene_of_a_batch_has_its_own_names():
-    envs = gym.make_vec(PANDA, num_envs=2, shapes=SHAPES).unwrapped
-    reset(envs, [[CRATE], [CRATE, HOUSE]], "scene 1: obstacle 1 'house' (box at", ENDS)
-    reset(envs, [HOUSE], "scene 0: obstacle 0 'house' (box at", ENDS)
-    envs.close()
+def test_each_scene_of_a_batch_has_its_own_names(several):
+    for obstacles, words in (
+        ([[CRATE], [CRATE, HOUSE], []], "scene 1: obstacle 1 'house'"),
+        ([HOUSE], "scene 0: obstacle 0 'house'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            several.reset(seed=0, options={**ENDS, "obstacles": obstacles})
 
 
 @pytest.mark.parametrize("normal", np.vstack((np.eye(3), -np.eye(3), (0.6, 0.0, -0.8))))
@@ -92,34 +81,15 @@ def test_half_spaces_up_to_the_limit_are_in_the_observation_space(env, normal):
     surface = HalfSpace.facing(normal, position=-normal)
     observation, _ = env.reset(seed=0, options={**ENDS, "obstacles": [surface]})
     assert env.observation_space.contains(observation)
-    reset(env, [HalfSpace.facing(normal, position=-1.01 * normal)], "has its surface over 1 m", ENDS)
+    with pytest.raises(ValueError):
+        env.reset(options={**ENDS, "obstacles": [HalfSpace.facing(normal, position=-1.01 * normal)]})
 
 
-@pytest.mark.parametrize(
-    ("obstacles", "reason"),
-    [
-        ([CRATE] * 9, "at most 8 obstacles, got 9"),
-        (np.zeros((1, 9, 15)), "at most 8 obstacles, got 9"),
-        (CRATE, f"{LISTS}; put a single obstacle in a list, got Box("),
-        (CRATE.to_dict(), f"{LISTS}; put a single obstacle in a list, got {{"),
-        (None, f"{LISTS}, got None"),
-        (obstacles_to_json([CRATE]), f"{LISTS}, got '["),
-        (np.array([CRATE]), f"{LISTS}, got array"),
-        ((each for each in [CRATE]), f"{LISTS}, got <generator"),
-        ([[0.1, 0.2], [0.3]], f"{LISTS}, got [["),
-        (np.zeros((1, 7), dtype=bool), f"{LISTS}, got array"),
-    ],
-)
-def test_what_is_no_list_of_obstacles_is_refused_with_what_is(env, obstacles, reason):
-    reset(env, obstacles, reason, ENDS)
-
-
-def test_observation_rows_take_dictionaries_and_name_shapes_that_they_lack():
+def test_observation_rows_take_dictionaries():
     np.testing.assert_array_equal(observation_rows([HOUSE.to_dict()], 2), observation_rows([HOUSE], 2))
-    with pytest.raises(ValueError, match="obstacle 0 'house': the shapes are capsule, not box"):
-        observation_rows([HOUSE], 1, ("capsule",))
-    with pytest.raises(ValueError, match="put a single obstacle in a list"):
-        observation_rows(HOUSE, 1)
+    for obstacles, shapes in (([HOUSE], ("capsule",)), (HOUSE, None)):
+        with pytest.raises(ValueError):
+            observation_rows(obstacles, 1, shapes)
 
 
 def test_options_of_a_scene_survive_json(env):
@@ -153,7 +123,7 @@ def test_rows_of_a_scene_file_keep_their_shapes_where_the_table_has_another_orde
     (found,) = obstacles_from_rows(np.array(scene_from_json(text)["obstacles"]))
     assert found == CRATE
     del table["box"]
-    with pytest.raises(ValueError, match=r"obstacle 0 of the scene file: unknown shape 'box'. Shapes are"):
+    with pytest.raises(ValueError):
         scene_from_json(text)
 
 
@@ -175,21 +145,15 @@ def test_changes_of_a_scene_survive_json():
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"),
+    "options",
     [
-        ({"begin": (0.1, 0.2)}, "not 'begin'"),
-        ({"obstacles": HOUSE}, "put a single obstacle in a list"),
-        ({"obstacles": [[HOUSE], [CRATE]]}, "options['obstacles'] must be real numbers"),
-        ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
-        ({"goal": np.zeros((2, 3))}, "options['goal'] must be those of one scene, got 2 scenes"),
-        ({"start": "here"}, "options['start'] must be real numbers"),
-        ({"start": (np.nan, 0.0, 0.1)}, "options['start'] must be finite, got nan"),
-        ({"start": (True, False, True)}, "options['start'] must be real numbers"),
-        ([], "options must be those of reset, a dictionary, got []"),
+        [], {"begin": (0.1, 0.2)}, {"goal": np.zeros((2, 3))},
+        {"start": "here"}, {"start": (np.nan, 0.0, 0.1)}, {"start": (True, False, True)},
+        {"obstacles": HOUSE}, {"obstacles": [[HOUSE], [CRATE]]}, {"obstacles": [{"shape": "cube"}]},
     ],
-)
-def test_what_is_no_scene_is_not_written(options, reason):
-    with pytest.raises(ValueError, match=re.escape(reason)):
+)  # fmt: skip
+def test_invalid_scenes_are_not_written(options):
+    with pytest.raises(ValueError):
         scene_to_json(options)
 
 
@@ -197,24 +161,19 @@ def test_a_batch_of_one_scene_is_written_as_that_scene():
     assert scene_to_json({"obstacles": [[HOUSE]]}) == scene_to_json({"obstacles": [HOUSE]})
 
 
-@pytest.mark.parametrize("start", [0.45, [0.45], [[0.45]] * 3, [[[0.45, -0.33, 0.4]]], [0.45, -0.33]])
-def test_ends_have_one_number_for_each_axis(several, start):
-    with pytest.raises(ValueError, match=re.escape("options['start'] must have shape (3, 3) or (3,), got")):
-        several.reset(seed=0, options={**ENDS, "start": start})
-
-
 @pytest.mark.parametrize(
-    ("obstacles", "reason"),
+    "options",
     [
-        ([[CRATE], None, []], f"scene 1: {LISTS}, got None"),
-        ([[CRATE], 3, []], f"scene 1: {LISTS}, got 3"),
-        ([[CRATE], [[0.0] * 5], []], "scene 1: rows of obstacles must have 15 numbers, got shape (1, 5)"),
-        ([[], []], "options['obstacles'] must have shape (n, 15) or (3, n, 15)"),
+        *({"start": start} for start in (0.45, [0.45], [[0.45]] * 3, [[[0.45, -0.33, 0.4]]], [0.45, -0.33])),
+        {"obstacles": [[CRATE], None, []]},
+        {"obstacles": [[CRATE], 3, []]},
+        {"obstacles": [[CRATE], [[0.0] * 5], []]},
+        {"obstacles": [[], []]},
     ],
 )
-def test_obstacles_of_each_scene_are_lists(several, obstacles, reason):
-    with pytest.raises(ValueError, match=re.escape(reason)):
-        several.reset(seed=0, options={**ENDS, "obstacles": obstacles})
+def test_options_fit_the_number_of_scenes_and_axes(several, options):
+    with pytest.raises(ValueError):
+        several.reset(seed=0, options={**ENDS, **options})
 
 
 def test_scenes_may_have_lists_and_rows_of_different_lengths(several):
@@ -231,17 +190,14 @@ def box_row(half=(0.03, 0.04, 0.05), kind="box", quaternion=(1.0, 0.0, 0.0, 0.0)
 @pytest.mark.parametrize(
     ("kind", "half"),
     [
-        ("box", (-0.3, 0.05, 0.05)),
-        ("box", (0.0, 0.05, 0.05)),
-        ("cylinder", (0.05, 0.06, 0.1)),
-        ("cylinder", (0.05, 0.05, -0.1)),
-        ("capsule", (0.05, 0.05, 0.02)),
-        ("sphere", (0.05, 0.05, 0.1)),
+        ("box", (-0.3, 0.05, 0.05)), ("box", (0.0, 0.05, 0.05)), ("cylinder", (0.05, 0.06, 0.1)),
+        ("cylinder", (0.05, 0.05, -0.1)), ("capsule", (0.05, 0.05, 0.02)), ("sphere", (0.05, 0.05, 0.1)),
     ],
-)
+)  # fmt: skip
 def test_rows_of_shapes_have_possible_half_lengths(kind, half):
     env = gym.make(PANDA, shapes=("capsule", "sphere", "box", "cylinder")).unwrapped
-    reset(env, box_row(half, kind), "is no row of a shape", ENDS)
+    with pytest.raises(ValueError):
+        env.reset(seed=0, options={**ENDS, "obstacles": box_row(half, kind)})
     env.close()
 
 
@@ -249,7 +205,8 @@ def test_quaternions_of_rows_are_normalised_if_they_nearly_are(env):
     env.reset(seed=0, options={**ENDS, "obstacles": box_row(quaternion=(1.0009, 0.0, 0.0, 0.0))})
     begin = 2 * 3 + 1
     assert env.batch.scenes.obstacles[0, 0, begin : begin + 4].tolist() == [1.0, 0.0, 0.0, 0.0]
-    reset(env, box_row(quaternion=(1.01, 0.0, 0.0, 0.0)), "is no row of a shape", ENDS)
+    with pytest.raises(ValueError):
+        env.reset(seed=0, options={**ENDS, "obstacles": box_row(quaternion=(1.01, 0.0, 0.0, 0.0))})
 
 
 def test_obstacles_may_overlap_the_base(env):
@@ -277,26 +234,17 @@ def test_walls_are_observed_where_they_are(env_id, ends):
     env.close()
 
 
-@pytest.mark.parametrize("kind", [99.0, -1.0, 2.7])
-def test_rows_of_unknown_kinds_are_refused(kind):
-    good = shape_rows("box", np.zeros(3), np.array((1.0, 0.0, 0.0, 0.0)), np.full(3, 0.1))
-    bad = good.copy()
-    bad[6] = kind
-    with pytest.raises(ValueError, match=f"obstacle 1 has the kind {kind:g}; kinds are 0 sphere, 1 capsule"):
-        obstacles_from_rows(np.stack((good, bad)))
+GOOD = shape_rows("box", np.zeros(3), np.array((1.0, 0.0, 0.0, 0.0)), np.full(3, 0.1))
+UNKNOWN = [np.where(np.arange(len(GOOD)) == 6, kind, GOOD)[None] for kind in (99.0, -1.0, 2.7)]
 
 
-@pytest.mark.parametrize("rows", [np.ones(7), np.ones((2, 2, 7)), np.ones((1, 6)), "rows"])
-def test_obstacles_are_read_from_a_table_of_rows(rows):
-    with pytest.raises(ValueError, match=r"rows must have shape \(n, .\)"):
+@pytest.mark.parametrize("rows", [*UNKNOWN, np.ones(7), np.ones((2, 2, 7)), np.ones((1, 6)), "rows"])
+def test_obstacles_are_read_from_a_table_of_rows_of_known_kinds(rows):
+    with pytest.raises(ValueError):
         obstacles_from_rows(rows)
 
 
-def test_nothing_is_no_scene_file():
-    with pytest.raises(ValueError, match="not JSON"):
-        scene_from_json(None)
-
-
-def test_misspelled_parts_of_a_scene_file_are_refused():
-    with pytest.raises(ValueError, match="not 'obstacle'"):
-        scene_from_json('{"format": "viapoint-scene", "goal": [0.1, 0.4], "obstacle": []}')
+@pytest.mark.parametrize("text", [None, '{"format": "viapoint-scene", "goal": [0.1, 0.4], "obstacle": []}'])
+def test_invalid_scene_files_are_refused(text):
+    with pytest.raises(ValueError):
+        scene_from_json(text)

@@ -1,6 +1,5 @@
 """Laws of arms that are loaded from MJCF files."""
 
-import inspect
 import itertools
 import json
 import pickle
@@ -12,12 +11,11 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-import torch
 from gymnasium.envs.registration import EnvSpec
-from imported_arms import HOME, JOINTS, UR5E, ur5e
+from imported_arms import HOME, JOINTS, UR5E, ur5e, written
 
 import viapoint.envs
-from viapoint.envs.arm_import import capsule_fit, reachability
+from viapoint.envs.arm_import import capsule_fit
 from viapoint.envs.arm_import.capsule_fit import cover_geom, cover_points, polytope_around
 from viapoint.envs.arm_import.loader import load_arm
 from viapoint.envs.arms import ARMS, PANDA, Arm, register_arm
@@ -157,30 +155,31 @@ def test_a_cube_takes_one_capsule_and_many_where_little_may_stick_out(monkeypatc
     assert ball.radius == pytest.approx(0.05 * 3**0.5, abs=2e-3)  # a short capsule is no better
     assert 2 < len(cover_points(cube, 0.02)) < 20
     monkeypatch.setattr(capsule_fit, "MOST_CAPSULES", 3)
-    with pytest.raises(ValueError, match=r"tolerance 0\.015 m takes more than 3 capsules for one geom"):
+    with pytest.raises(ValueError):
         cover_points(cube, 0.015)
 
 
-@pytest.mark.parametrize("env_id", OWN_ARM_TASKS)
-def test_environments_take_it_and_it_moves_as_planned(arm, env_id):
-    env = gym.make_vec(env_id, num_envs=24, arm=arm, threads=1)
-    env.reset(seed=0)
-    inner = pickle.loads(pickle.dumps(env.unwrapped))
-    inner.reset(seed=0)
-    _, _, info = inner.execute_actions(np.zeros((24, 4)))
-    free = env_id == "viapoint/Reach-v0"
-    assert (info["is_success"] if free else info["collision"]).all()
-    if free:
-        assert info["tracking_error"].max() < 1e-3
-        np.testing.assert_array_equal(info["stretch"], 1.0)
+def moves_as_planned(arm, error):
+    """Straight movements reach their goal without obstacles, and touch one among obstacles."""
+    for env_id, outcome in (("viapoint/Reach-v0", "is_success"), ("viapoint/Obstacles-v0", "collision")):
+        env = gym.make_vec(env_id, num_envs=24, arm=arm, threads=1)
+        inner = pickle.loads(pickle.dumps(env.unwrapped))
+        inner.reset(seed=0)
+        _, _, info = inner.execute_actions(np.zeros((24, 4)))
+        assert info[outcome].all()
+        if outcome == "is_success":
+            assert info["tracking_error"].max() < error
+            np.testing.assert_array_equal(info["stretch"], 1.0)
+
+
+def test_environments_take_it_and_it_moves_as_planned(arm):
+    moves_as_planned(arm, error=1e-3)
 
 
 def test_single_equals_batch_bit_for_bit(arm):
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)).astype(np.float32)
-    env, single = (
-        gym.make_vec("viapoint/Obstacles-v0", num_envs=12, arm=arm),
-        gym.make("viapoint/Obstacles-v0", arm=arm),
-    )
+    env = gym.make_vec("viapoint/Obstacles-v0", num_envs=12, arm=arm)
+    single = gym.make("viapoint/Obstacles-v0", arm=arm)
     env.reset(seed=5)
     *_, together = env.step(actions)
     for i in range(12):
@@ -194,252 +193,154 @@ def test_without_one_they_are_the_pandas(env_id, like):
     one, other = gym.make(env_id), gym.make(like)
     assert one.unwrapped.task == other.unwrapped.task
     assert one.unwrapped.task.arm is PANDA
-    assert env_id in (DOCS / "bring-your-arm.md").read_text(encoding="utf-8")
 
 
-def test_posture_in_torch_is_the_same_and_differentiable(arm):
-    hand = torch.as_tensor(places(arm, 40)).requires_grad_()
-    joints = arm.inverse_kinematics(hand)
-    np.testing.assert_allclose(joints.detach().numpy(), arm.inverse_kinematics(places(arm, 40)), atol=1e-9)
-    jacobian = torch.autograd.grad(arm.hand_position(joints).sum(), hand)[0]
-    np.testing.assert_allclose(jacobian.numpy(), 1.0, atol=1e-4)  # the hand goes where it is sent
+REFUSED = {
+    "path": ["", "none.xml"],
+    "hand_site": ["tool"],
+    "name": [5],
+    "joints": [
+        5, "elbow", JOINTS[:4], (*JOINTS[:5], "wrist_4"), (*JOINTS[:5], JOINTS[0]), (JOINTS[1], JOINTS[0], *JOINTS[2:]),
+    ],
+    "home": [HOME[:3], (7.0, *HOME[1:]), (0.0, -1.57, 0.0, 0.0, 0.0, 0.0)],
+    "origin": ["base", (0, 0), (0.0, 0.0, np.nan), (0.0, 0.0, -0.8), (0.0, 0.0, 0.25)],
+    "workspace": [
+        "table", (1, 2), ((0.3, -0.2), (0.5, 0.2)), ((np.nan, 0.0, 0.1), (0.5, 0.2, 0.3)),
+        ((0.3, -0.2, 0.1), (1.2, 0.2, 0.3)),  # beyond the observation
+        ((0.3, -0.4, 0.2), (0.9, 0.4, 0.4)),  # beyond the reach
+        ((0.3, -0.4, 0.2), (0.55, 0.4, 0.2)), ((0.4, 0.1, 0.2), (0.45, 0.15, 0.25)),  # too small
+    ],
+    "joint_range": [
+        {}, [(-np.inf, np.inf)] * 6, [(0.0, 1.0), (0.0,)],
+        [*[(-6, 6)] * 4, (1.56, 6), (-6, 6)],  # a joint at the end of its range at home
+    ],
+    "velocity_limit": [{}],
+    "torque_limit": [
+        -1.0, [1e-3] * 6,
+        [150.0, 25.0, 25.0, 28.0, 28.0, 28.0],  # enough at home, where the elbow bears most
+    ],
+    "hand_radius": [0, -1, np.nan, "small"],
+    "tolerance": [0.0, "fine", np.nan],
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"hand_site": "tool"}, "no site 'tool' in the file; there are: hand"),
-        ({"joints": (*JOINTS[:5], "wrist_4")}, "no joint 'wrist_4'.* there are: shoulder_pan"),
-        ({"joints": JOINTS[:4]}, "five or more"),
-        ({"joints": (JOINTS[1], JOINTS[0], *JOINTS[2:])}, "'shoulder_lift' does not carry 'shoulder_pan'"),
-        ({"joints": JOINTS[:5], "home": HOME[:5], "hand_site": "hand"}, None),
-        ({"home": HOME[:3]}, "home must be 6 numbers"),
-        ({"home": (7.0, *HOME[1:])}, "home is outside the range of shoulder_pan"),
-        ({"torque_limit": -1.0}, "torque_limit must be positive"),
-        ({"workspace": ((0.3, -0.2, 0.1), (1.2, 0.2, 0.3))}, r"does not get to \("),
-        ({"home": (0.0, -1.57, 0.0, 0.0, 0.0, 0.0)}, "give another home"),
-        ({"workspace": (1, 2)}, r"workspace must be two opposite corners, .* got \(1, 2\)"),
-        ({"workspace": ((np.nan, 0.0, 0.1), (0.5, 0.2, 0.3))}, "workspace must be two opposite corners"),
-        ({"workspace": ((0.3, -0.2), (0.5, 0.2))}, "workspace must be two opposite corners"),
-        ({"workspace": "table"}, "workspace must be two opposite corners, .* got 'table'"),
-        ({"workspace": ((0.3, -1e9, 0.1), (0.5, 0.2, 0.3))}, r"does not get to \(0.3, -1e\+09, 0.1\) m"),
-        (
-            {"workspace": ((0.4, 0.1, 0.2), (0.45, 0.15, 0.25))},
-            "too small: start and goal are 0.3 to 0.5 m apart",
-        ),
-        ({"origin": (0.0, 0.0, np.nan)}, "origin must be three finite numbers, x, y and z in m, got"),
-        ({"origin": (0, 0)}, r"origin must be three finite numbers, .* got \(0, 0\)"),
-        ({"origin": "base"}, "origin must be three finite numbers, .* got 'base'"),
-        ({"joint_range": {}}, "joint_range must be 6 pairs of finite numbers in increasing order, got {}"),
-        ({"joint_range": [(-np.inf, np.inf)] * 6}, "joint_range must be 6 pairs of finite numbers"),
-        ({"joint_range": [(0.0, 1.0), (0.0,)]}, "joint_range must be 6 pairs of finite numbers"),
-        ({"velocity_limit": {}}, "velocity_limit must be 6 numbers"),
-        (
-            {"torque_limit": [1e-3] * 6},
-            "torque_limit of elbow is 0.001 N m, .* at home against gravity takes 21.6",
-        ),
-        (
-            {
-                "torque_limit": [150.0, 25.0, 25.0, 28.0, 28.0, 28.0]
-            },  # enough at home, where the elbow bears most
-            r"torque_limit of shoulder_lift is 25 N m, .* with its hand at \(0\..*\) m against gravity",
-        ),
-        ({"hand_radius": 0}, "hand_radius must be a positive number of m, .* got 0"),
-        ({"hand_radius": -1}, "hand_radius must be a positive number"),
-        ({"hand_radius": np.nan}, "hand_radius must be a positive number"),
-        ({"hand_radius": "small"}, "hand_radius must be a positive number"),
-        ({"tolerance": 0.0}, "tolerance must be a number of m from 0.005 to less than 0.95, got 0.0"),
-        ({"tolerance": "fine"}, "tolerance must be a number of m .* got 'fine'"),
-        ({"tolerance": np.nan}, "tolerance must be a number of m"),
-        ({"joints": 5}, "joints must be names, in order from the base to the hand, got 5"),
-        ({"joints": "elbow"}, "joints must be names"),
-        ({"name": 5}, "name must be a string"),
-        ({"joints": (*JOINTS[:5], JOINTS[0])}, "joints must be named once each, got .*'shoulder_pan'"),
-    ],
+    ("name", "value"), [(name, value) for name, values in REFUSED.items() for value in values]
 )
-def test_what_is_missing_is_named(changes, message):
-    if message is None:
-        assert ur5e(**changes).dimension == 3  # the last joint is held still
-        return
-    with pytest.raises(ValueError, match=message):
-        ur5e(**changes)
+def test_invalid_arguments_are_refused(name, value):
+    with pytest.raises(ValueError):
+        ur5e(**{name: value})
 
 
-def test_joints_need_limits_and_torques(tmp_path):
-    text = UR5E.read_text(encoding="utf-8")
-    for change, message in (
-        (lambda t: re.sub(r' range="-6.2832 6.2832"', "", t), "'shoulder_pan' has no limits"),
-        (
-            lambda t: re.sub(r' actuatorfrcrange="[^"]*"', "", t),
-            "no actuator with a limited force drives shoulder_pan",
-        ),
-        (
-            lambda t: re.sub(r"<joint name=\"elbow\" range", '<joint name="elbow" type="slide" range', t),
-            "is not a hinge",
-        ),
-    ):
-        path = tmp_path / "arm.xml"
-        path.write_text(change(text), encoding="utf-8")
-        with pytest.raises(ValueError, match=message):
-            load_arm(path, hand_site="hand", joints=JOINTS, home=HOME)
-    with pytest.raises(ValueError, match="no file"):
-        load_arm(tmp_path / "none.xml", hand_site="hand", joints=JOINTS)
+@pytest.mark.parametrize("path", [5, None, b"arm.xml"])
+def test_a_path_is_the_name_of_a_file(path):
+    with pytest.raises(TypeError):
+        ur5e(path=path)
 
 
-def test_corners_of_the_workspace_may_be_any_two_that_are_opposite():
-    arm = ur5e(workspace=((0.58, 0.4, 0.35), (0.3, -0.4, 0.1)))
-    assert arm == ur5e(workspace=((0.3, -0.4, 0.1), (0.58, 0.4, 0.35)))
-    assert arm.workspace == ((0.3, -0.4, 0.1), (0.58, 0.4, 0.35))
-    gym.make("viapoint/Reach-v0", arm=arm).reset(seed=0)
+def test_joints_that_are_left_out_are_fixed():
+    assert ur5e(joints=JOINTS[:5], home=HOME[:5]).link_joints[-1] == 4
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("pattern", "other"),
     [
-        (
-            lambda text: re.sub(r"<geom[^>]*/>", "", text),
-            "there are no geoms in .*: nothing of the arm can collide",
-        ),
-        (lambda text: re.sub(r"<geom type[^>]*/>", "", text), "MuJoCo cannot compile .*arm.xml.*mass"),
-        (lambda text: text[:-20], "MuJoCo cannot read .*arm.xml' as an MJCF file"),
-        (
-            lambda text: text.replace("<worldbody>", f"<asset>{CUBE_MESH}</asset><worldbody>").replace(
-                '<geom type="box"', '<geom name="case" type="sdf" mesh="cube" mass="0.1"/><geom type="box"'
-            ),
-            "geom case: a link may have geoms of the types sphere, capsule, .* and mesh, not sdf",
-        ),
-        (
-            lambda text: text.replace('<joint name="wrist_1" class="wrist"/>', "").replace(
-                '<joint name="wrist_2"',
-                '<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"',
-            ),
-            "joints 'wrist_1' and 'wrist_2' belong to one body",
-        ),
+        (r' range="-6.2832 6.2832"', ""),  # joints without limits
+        (r' actuatorfrcrange="[^"]*"', ""),  # and without torques
+        (r'<joint name="elbow" range', '<joint name="elbow" type="slide" range'),
+        (r"<geom[^>]*/>", ""),
+        (r"<geom type[^>]*/>", ""),  # bodies without mass
+        (r"(?s).{20}$", ""),  # no XML
+        (r'<geom type="box"', '<geom type="sdf" mesh="cube" mass="0.1"/><geom type="box"'),
+        (r'<joint name="wrist_1" class="wrist"/>((?s:.*?))<joint name="wrist_2"',
+         r'\1<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"'),  # two in one body
+        (r'actuatorfrcrange="-28 28"', 'actuatorfrcrange="0 28"'),  # motors that pull one way
     ],
-)
-def test_files_that_suffice_for_nothing_are_named(tmp_path, change, message):
+)  # fmt: skip
+def test_files_that_lack_something_are_refused(tmp_path, pattern, other):
+    text = UR5E.read_text(encoding="utf-8").replace("<worldbody>", f"<asset>{CUBE_MESH}</asset><worldbody>")
+    changed, number = re.subn(pattern, other, text)
+    assert number
     path = tmp_path / "arm.xml"
-    path.write_text(change(UR5E.read_text(encoding="utf-8")), encoding="utf-8")
-    with pytest.raises(ValueError, match=message):
+    path.write_text(changed, encoding="utf-8")
+    with pytest.raises(ValueError):
         load_arm(path, hand_site="hand", joints=JOINTS, home=HOME)
 
 
-def test_feasibility_does_not_depend_on_how_many_distances_are_computed_at_once(arm, monkeypatch):
-    kwargs = {"hand_site": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
-    monkeypatch.setattr(reachability, "BLOCK", 997)
-    again = load_arm(UR5E, **kwargs)
-    assert again.workspace == arm.workspace
-    assert again.shape == arm.shape
-
-
-def test_joints_may_have_any_names(tmp_path):
+def test_joints_may_have_any_names(tmp_path, arm):
     """Those of the parts that are added to the file, too."""
-    text, names = (
-        UR5E.read_text(encoding="utf-8"),
-        ("hand_x", "hand_x_", "hand", "origin", "obstacle_0", "a/b"),
-    )
-    for joint, name in zip(JOINTS, names, strict=True):
-        text = text.replace(f'joint name="{joint}"', f'joint name="{name}"')
-    path = tmp_path / "arm.xml"
-    path.write_text(text, encoding="utf-8")
-    arm = load_arm(path, hand_site="hand", joints=names, home=HOME, velocity_limit=np.pi)
-    mine, other = (
-        gym.make("viapoint/Obstacles-v0", arm=each).unwrapped for each in (arm, ur5e(velocity_limit=np.pi))
-    )
-    for env in (mine, other):
+    names = ("hand_x", "hand_x_", "hand", "origin", "obstacle_0", "a/b")
+    changes = [
+        (f'joint name="{joint}"', f'joint name="{name}"') for joint, name in zip(JOINTS, names, strict=True)
+    ]
+    path = written(tmp_path / "arm.xml", *changes)
+    other = load_arm(path, hand_site="hand", joints=names, home=HOME, velocity_limit=np.pi)
+    outcomes = []
+    for each in (arm, other):
+        env = gym.make("viapoint/Obstacles-v0", arm=each)
         env.reset(seed=0)
-    assert mine.step(np.zeros(4))[-1] == other.step(np.zeros(4))[-1]
-    model = mine.model
-    assert [model.actuator(i).trntype[0] for i in range(model.nu)] == [mujoco.mjtTrn.mjTRN_SITE] * 3 + [
-        mujoco.mjtTrn.mjTRN_JOINT
-    ] * 6
+        outcomes.append(env.step(np.zeros(4))[-1])
+    assert outcomes[0] == outcomes[1]
 
 
-def test_a_record_that_json_took_apart_is_refused_in_few_words(arm):
+def test_a_record_that_json_took_apart_is_refused(arm):
     spec = EnvSpec.from_json(gym.make("viapoint/Obstacles-v0", arm=arm).spec.to_json())
-    with pytest.raises(TypeError, match=r"arm must be an arm of .*register_arm") as refused:
+    with pytest.raises(TypeError):
         gym.make(spec)
-    assert len(str(refused.value).split(" was raised from")[0]) < 400
 
 
 @pytest.mark.parametrize("thing", [3, None, "panda", Arm])
 def test_only_records_are_registered(thing):
     known = dict(ARMS)
-    with pytest.raises(TypeError, match=r"arm must be an arm of viapoint\.envs\.arms, got"):
+    with pytest.raises(TypeError):
         register_arm(thing)
     assert known == ARMS
 
 
-def test_goals_out_of_reach_and_obstacles_at_the_start_are_refused_with_the_reason(arm):
+def test_goals_out_of_reach_and_obstacles_at_the_start_are_refused(arm):
     env = gym.make("viapoint/Obstacles-v0", arm=arm)
     start, goal = np.array(arm.workspace)
-    with pytest.raises(ValueError, match="out of the arm's reach"):
-        env.reset(options={"start": start, "goal": goal + 0.3, "obstacles": []})
     touching = np.concatenate((start + 0.01, np.zeros(3), [0.03]))
-    with pytest.raises(ValueError, match=r"obstacle 0 .* touches the arm at the start"):
-        env.reset(options={"start": start, "goal": goal, "obstacles": touching[None]})
+    for far, obstacles in ((goal + 0.3, []), (goal, touching[None])):
+        with pytest.raises(ValueError):
+            env.reset(options={"start": start, "goal": far, "obstacles": obstacles})
 
 
 @pytest.mark.skipif(find_spec("gymnasium_robotics") is None, reason="gymnasium-robotics is not installed")
 def test_the_fetch_of_gymnasium_robotics():
     assets = Path(find_spec("gymnasium_robotics").submodule_search_locations[0]) / "envs" / "assets"
     path = assets / "fetch" / "reach.xml"
-    with pytest.raises(ValueError, match="'robot0:upperarm_roll_joint' has no limits"):
-        load_arm(path, **{**FETCH, "joint_range": None})
-    with pytest.raises(ValueError, match="no actuator with a limited force drives robot0:shoulder_pan_joint"):
-        load_arm(path, **{**FETCH, "torque_limit": None})
-    fetch = load_arm(path, **FETCH)
-    env = gym.make_vec("viapoint/Obstacles-v0", num_envs=16, arm=fetch, threads=1)
-    env.reset(seed=0)
-    _, _, info = env.unwrapped.execute_actions(np.zeros((16, 4)))
-    assert info["collision"].all()
-    env = gym.make_vec("viapoint/Reach-v0", num_envs=16, arm=fetch, threads=1)
-    env.reset(seed=0)
-    _, _, info = env.unwrapped.execute_actions(np.zeros((16, 4)))
-    assert info["is_success"].all()
-    assert info["tracking_error"].max() < 2e-3
+    for missing in ("joint_range", "torque_limit"):
+        with pytest.raises(ValueError):
+            load_arm(path, **{**FETCH, missing: None})
+    moves_as_planned(load_arm(path, **FETCH), error=2e-3)
 
 
-def test_the_page_runs_and_its_numbers_are_measured(monkeypatch, capsys):
+def test_the_examples_of_the_page_run(monkeypatch):
     monkeypatch.chdir(DOCS.parent)
     page, names = (DOCS / "bring-your-arm.md").read_text(encoding="utf-8"), {}
     for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         if "TrainConfig" not in example:
             exec(example, names)
-    error = capsys.readouterr().out.splitlines()[-1]
-    size = " x ".join(f"{width:.2f}" for width in np.diff(names["ur5e"].ik.box, axis=0)[0])
-    assert f"| `docs/ur5e.xml` | 6 | {size} m | {error} |" in page
     np.testing.assert_allclose(names["points"], [[0.45, 0.0, 0.2], [0.45, 0.3, 0.2]], atol=1e-6)
-    for env in (names["env"], names["envs"]):
-        env.close()
 
 
-def test_by_default_capsules_reach_25_mm_beyond_geoms_at_most_and_the_page_has_the_measured_ones(arm):
-    page = (DOCS / "bring-your-arm.md").read_text(encoding="utf-8")
-    default = inspect.signature(load_arm).parameters["tolerance"].default
+def test_by_default_capsules_reach_25_mm_beyond_geoms_at_most(arm):
     rows = {row["arm"]: row for row in json.loads((DOCS / "arm-contacts.json").read_text(encoding="utf-8"))}
-    assert default == 0.025
-    assert f"(default {default} m)" in page
-    for name, link in (("ur5e", "`docs/ur5e.xml`"), ("fetch", "Fetch")):
-        capsules, excess = rows[name]["capsules"], rows[name]["excess"]
-        assert excess <= 1e3 * default
-        assert f"| {link} | {capsules} | {excess} mm |" in page
     assert len(arm.shape) == rows["ur5e"]["capsules"]
     assert 1e3 * max(each.excess for each in arm.shape) == pytest.approx(rows["ur5e"]["excess"], abs=0.05)
+    assert max(row.get("excess", 0.0) for row in rows.values()) <= 25.0
     assert {row["wrong"] for row in rows.values()} == {0}
-    assert f"{rows['ur5e']['poses']:,} random configurations" in page
 
 
 def test_an_arm_is_known_by_its_name_once_it_is_registered(arm, monkeypatch):
     monkeypatch.delitem(ARMS, arm.name, raising=False)
-    with pytest.raises(ValueError, match=rf"got '{arm.name}'.*register_arm registers an arm of your own"):
+    with pytest.raises(ValueError, match="register_arm registers an arm of your own"):
         gym.make("viapoint/Obstacles-v0", arm=arm.name)
     monkeypatch.setitem(ARMS, arm.name, arm)
     register_arm(arm)
-    env = gym.make("viapoint/Obstacles-v0", arm=arm.name).unwrapped
-    assert env.task.arm is arm
-    env.close()
-    with pytest.raises(ValueError, match="another arm is registered as"):
+    assert gym.make("viapoint/Obstacles-v0", arm=arm.name).unwrapped.task.arm is arm
+    with pytest.raises(ValueError):
         register_arm(ur5e(velocity_limit=1.0))
 
 

@@ -1,7 +1,6 @@
-"""The page of the environments says what the code does."""
+"""Tables on the pages of the environments, and the code."""
 
 import inspect
-import json
 import re
 from pathlib import Path
 
@@ -9,96 +8,67 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs import TASKS
-from viapoint.envs.mdp.rewards import RewardWeights
-from viapoint.envs.sim.outcome import GOAL_TOLERANCE, REST_SPEED, Outcome
-from viapoint.envs.single_env import ReachVectorEnv
+from viapoint.envs.registration import twin_of
+from viapoint.envs.sim.replan_triggers import Event
 
-PAGE = (Path(__file__).parents[2] / "docs" / "environments.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = {
+    "environments": "viapoint/PlanarObstacles-v0",
+    "environments-step": "viapoint/PlanarObstaclesStep-v0",
+    "environments-replanning": "viapoint/PlanarMovingObstacles-v0",
+}
 
 
-def table(section):
-    """The rows of the first table of a section, without its head."""
-    text = f"\n{PAGE}".partition(f"\n{section}\n")[2].partition("\n## ")[0]
-    rows = [
-        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
-        for line in text.splitlines()
-        if line[:1] == "|"
-    ]
-    return rows[2:]
+@pytest.fixture(params=PAGES)
+def page(request):
+    return request.param
 
 
 @pytest.fixture
-def env():
-    return gym.make("viapoint/PlanarObstacles-v0").unwrapped
+def env(page):
+    return gym.make(PAGES[page]).unwrapped
 
 
-def test_the_stated_speeds_relative_to_mujoco_are_the_measured_ones():
-    docs = Path(__file__).parents[2] / "docs"
-    lines = (docs / "vectorized.md").read_text(encoding="utf-8").splitlines()
-    names = {
-        "256 environments of `make_vec`": "make_vec, 256 environments",
-        "one environment of `make`, steps alone": "make, one environment, step",
-        "one environment of `make`, with resets": "make, one environment, reset and step",
-    }
-    found = [json.loads((docs / f"bench-{name}-obstacles.json").read_text()) for name in ("planar", "panda")]
-    for shown, name in names.items():
-        ratios = " | ".join(f"{each[name]['ratio']:.2f}" for each in found)
-        assert f"| {shown} | {ratios} |" in lines
+def table(page, section):
+    """The rows of the first table of a section, without its head."""
+    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    section = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    lines = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE).group(0).splitlines()
+    return [[cell.strip().strip("`") for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_the_sections_are_in_the_order_of_gymnasium():
-    assert re.findall(r"^## (.*)$", PAGE, re.MULTILINE) == [
-        "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
-        "Version History",
-    ]  # fmt: skip
+def test_actions(page, env):
+    layout = getattr(env, "steering", env.action_layout)
+    rows = zip(map(str, range(len(layout.names))), layout.names, layout.units, strict=True)
+    assert table(page, "Action Space") == [list(row) for row in rows]
 
 
-def test_every_id_is_listed_with_what_it_sets():
-    rows = {row[0]: row[3] for row in table("# The environments")}
-    assert set(rows) == set(TASKS)
-    for name, kwargs in TASKS.items():
-        assert rows[name] == (", ".join(f"{k}={v}" for k, v in kwargs.items()) or "-")
-
-
-def test_action_space(env):
-    assert f"`Box(-1.0, 1.0, {env.action_space.shape}, float32)`" in PAGE
-    layout = env.action_layout
-    assert table("## Action Space") == [
-        [str(i), n, u] for i, (n, u) in enumerate(zip(layout.names, layout.units, strict=True))
-    ]
-
-
-def test_observation_space(env):
-    rows = {row[0]: row[1:4] for row in table("## Observation Space")}
-    assert set(rows) == set(env.observation_space)
-    for name, (size, low, high) in rows.items():
+def test_observations(page, env):
+    rows = {row[0]: row[1:4] for row in table(page, "Observation Space")}
+    twin = twin_of(PAGES[page])
+    others = set() if twin == PAGES[page] else set(gym.make(twin).observation_space)
+    assert set(rows) == set(env.observation_space) - others
+    for name, (size, *sides) in rows.items():
         box = env.observation_space[name]
         assert box.shape == (int(size),)
-        for stated, bound in ((low, box.low), (high, box.high)):
-            numbers = np.array([float(n) for n in stated.split(",")])
-            np.testing.assert_allclose(np.tile(numbers, len(bound) // len(numbers)), bound, atol=1e-6)
+        for told, side in zip(sides, (box.low, box.high), strict=True):
+            numbers = [float(number) for number in told.split(",")]
+            np.testing.assert_allclose(side, np.resize(numbers, side.shape), atol=1e-4)
 
 
-def test_rewards():
-    weights = RewardWeights()
-    assert {row[0]: float(row[1]) for row in table("## Rewards")} == {
-        k: getattr(weights, k) for k in weights.__annotations__
-    }
+def test_rewards(page, env):
+    weights = {row[0]: float(row[1]) for row in table(page, "Rewards")}
+    assert weights == vars(env.task.weights)
 
 
-def test_arguments():
-    parameters = inspect.signature(ReachVectorEnv).parameters
-    skipped = {"self", "num_envs", "unknown"}
-    code = {name: p.default for name, p in parameters.items() if name not in skipped}
-    stated = {row[0]: row[1] for row in table("## Arguments")}
-    assert set(stated) == set(code)
-    for name, default in code.items():
-        assert stated[name] == ("ADULT" if name == "arm" else repr(default))
+def test_arguments(page, env):
+    code = {}
+    for name, parameter in inspect.signature(type(env.batch)).parameters.items():
+        if name != "num_envs":
+            code[name] = "ADULT" if name == "arm" else repr(parameter.default)
+    assert {row[0]: row[1] for row in table(page, "Arguments")} == code
 
 
-def test_episode_end():
-    for name in Outcome._fields:
-        assert f"`{name}`" in PAGE
-    assert f"within {GOAL_TOLERANCE} m of the goal" in PAGE.replace("\n", " ")
-    assert f"slower than {REST_SPEED} m/s" in PAGE
+def test_events():
+    rows = table("environments-replanning", "Episode End")
+    assert [(int(row[0]), row[1].upper()) for row in rows] == [(event, event.name) for event in Event]

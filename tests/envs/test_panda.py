@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -10,40 +11,23 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-import torch
 
 from viapoint.envs.actions.via_points import ActionLayout
 from viapoint.envs.arms import PANDA
-from viapoint.envs.arms.base import SELF_MARGIN, CollisionModel
-from viapoint.envs.arms.serial_arm import LIMIT_SHARE, NEAR, serial_arm
+from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.arms.serial_arm import LIMIT_SHARE, serial_arm
 from viapoint.envs.geometry.distance import MAX_CLEARANCE, arm_clearance
 from viapoint.envs.geometry.narrow_phase import ends_of, nearest_approach
+from viapoint.envs.scenes.families import scene_families
 from viapoint.envs.sim.simulator import Simulator
-from viapoint.envs.single_env import ReachVectorEnv
 
+DOCS = Path(__file__).parents[2] / "docs"
 PANDA_FILE = files("viapoint.envs") / "assets" / "panda.xml"
 CAPSULE = 'fromto="0 0.0421 -0.1081 0 0.064 0.0008" size="0.068"'
 BALL = 'type="sphere" pos="0 0.053 -0.054" size="0.08"'
 WITH_SPHERES = serial_arm(
     PANDA_FILE.read_text(encoding="utf-8").replace(CAPSULE, BALL), name="with-spheres", ik=PANDA.ik,
     joint_names=PANDA.joint_names, hand_site="hand", workspace=PANDA.workspace,
-)  # fmt: skip
-LINKS = (*(f"link{number}" for number in range(8)), "gripper")
-BODIES_OF = {
-    (i, j): tuple(sorted((one.name.split("_")[0], other.name.split("_")[0]), key=LINKS.index))
-    for (i, one), (j, other) in itertools.combinations(enumerate((*PANDA.shape, *PANDA.base)), 2)
-}
-TOUCHING = ("link5", "link7")
-"""Forearm and flange, whose capsules overlap within reach."""
-NOT_COMPARED = {
-    ("link0", "link2"), ("link0", "link3"), ("link0", "link4"),
-    ("link1", "link3"), ("link1", "link4"), ("link2", "link4"),
-    ("link3", "link5"), ("link3", "link6"), ("link3", "link7"), ("link3", "gripper"),
-    ("link4", "link6"), ("link4", "link7"), ("link4", "gripper"), TOUCHING,
-}  # fmt: skip
-SELF_TOUCHING = dataclasses.replace(
-    PANDA, name="self-touching", may_touch_itself=True,
-    self_pairs=(*PANDA.self_pairs, *(pair for pair, bodies in BODIES_OF.items() if bodies == TOUCHING)),
 )  # fmt: skip
 LAYOUT = ActionLayout(dimension=3, duration_range=(1.0, 2.0))
 
@@ -107,48 +91,14 @@ def test_the_hand_points_down_and_keeps_its_heading_and_nothing_touches_itself_o
         assert data.ncon == 0
 
 
-def test_in_any_posture_bodies_touch_one_another_and_the_table_but_for_those_that_are_not_compared():
-    model = PANDA.compile(0, whole_arm=True)
-    data, rng = mujoco.MjData(model), np.random.default_rng(4)
-    geoms = {
-        body: [model.geom(g).name for g in range(model.ngeom) if model.geom(g).name.startswith(body)]
-        for body in LINKS
-    }
-    geoms["gripper"].append("hand")
-    bodies = {(a, b) for a, b in itertools.combinations(LINKS, 2) if LINKS.index(b) > LINKS.index(a) + 1}
-    bodies -= {("link6", "gripper"), *NOT_COMPARED}
-    pairs = {(g, h) for a, b in bodies for g in geoms[a] for h in geoms[b]}
-    pairs |= {(g, "table") for body in LINKS[4:] for g in geoms[body]}
-    seen = set()
-    for joints in rng.uniform(*np.array(PANDA.joint_range).T, (400, 7)):
-        data.qpos[:] = joints
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        touching = {frozenset(model.geom(g).name for g in contact.geom) for contact in data.contact}
-        apart = {
-            pair: mujoco.mj_geomDistance(model, data, *(model.geom(g).id for g in pair), 1.0, None)
-            for pair in pairs
-        }
-        assert touching == {frozenset(pair) for pair, distance in apart.items() if distance < 0.0}
-        seen |= touching
-    assert {frozenset(("gripper_0", "link5_0")), frozenset(("link5_0", "table"))} <= seen
-
-
-def test_postures_are_differentiable_and_change_smoothly():
-    plan = movements(40)
-    position, velocity, _ = looked_at(plan)
-    hand = torch.as_tensor(position).requires_grad_()
-    joints = PANDA.inverse_kinematics(hand)
-    jacobian = torch.stack(
-        [torch.autograd.grad(joints[..., k].sum(), hand, retain_graph=True)[0] for k in range(7)]
+def test_postures_change_smoothly():
+    """Differences over steps of very different lengths give the same joint rates."""
+    position, velocity, _ = looked_at(movements(40))
+    short, long = (
+        (PANDA.inverse_kinematics(position + step * velocity) - PANDA.inverse_kinematics(position)) / step
+        for step in (1e-7, 1e-5)
     )
-    rates = (jacobian.numpy() * velocity).sum(axis=-1)
-    along = np.moveaxis(
-        (PANDA.inverse_kinematics(position + 1e-6 * velocity) - PANDA.inverse_kinematics(position)) / 1e-6,
-        -1,
-        0,
-    )
-    np.testing.assert_allclose(rates, along, atol=1e-3)
+    np.testing.assert_allclose(short, long, atol=1e-3)
 
 
 def test_movements_of_the_centre_duration_are_tracked_and_links_are_where_they_were_foreseen():
@@ -242,100 +192,30 @@ def test_contact_with_itself_and_the_table_exactly_where_the_clearance_from_itse
         contact[i] = data.ncon > 0
     np.testing.assert_array_equal(contact, clearance < 0.0)
     assert 0.2 < contact.mean() < 0.8
-    batches = (
-        arm.self_clearance(joints.reshape(6, 100, 7)),
-        arm.self_clearance(torch.as_tensor(joints)).numpy(),
-    )
-    for batch in batches:
-        np.testing.assert_allclose(batch.ravel(), clearance, atol=1e-12)
+    np.testing.assert_allclose(arm.self_clearance(joints.reshape(6, 100, 7)).ravel(), clearance, atol=1e-12)
 
 
-def test_links_are_compared_unless_they_are_neighbours_or_never_touch_but_forearm_and_flange():
-    compared = {BODIES_OF[pair] for pair in PANDA.self_pairs}
-    every = {(LINKS[a], LINKS[b]) for b in range(len(LINKS)) for a in range(b - 1)}
-    assert every - compared == {*NOT_COMPARED, ("link6", "gripper")}  # the gripper is fixed to link 7
-    never = tuple(pair for pair, bodies in BODIES_OF.items() if bodies in NOT_COMPARED - {TOUCHING})
-    arm = dataclasses.replace(PANDA, self_pairs=never, off_table=())
+def test_links_that_are_not_compared_never_touch():
+    """But neighbours, and forearm and flange, whose capsules overlap within reach although the links do not."""
+    every = (*PANDA.shape, *PANDA.base)
+    distant = [(i, j) for i, j in itertools.combinations(range(len(every)), 2)
+               if abs(every[i].joint - every[j].joint) > 1
+               and [every[i].name[:5], every[j].name[:5]] != ["link5", "link7"]]  # fmt: skip
+    arm = dataclasses.replace(PANDA, self_pairs=tuple({*distant} - {*PANDA.self_pairs}), off_table=())
     joints = np.random.default_rng(5).uniform(*np.array(PANDA.joint_range).T, (5000, 7))
-    assert arm.self_clearance(joints).min() > 0.0
+    assert 0.0 < arm.self_clearance(joints).min() < MAX_CLEARANCE
+    assert {*PANDA.self_pairs} < {*distant}
 
 
 def test_measured_bounds_of_the_capsules():
     """benchmarks/panda_collision.py: Franka's geometry is inside, and the capsules reach at most 25 mm beyond it."""
-    found = json.loads(
-        (Path(__file__).parents[2] / "docs" / "panda-collision.json").read_text(encoding="utf-8")
-    )
+    found = json.loads((DOCS / "panda-collision.json").read_text(encoding="utf-8"))
     joints = [capsule.joint for capsule in (*PANDA.shape, *PANDA.base)]
-    listed = [tuple(pair.split("-")) for pairs in found["not_compared"].values() for pair in pairs]
-    assert set(listed) == set(itertools.combinations(LINKS, 2)) - {
-        BODIES_OF[pair] for pair in PANDA.self_pairs
-    } - {
-        ("link7", "gripper")  # one rigid body
-    }
-    assert len(listed) == len(set(listed))
-    apart, found = found["forearm_and_flange"], found["links"]
-    assert [row["capsules"] for row in found] == [joints.count(joint) for joint in range(-1, 7)]
-    assert PANDA.link_joints == (0, 1, 2, 3, 4, 4, 5, 5, 6, 6, 6, 6, 6, 6)
-    assert max(row["outside"] for row in found) == 0.0
-    assert max(row["excess"] for row in found) <= 25.0
+    assert [row["capsules"] for row in found["links"]] == [joints.count(joint) for joint in range(-1, 7)]
+    assert max(row["outside"] for row in found["links"]) == 0.0
+    assert max(row["excess"] for row in found["links"]) <= 25.0
+    apart = found["forearm_and_flange"]
     assert apart["capsules"] < 0.0 < 10.0 < apart["geometry"]
-
-
-def test_within_reach_a_few_pairs_of_links_suffice():
-    hand = np.random.default_rng(6).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (20_000, 3))
-    joints = SELF_TOUCHING.inverse_kinematics(hand[SELF_TOUCHING.reach_margin(hand) >= 0.0])
-    every, some = (
-        SELF_TOUCHING.self_clearance(joints),
-        SELF_TOUCHING.planned_self_clearance(SELF_TOUCHING.links(joints)),
-    )
-    near = every < NEAR
-    np.testing.assert_array_equal(some[near], every[near])
-    assert (some[~near] >= NEAR).all()
-    assert len(SELF_TOUCHING._pairs_within_reach) < len(SELF_TOUCHING.self_pairs) / 2
-
-
-def test_the_clearance_from_itself_has_the_gradient_of_finite_differences():
-    joints = torch.as_tensor(np.random.default_rng(8).uniform(*np.array(PANDA.joint_range).T, (5, 7)))
-    assert torch.autograd.gradcheck(PANDA.self_clearance, joints.requires_grad_(), atol=1e-4)
-
-
-def test_plans_of_an_arm_that_touches_itself_have_a_negative_clearance():
-    """Executed movements, other arms and the hand alone are compared with obstacles only."""
-    places = np.random.default_rng(9).uniform((-0.2, -0.8, 0.0), (0.8, 0.8, 0.8), (4000, 3))
-    hand = places[SELF_TOUCHING.reach_margin(places) >= 0.0][:400].reshape(100, 4, 3)
-    far = np.concatenate(
-        (np.full((100, 1, 3), 0.95), np.zeros((100, 1, 3)), np.full((100, 1, 1), 0.01)), axis=-1
-    )
-    joints, present = SELF_TOUCHING.inverse_kinematics(hand), np.ones((100, 1), dtype=bool)
-    own, there = SELF_TOUCHING.self_clearance(joints) - SELF_MARGIN, np.repeat(far[:, None], 4, axis=1)
-    without = dataclasses.replace(SELF_TOUCHING, may_touch_itself=False)
-    for whole_arm, given in ((True, None), (True, joints), (False, None)):
-        model, other = CollisionModel(SELF_TOUCHING, whole_arm), CollisionModel(without, whole_arm)
-        least, profile = (
-            other.least_clearance(hand, far, present),
-            other.clearance_profile(hand, there, present),
-        )
-        if whole_arm and given is None:
-            least = np.where(own.min(axis=1) < 0.0, own.min(axis=1), least)
-            profile = np.where(own < 0.0, own, profile[..., 0])[..., None]
-            nothing = model.least_clearance(hand, far[:, :0], present[:, :0])
-            np.testing.assert_array_equal(nothing < 0.0, own.min(axis=1) < 0.0)
-        np.testing.assert_allclose(model.least_clearance(hand, far, present, given), least, atol=1e-12)
-        np.testing.assert_allclose(model.clearance_profile(hand, there, present, given), profile, atol=1e-12)
-    assert 0.01 < (own.min(axis=1) < 0.0).mean() < 0.5
-
-
-def test_the_arm_collides_with_itself_and_with_the_table():
-    model = PANDA.compile(0, whole_arm=True)
-    data = mujoco.MjData(model)
-    for joints, second in (
-        ([0, 0, 0, -3.05, 0, 0.0, 0], {"link0", "link1", "link2", "link3"}),  # folded onto itself
-        ([0, 1.2, 0, -1.2, 0, 2.4, 0], {"table"}),
-    ):
-        data.qpos[:] = joints
-        mujoco.mj_forward(model, data)
-        names = {model.geom(geom).name for contact in data.contact for geom in contact.geom}
-        assert names & second, names
 
 
 def test_the_nearest_approach_is_the_least_of_all_times():
@@ -361,21 +241,6 @@ def test_the_nearest_approach_is_the_least_of_all_times():
     np.testing.assert_array_equal(nothing, MAX_CLEARANCE)
 
 
-def test_info_tells_how_much_slower_a_movement_was_made():
-    env = ReachVectorEnv(16, arm="panda", whole_arm=True, n_obstacles=0, duration_range=(0.3, 2.0), threads=1)
-    env.reset(seed=0)
-    slow, fast = np.zeros((16, 4)), np.zeros((16, 4))
-    slow[:, 3], fast[:, 3] = 1.0, -1.0
-    _, _, info = env.execute_actions(slow)
-    np.testing.assert_array_equal(info["stretch"], 1.0)
-    assert info["is_success"].all()
-    env.reset(seed=0)
-    _, _, info = env.execute_actions(fast)
-    assert (info["stretch"] > 1.0).all()
-    np.testing.assert_allclose(info["duration"], 0.3 * info["stretch"])
-    assert info["is_success"].all()
-
-
 def test_straight_movements_of_drawn_scenes_are_not_slowed_down():
     """The number of scenes is that of docs/environments-panda.md."""
     envs = gym.make_vec("viapoint/PandaObstacles-v0", num_envs=500)
@@ -386,3 +251,12 @@ def test_straight_movements_of_drawn_scenes_are_not_slowed_down():
         position, velocity, acceleration = looked_at(plan)
         np.testing.assert_array_equal(PANDA.required_time_scale(position, velocity, acceleration), 1.0)
     envs.close()
+
+
+def test_the_example_of_the_page_puts_a_scene_of_a_family_into_the_environment():
+    page = (DOCS / "environments-panda.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    exec(example, names)
+    assert names["scenes"].present.sum(axis=-1).min() >= scene_families(3)["tunnel"].n_obstacles
+    assert names["observation"]["hand"] == pytest.approx(names["scenes"].start[0], abs=1e-6)

@@ -59,14 +59,10 @@ def test_the_way_round_succeeds_where_the_straight_line_crashes():
 def test_rewards_are_ordered_as_a_person_would_order_them():
     """A smooth way round, a wide one, a refused one, a crash; and a graze above a crash in the middle."""
     env = make(WALL)
+    smooth, wide, graze = (through(env, np.array([-0.1, y])) for y in (0.53, 0.59, 0.515))
+    refused, crash = np.array([-1.0, 1.0, 0.0], np.float32), np.zeros(3, np.float32)
     rewards = []
-    for action in (
-        through(env, np.array([-0.1, 0.53])),
-        through(env, np.array([-0.1, 0.59])),
-        np.array([-1.0, 1.0, 0.0], dtype=np.float32),
-        through(env, np.array([-0.1, 0.515])),
-        np.zeros(3, dtype=np.float32),
-    ):
+    for action in (smooth, wide, refused, graze, crash):
         env = make(WALL)
         _, reward, *_, info = env.step(action)
         rewards.append((reward, info["is_success"], info["reachable"], info["collision"]))
@@ -148,16 +144,12 @@ def test_components_beyond_one_are_clipped():
     assert outcomes[0] == outcomes[1]
 
 
-def test_weights_scale_their_terms_and_unknown_or_negative_ones_are_refused():
+def test_weights_scale_their_terms():
     action = np.array([0.1, 0.3, 0.2], dtype=np.float32)
     *_, usual = make(WALL).step(action)
     *_, double = make(WALL, reward_weights={"smoothness": 2 * RewardWeights().smoothness}).step(action)
     assert double["reward_smoothness"] == pytest.approx(2 * usual["reward_smoothness"])
     assert double["reward_duration"] == usual["reward_duration"]
-    with pytest.raises(ValueError, match="'speed'"):
-        make(reward_weights={"speed": 1.0})
-    with pytest.raises(ValueError, match="success"):
-        make(reward_weights={"success": -1.0})
 
 
 def test_more_via_points_and_learned_timing():

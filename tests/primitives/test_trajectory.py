@@ -224,7 +224,7 @@ def test_leading_dimensions_broadcast_or_are_refused(points, times):
         and all(a == b or 1 in (a, b) for a, b in zip(points[-3::-1], times[-2::-1], strict=False))
     )
     if not fits:
-        with pytest.raises(ValueError):  # noqa: PT011
+        with pytest.raises(ValueError):
             through(np.ones(points), np.ones(times))
         return
     movement, batch = through(np.ones(points), np.ones(times)), np.broadcast_shapes(points[:-2], times[:-1])

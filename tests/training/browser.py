@@ -1,6 +1,5 @@
 """A headless browser, driven by the Chrome DevTools protocol."""
 
-import base64
 import json
 import shutil
 import subprocess
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-PATIENCE = 40.0
+PATIENCE = 90.0
 """Time limit of an answer of the browser, [s]."""
 SIZE = 1280, 800
 """Width and height of the window, [pixels]."""
@@ -153,9 +152,6 @@ class Tab:
             "(()=>{const a=[...document.querySelectorAll('canvas')].sort((a,b)=>b.clientWidth*b.clientHeight"
             "-a.clientWidth*a.clientHeight)[0].getBoundingClientRect();return [a.x,a.y,a.width,a.height]})()"
         )
-
-    def screenshot(self):
-        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def close(self):
         if not self.closed:

@@ -1,4 +1,4 @@
-"""Files made to deceive: each is refused with its name and the reason, and none of what it carries is run."""
+"""Files made to deceive: each is refused by its name, and none of what it carries is run."""
 
 import hashlib
 import io
@@ -7,6 +7,7 @@ import os
 import pickle
 import resource
 import struct
+import sys
 import zipfile
 
 import numpy as np
@@ -22,7 +23,7 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.checkpoints import _digest, read_checkpoint, write_checkpoint
 
 ENV = "viapoint/PlanarObstacles-v0"
-MEGABYTE = 1 << 20
+RECORD, WEIGHTS = "model.json", "weights.safetensors"
 SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwargs": {"net_arch": [8]}}
 
 
@@ -52,6 +53,18 @@ def model(saved, tmp_path):
         (tmp_path / name).write_bytes(content)
     load_model(tmp_path)
     return tmp_path
+
+
+def edit(folder, **changes):
+    record = json.loads((folder / RECORD).read_text())
+    (folder / RECORD).write_text(json.dumps({**record, **changes}))
+
+
+def check_refused(folder, name):
+    """Check that the error is about one of the files."""
+    with pytest.raises(BadFileError) as error:
+        load_model(folder)
+    assert error.value.path == folder / name
 
 
 class Canary:
@@ -88,19 +101,25 @@ def test_a_pickle_is_not_opened_wherever_it_hides(model):
     archive = zipped(data=json.dumps({"policy_class": {":serialized:": "x"}}), **{"policy.pth": evil})
     hidden = save({"w": np.frombuffer(evil.ljust(len(evil) + -len(evil) % 4), np.float32)})
     for content in (evil, archive, hidden, with_header(evil), with_header(tensor(), evil)):
-        (model / "weights.safetensors").write_bytes(content)
-        with pytest.raises(BadFileError, match=r"weights\.safetensors"):
-            load_model(model)
-    for path in (b"\x80\x04", archive):
-        (model / "model.json").write_bytes(path)
-        with pytest.raises(BadFileError, match=r"model\.json"):
-            load_model(model)
+        (model / WEIGHTS).write_bytes(content)
+        check_refused(model, WEIGHTS)
+    for content in (evil, archive):
+        (model / RECORD).write_bytes(content)
+        check_refused(model, RECORD)
     assert not canary.exists()
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
+def test_no_module_is_imported_by_name(model, monkeypatch):
+    (model / "evil_module.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(model)
+    edit(model, env={"id": "evil_module:viapoint/PlanarReach-v0", "kwargs": {}})
+    check_refused(model, RECORD)
+    assert "evil_module" not in sys.modules
+
+
+CONTENTS = {
+    WEIGHTS: [
+        b"",
         struct.pack("<Q", 2**63) + b"{}",
         struct.pack("<Q", 10**9) + b"{}",
         struct.pack("<Q", 2**64 - 1),
@@ -111,8 +130,6 @@ def test_a_pickle_is_not_opened_wherever_it_hides(model):
         with_header(tensor(data_offsets=[0, 10**18]), bytes(8)),
         with_header({**tensor(), "v": tensor()["w"]}, bytes(8)),
         with_header(tensor(dtype="PICKLE"), bytes(8)),
-        with_header(tensor(dtype="F32 "), bytes(8)),
-        with_header({"w": "all of it"}),
         with_header({"w": {"dtype": "F32"}}),
         with_header(b"[" * 100_000),
         with_header(b"\xff\xfe"),
@@ -120,70 +137,77 @@ def test_a_pickle_is_not_opened_wherever_it_hides(model):
         with_header(tensor(), bytes(4)),
         with_header(tensor(), bytes(12)),
     ],
-    ids=range(18),
-)
-def test_headers_that_lie_are_refused(content, model):
-    (model / "weights.safetensors").write_bytes(content)
-    with pytest.raises(BadFileError, match=r"weights\.safetensors"):
-        load_model(model)
-
-
-def test_names_cannot_lead_out_of_the_folder(model, tmp_path_factory):
-    """A tensor's name is a name and no path; an environment's is looked up and never imported."""
-    arrays = load_file(model / "weights.safetensors")
-    outside = tmp_path_factory.mktemp("outside")
-    save_file({f"../{outside.name}/x": np.zeros(1, np.float32), **arrays}, model / "weights.safetensors")
-    with pytest.raises(BadFileError, match="unknown to the model"):
-        load_model(model)
-    assert list(outside.iterdir()) == []
-    for name in ("../../etc/passwd", "os:system", "viapoint/../Planar-v0", "", None, ["x"]):
-        edit(model, env={"id": name, "kwargs": {}})
-        with pytest.raises(BadFileError, match=r"model\.json"):
-            load_model(model)
-
-
-def edit(folder, **changes):
-    record = json.loads((folder / "model.json").read_text())
-    (folder / "model.json").write_text(json.dumps({**record, **changes}))
+    RECORD: [
+        b"",
+        b"[" * 200_000,
+        b'{"a":' * 100_000,
+        b'{"format": ' + b"9" * 100_000 + b"}",
+        b'{"format": 1e999}',
+        b'{"format": NaN}',
+        b'{"format": 1, "format": 2}',
+        b'{"format": 1}',
+        b"[]",
+        b"\xff\xfe\x00",
+        b" " * (2 << 20),
+    ],
+}
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (b"[" * 200_000, "JSON"),
-        (b'{"a":' * 100_000, "JSON"),
-        (b'{"format": ' + b"9" * 100_000 + b"}", "JSON"),
-        (b'{"format": 1e999}', "too large a number"),
-        (b'{"format": NaN}', "NaN is no JSON number"),
-        (b'{"format": 1, "format": 2}', "'format' is there twice"),
-        (b'{"format": 1}', "does not describe"),
-        (b"[]", "must hold a JSON object"),
-        (b"\xff\xfe\x00", "JSON"),
-        (b" " * (2 * MEGABYTE), "must have at most 1048576 bytes"),
-    ],
-    ids=range(10),
+    ("name", "number"), [(name, i) for name in CONTENTS for i in range(len(CONTENTS[name]))]
 )
-def test_json_that_is_none_is_refused(content, reason, model):
-    (model / "model.json").write_bytes(content)
-    with pytest.raises(BadFileError, match=reason):
-        load_model(model)
+def test_content_that_is_none_is_refused(name, number, model):
+    (model / name).write_bytes(CONTENTS[name][number])
+    check_refused(model, name)
 
 
-HUGE = [
-    {"policy_kwargs": {"net_arch": [50_000, 50_000]}},
-    {"policy_kwargs": {"net_arch": [3_000_000_000]}},
-    {"policy_kwargs": {"net_arch": [8] * 30_000}},
-    {"policy_kwargs": {"n_critics": 10**9, "net_arch": [8]}},
-]
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": 99},
+        {"algorithm": "os.system"},
+        {"policy": "CnnPolicy2"},
+        {"hyperparameters": {"policy_kwargs": {"net_arch": "a lot"}}},
+        {"hyperparameters": {"tensorboard_log": "x"}},
+        {"hyperparameters": {"learning_rate": {"kind": "eval"}}},
+        *({"env": {"id": name, "kwargs": {}}} for name in ("../../etc/passwd", "os:system", "", None, ["x"])),
+        {"env": {"id": ENV, "kwargs": {"nothing": 1}}},
+        {"env": None},
+        {"num_timesteps": "many"},
+    ],
+)
+def test_a_record_of_something_else_is_refused(change, model):
+    edit(model, **change)
+    check_refused(model, RECORD)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda arrays, name: {**arrays, name: arrays[name][:-1]},
+        lambda arrays, name: {**arrays, name: np.full_like(arrays[name], np.nan)},
+        lambda arrays, name: {**arrays, name: arrays[name].astype(np.float64)},
+        lambda arrays, name: {**arrays, "../more": np.zeros(3, np.float32)},
+        lambda arrays, name: {each: array for each, array in arrays.items() if each != name},
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(spoil, model):
+    arrays = load_file(model / WEIGHTS)
+    save_file(spoil(arrays, sorted(arrays)[0]), model / WEIGHTS)
+    check_refused(model, WEIGHTS)
 
 
 def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(model):
-    record = json.loads((model / "model.json").read_text())
+    record = json.loads((model / RECORD).read_text())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for change in HUGE:
+    for change in (
+        {"policy_kwargs": {"net_arch": [50_000, 50_000]}},
+        {"policy_kwargs": {"net_arch": [3_000_000_000]}},
+        {"policy_kwargs": {"net_arch": [8] * 30_000}},
+        {"policy_kwargs": {"n_critics": 10**9, "net_arch": [8]}},
+    ):
         edit(model, hyperparameters={**record["hyperparameters"], **change})
-        with pytest.raises(BadFileError, match=r"larger networks|allocate memory"):
-            load_model(model)
+        check_refused(model, RECORD)
     edit(model, hyperparameters={**record["hyperparameters"], "buffer_size": 10**15})
     load_model(model)  # to decide, it needs no buffer
     for kwargs in (
@@ -193,40 +217,36 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
         {"threads": 10**6},
     ):
         edit(model, **{**record, "env": {"id": ENV, "kwargs": kwargs}})
-        with pytest.raises(BadFileError, match="may be at most"):
-            load_model(model)
-    for name in ("weights.safetensors", "model.json"):
+        check_refused(model, RECORD)
+    edit(model, **{**record, "env": {"id": ENV, "kwargs": {}, "candidates": 10**9}})
+    check_refused(model, RECORD)
+    for name in (WEIGHTS, RECORD):
         with (model / name).open("r+b") as file:
             file.truncate(1 << 40)  # takes no room on the disk
-        with pytest.raises(BadFileError, match=f"{name}: must have at most"):
-            load_model(model)
+        check_refused(model, name)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
 
 
-def test_a_single_flipped_bit_is_noticed(model):
-    path = model / "weights.safetensors"
-    content = bytearray(path.read_bytes())
+@pytest.mark.parametrize("name", [RECORD, WEIGHTS])
+def test_what_is_cut_damaged_missing_or_would_be_read_for_ever_is_refused(name, model):
+    content = bytearray((model / name).read_bytes())
+    (model / name).write_bytes(content[: len(content) // 2])
+    check_refused(model, name)
     content[-3] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(BadFileError, match="is damaged"):
-        load_model(model)
-
-
-@pytest.mark.parametrize("name", ["model.json", "weights.safetensors"])
-def test_what_would_be_read_for_ever_is_refused(name, model):
+    (model / name).write_bytes(content)
+    check_refused(model, name)
     (model / name).unlink()
+    check_refused(model, name)
     os.mkfifo(model / name)
-    with pytest.raises(BadFileError, match=f"{name}: is no regular file"):
-        load_model(model)
+    check_refused(model, name)
     (model / name).unlink()
     (model / name).symlink_to("/dev/zero")
-    with pytest.raises(BadFileError, match=f"{name}: is no regular file"):
-        load_model(model)
+    check_refused(model, name)
 
 
 def test_a_newer_format_says_which_version_wrote_it(model):
     edit(model, format=9, viapoint="7.1.0")
-    with pytest.raises(BadFileError, match=r"must have format 1, got 9; it was written by viapoint 7\.1\.0"):
+    with pytest.raises(BadFileError, match=r"7\.1\.0"):
         load_model(model)
 
 
@@ -251,41 +271,33 @@ def forged(checkpoint, folder, change):
     (folder / "state.json").write_text(json.dumps(state))
 
 
-FORGERIES = {
-    "another format": (lambda state, arrays: state.update(format=3), "must have format 1 or 2"),
-    "no model": (lambda state, arrays: state.pop("model"), "must have format"),
-    "no counters": (lambda state, arrays: state.pop("counters"), "'counters'"),
-    "a missing tensor": (lambda state, arrays: arrays.pop("buffer/arrays/rewards"), "rewards"),
-    "no random state": (lambda state, arrays: state["random"].update(numpy={}), "does not fit"),
-    "a row beyond": (lambda state, arrays: state["buffer"].update(pos=10**9), "no row 1000000000"),
-    "other shapes": (
-        lambda state, arrays: arrays.update({"buffer/arrays/rewards": np.zeros((8, 9), np.float32)}),
-        "rewards of the replay buffer must fit",
-    ),
-    "another environment": (lambda state, arrays: state["env"].update(generators=[]), "does not fit"),
-    "nothing besides": (lambda state, arrays: state.pop("extra"), "'extra'"),
-    "another algorithm": (lambda state, arrays: state["model"].update(algorithm="ppo"), "of another model"),
-}
-
-
-def test_the_checkpoint_itself_is_good(env, checkpoint, tmp_path):
+def test_the_checkpoint_itself_is_good_and_a_changed_number_is_noticed(env, checkpoint, tmp_path):
     forged(checkpoint, tmp_path, lambda state, arrays: None)
     assert read_checkpoint(new(env), tmp_path) == {"curve": []}
-
-
-@pytest.mark.parametrize("name", FORGERIES)
-def test_a_forged_checkpoint_is_refused(name, env, checkpoint, tmp_path):
-    change, reason = FORGERIES[name]
-    forged(checkpoint, tmp_path, change)
-    with pytest.raises(BadFileError, match=reason):
+    content = (tmp_path / "state.json").read_text()
+    changed = content.replace('"num_timesteps": 16', '"num_timesteps": 17')
+    assert changed != content
+    (tmp_path / "state.json").write_text(changed)
+    with pytest.raises(BadFileError):
         read_checkpoint(new(env), tmp_path)
 
 
-def test_a_number_changed_in_a_state_is_noticed(env, checkpoint, tmp_path):
-    for name, content in checkpoint.items():
-        (tmp_path / name).write_bytes(content)
-    changed = checkpoint["state.json"].replace(b'"num_timesteps": 16', b'"num_timesteps": 17')
-    assert changed != checkpoint["state.json"]
-    (tmp_path / "state.json").write_bytes(changed)
-    with pytest.raises(BadFileError, match="is damaged"):
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state, arrays: state.update(format=3),
+        lambda state, arrays: state.pop("model"),
+        lambda state, arrays: state.pop("counters"),
+        lambda state, arrays: state.pop("extra"),
+        lambda state, arrays: state["random"].update(numpy={}),
+        lambda state, arrays: state["buffer"].update(pos=10**9),
+        lambda state, arrays: state["env"].update(generators=[]),
+        lambda state, arrays: state["model"].update(algorithm="ppo"),
+        lambda state, arrays: arrays.pop("buffer/arrays/rewards"),
+        lambda state, arrays: arrays.update({"buffer/arrays/rewards": np.zeros((8, 9), np.float32)}),
+    ],
+)
+def test_a_forged_checkpoint_is_refused(change, env, checkpoint, tmp_path):
+    forged(checkpoint, tmp_path, change)
+    with pytest.raises(BadFileError):
         read_checkpoint(new(env), tmp_path)

@@ -4,10 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.envs import Sphere
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-from viapoint.envs.registration import REPLANNING_TASKS, TASKS
-from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS, make_method
+from viapoint.envs.registration import REPLANNING_TASKS
+from viapoint.training.planners.baselines import factory
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.search import geometry_search
@@ -28,6 +27,7 @@ PLANE, WHOLE_ARM, PANDA = (
 AMONG_OBSTACLES = (PLANE, WHOLE_ARM, PANDA)
 SHARES = np.linspace(0.0, 1.0, 33)
 MARGINS = (0.001, 0.001)
+SHAPES = ("capsule", "box", "cylinder")
 
 
 def made(env_id, number=16, **kwargs):
@@ -75,18 +75,6 @@ def test_planned_movements_are_those_of_the_environment(env_id, n_via, timing):
     np.testing.assert_allclose(found.log_jerk, np.log(jerk), atol=1e-4)
 
 
-@pytest.mark.parametrize("at_end", [-1.0, 1.0])
-def test_a_via_point_on_an_end_is_a_straight_movement(at_end):
-    env, observation = made(PLANE, 8)
-    distance = np.linalg.norm(env.scenes.goal - env.scenes.start, axis=-1)
-    actions = np.zeros((8, 1, 3), dtype=np.float32)
-    actions[:, 0, 0] = at_end * 0.5 * distance / env.task.action.via_scale[0]
-    straight = plan_movements(observation, np.zeros_like(actions), env.task, SHARES)
-    found = plan_movements(observation, actions, env.task, SHARES)
-    assert np.isfinite(found.path).all()
-    np.testing.assert_allclose(found.path, straight.path, atol=1e-3)
-
-
 @pytest.mark.parametrize("env_id", REPLANNING_TASKS)
 @pytest.mark.parametrize("decisions", [0, 2])
 def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, decisions):
@@ -102,7 +90,12 @@ def test_planned_movements_on_the_way_are_those_that_will_be_commanded(env_id, d
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "tolerance"),
-    [(PLANE, {}, 5e-4), (WHOLE_ARM, {}, 5e-4), (PANDA, {"shapes": "capsule"}, 5e-4), (PANDA, {}, 1e-3)],
+    [
+        (PLANE, {}, 5e-4),
+        (WHOLE_ARM, {}, 5e-4),
+        (PANDA, {"shapes": "capsule"}, 5e-4),
+        *((env_id, {"shapes": SHAPES}, 1.5e-3) for env_id in AMONG_OBSTACLES),
+    ],
 )
 def test_clearance_is_that_of_many_instants(env_id, kwargs, tolerance):
     number, tried = 24, 12
@@ -275,18 +268,10 @@ def test_the_search_succeeds(env_id, name, number, least):
     every = load("validation", env_id).scenes
     scenes = every.take(np.linspace(0, len(every.start) - 1, number).astype(int))
     simulation = new_simulation(env_id, number, threads=1)
-    method = (REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS)[name](simulation)
-    assert method.name == f"search, {name.removeprefix('search')} checks"
+    method = factory(name, env_id)(simulation)
     done = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
     assert done.success.mean() >= least
     simulation.close()
-
-
-@pytest.mark.parametrize("env_id", [*TASKS, *REPLANNING_TASKS])
-def test_it_is_a_method_of_every_task(env_id):
-    method = make_method("search16", env_id, num_envs=2, threads=1)
-    _, observation = made(env_id, 2)
-    assert method.decide(observation, None).shape == (2, method.task.action.size)
 
 
 @pytest.mark.parametrize("timing", ["optimal", "learned"])
@@ -306,14 +291,6 @@ def test_movements_take_the_time_of_the_greatest_reward(duration, component):
     actions = GeometrySearch(env.task, 16).decide(observation)
     np.testing.assert_allclose(actions[:, 2], component, atol=1e-6)
     assert (GeometrySearch(env.task, 1).decide(observation) == 0.0).all()
-
-
-def test_a_refinement_is_around_plans_that_are_worth_something():
-    actions, merits = np.arange(12.0).reshape(2, 3, 2), np.array([[-np.inf, 1.0, -np.inf], [1.0, 2.0, 3.0]])
-    best, value = geometry_search.best_actions(actions, merits)
-    np.testing.assert_array_equal(best[0], np.repeat(actions[0, 1:2], 3, axis=0))
-    np.testing.assert_array_equal(best[1], actions[1, ::-1])
-    np.testing.assert_array_equal(value[1], [3.0, 2.0, 1.0])
 
 
 def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
@@ -343,22 +320,6 @@ def test_a_plan_that_stays_clear_is_kept():
     assert (actions[blocked] != 0.0).any(axis=-1).all()
 
 
-def test_a_plan_from_coordinates_is_that_of_the_observation():
-    env = gym.make(PLANE).unwrapped
-    start, goal, rows = (
-        (-0.2, 0.3),
-        (0.1, 0.4),
-        [(-0.05, 0.35, 0.0, 0.0, 0.03), (0.05, 0.45, 0.02, 0.0, 0.01)],
-    )
-    observation, _ = env.reset(options={"start": start, "goal": goal, "obstacles": rows})
-    search = GeometrySearch(PLANE, 128)
-    plan, (action, _) = search.plan(start, goal, rows), search.predict(observation)
-    np.testing.assert_allclose(search.task.action.encode(plan), action, atol=1e-5)
-    np.testing.assert_allclose(plan.waypoints[[0, -1]], [start, goal])
-    *_, info = env.step(action)
-    assert info["is_success"]
-
-
 def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
     search = GeometrySearch("viapoint/PlanarReach-v0", 32)
     for nothing in (None, [], np.zeros((0, 5))):
@@ -366,35 +327,3 @@ def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
         np.testing.assert_allclose(plan.waypoints[1], np.mean([(-0.2, 0.3), (0.1, 0.4)], axis=0))
     many = [(-0.05, 0.35, 0.0, 0.0, 0.03)] + [(0.5, 0.1 * i, 0.0, 0.0, 0.01) for i in range(9)]
     assert abs(search.plan((-0.2, 0.3), (0.1, 0.4), many).waypoints[1] - (-0.05, 0.35)).max() > 0.03
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"start": (0.1, 0.2, 0.3)}, r"start must have shape \(2,\), got \(3,\)"),
-        ({"goal": (np.nan, 0.4)}, "goal must be finite"),
-        ({"goal": "there"}, "goal must be numbers"),
-        ({"goal": (0.9, 0.4)}, r"goal \(0.9, 0.4\) m is .* out of the arm's reach"),
-        ({"goal": (-0.2, 0.3)}, "start and goal are 0.0000 m apart; at least 0.02 m"),
-        ({"obstacles": [(0.0, 0.3, 0.1)]}, r"obstacles must have shape \(n, 5\), got \(1, 3\)"),
-        ({"obstacles": [(0.0, np.inf, 0.0, 0.0, 0.1)]}, "obstacle 0 must be finite"),
-        ({"obstacles": [(0.0, 0.3, 0.0, 0.0, 0.5)]}, "has a radius over 0.1 m"),
-        ({"obstacles": [(-0.2, 0.3, 0.0, 0.0, 0.02)]}, "obstacle 0 .* touches the arm at the start"),
-        (
-            {"obstacles": [Sphere(0.02, position=(-0.2, 0.3, 0.0), name="can")]},
-            "obstacle 0 'can' .* touches the arm",
-        ),
-    ],
-)
-def test_what_cannot_be_planned_is_refused(given, message):
-    search = GeometrySearch(PLANE, 8)
-    with pytest.raises(ValueError, match=message):
-        search.plan(**{"start": (-0.2, 0.3), "goal": (0.1, 0.4), **given})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("n_checks", 0), ("n_checks", 1.5), ("refinements", -1), ("per_round", True)]
-)
-def test_numbers_out_of_range_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be a whole number"):
-        GeometrySearch(PLANE, **{name: value})

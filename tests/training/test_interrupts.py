@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import resource
 import signal
 import subprocess
@@ -15,7 +14,7 @@ import pytest
 from viapoint.training.algorithms.model_io import load_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.io.files import BadFileError, read_arrays, versions, write_json
 from viapoint.training.runs import run_dir
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train
@@ -72,13 +71,12 @@ def test_ctrl_c_in_training_saves_and_leaves_and_nobody_else_gets_in(start, tmp_
     for words in (["--resume"], []):
         with pytest.raises(SystemExit):
             cli.main(["train", "--out", str(folder), *words])
-    refused = capsys.readouterr().err.splitlines()
-    assert f"is in use by the process with number {process.pid}" in refused[0]
-    assert "holds a run already" in refused[1]
+    in_use, another = capsys.readouterr().err.splitlines()
+    assert str(process.pid) in in_use
+    assert "--resume" in another
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=PATIENCE)
+    process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert "all is saved" in told
     run = Run(folder)
     assert load_model(folder / "final").num_timesteps == run.decisions > 64
     before = run.decisions
@@ -101,7 +99,6 @@ def test_ctrl_c_in_an_evaluation_leaves_what_is_finished_and_says_that_it_is_par
     process.send_signal(signal.SIGINT)
     process.wait(PATIENCE)
     assert process.returncode == 130
-    assert "the results are partial" in process.stderr.read()
     record = json.loads(out.read_text())
     assert record["partial"] is True
     assert record["methods"]["straight line"]["scenes"] == 40
@@ -111,19 +108,10 @@ def test_ctrl_c_in_an_evaluation_leaves_what_is_finished_and_says_that_it_is_par
 
 def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipped):
     run = train(config(tmp_path / "run", n_timesteps=32))
-    words = [
-        "evaluate",
-        str(run.folder),
-        "--env",
-        ENV,
-        "--baselines",
-        "straight",
-        "random",
-        "--n-scenes",
-        "4",
-    ]
+    words = ["evaluate", str(run.folder), "--baselines", "straight", "random", "--n-scenes", "4"]
     cli.main(words)
-    whole = (run.folder / "evaluations" / "test.first-4.json").read_text()
+    kept = run.folder / "evaluations"
+    whole = (kept / "test.first-4.json").read_text()
 
     def interrupted(self, observation, scenes):
         raise KeyboardInterrupt
@@ -132,10 +120,8 @@ def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipp
     with pytest.raises(SystemExit) as end:
         cli.main(words)
     assert end.value.code == 130
-    assert (run.folder / "evaluations" / "test.first-4.json").read_text() == whole
-    assert (
-        json.loads((run.folder / "evaluations" / "test.first-4.partial.json").read_text())["partial"] is True
-    )
+    assert (kept / "test.first-4.json").read_text() == whole
+    assert json.loads((kept / "test.first-4.partial.json").read_text())["partial"] is True
 
 
 @pytest.fixture
@@ -147,34 +133,24 @@ def full_disk():
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_stops_training_with_the_reason_and_keeps_what_was_there(full_disk, tmp_path):
-    with pytest.raises(
-        TrainingFailedError, match=r"cannot go on: .*tensors\.safetensors.*keeps.*--resume"
-    ) as error:
+def test_a_full_disk_stops_training_and_keeps_what_was_there(full_disk, tmp_path):
+    with pytest.raises(TrainingFailedError, match=r"tensors\.safetensors.*--resume") as error:
         train(config(tmp_path / "run"))
     assert error.value.__cause__.errno in (errno.EFBIG, errno.ENOSPC)
     run = Run(tmp_path / "run")
-    kept = run.checkpoints()
     assert 0 < run.decisions < 320
     assert not list(run.folder.rglob(".*.part"))
     full_disk()  # there is room again
-    assert run.restore(runs_model(run))[1] == []
-    resumed, whole = (
-        train(TrainConfig(out=run.folder, resume=True, progress=False)),
-        train(config(tmp_path / "whole")),
-    )
-    assert kept
-    for name, array in read_arrays(whole.folder / "final" / "weights.safetensors").items():
-        np.testing.assert_array_equal(
-            read_arrays(resumed.folder / "final" / "weights.safetensors")[name], array
-        )
+    resumed = train(TrainConfig(out=run.folder, resume=True, progress=False))
+    whole = train(config(tmp_path / "whole"))
+    same_arrays(*(each.folder / "final" / "weights.safetensors" for each in (resumed, whole)))
 
 
-def runs_model(run):
-    from viapoint.training.rollouts.vec_env import ViaVecEnv
-    from viapoint.training.runs.trainer import new_model
-
-    return new_model(run.config, ViaVecEnv(run.config.env, run.config.copies, threads=1))
+def same_arrays(one, other):
+    one, other = read_arrays(one), read_arrays(other)
+    assert set(one) == set(other)
+    for name, array in one.items():
+        np.testing.assert_array_equal(array, other[name], err_msg=name)
 
 
 def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):
@@ -182,16 +158,13 @@ def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):
     whole = train(config(tmp_path / "whole", n_timesteps=128))
     train(config(tmp_path / "halves", n_timesteps=64))
     halves = train(TrainConfig(out=tmp_path / "halves", resume=True, n_timesteps=128, progress=False))
-    one, other = (read_arrays(run.checkpoints()[-1] / "tensors.safetensors") for run in (whole, halves))
-    assert set(one) == set(other)
-    for name, array in one.items():
-        np.testing.assert_array_equal(array, other[name], err_msg=name)
+    same_arrays(*(run.checkpoints()[-1] / "tensors.safetensors" for run in (whole, halves)))
 
 
 def test_a_start_that_got_no_further_can_be_repeated(tmp_path):
     folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("lock", "lock.pid", "versions.json", f".config.json.{32 * 'a'}.part"):
+    write_json(folder / "versions.json", versions())
+    for name in ("lock", "lock.pid", f".config.json.{32 * 'a'}.part"):
         (folder / name).write_text("")
     assert Run.create(config(folder)).decisions == 0
     assert (folder / "config.json").is_file()
@@ -207,7 +180,7 @@ def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
         Run.create(config(path, seed=1))
 
     monkeypatch.setattr(run_dir, "check_free", slow)
-    with pytest.raises(BadFileError, match="holds a run already"):
+    with pytest.raises(BadFileError):
         Run.create(config(folder, seed=2))
     assert Run(folder).config.seed == 1
 
@@ -216,9 +189,8 @@ def test_other_versions_are_told(tmp_path, capsys):
     run = train(config(tmp_path / "run", n_timesteps=32))
     (run.folder / "versions.json").write_text(json.dumps({**run.versions, "mujoco": "3.3.0"}))
     train(TrainConfig(out=run.folder, resume=True, n_timesteps=64, progress=False))
-    assert "began with mujoco 3.3.0 (now" in capsys.readouterr().err
+    assert "mujoco 3.3.0" in capsys.readouterr().err
     (run.folder / "versions.json").write_text(json.dumps({"viapoint": "7.2.0"}))
     (run.folder / "config.json").write_text(json.dumps({"colour": "red"}))
-    with pytest.raises(BadFileError, match=r"written by viapoint 7\.2\.0"):
+    with pytest.raises(BadFileError, match=r"7\.2\.0"):
         Run(run.folder)
-    assert os.path.exists(run.folder / "final" / "model.json")

@@ -5,7 +5,6 @@ import socket
 from pathlib import Path
 
 import gymnasium as gym
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -26,15 +25,10 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import load_agent
 from viapoint.training.algorithms.agent import SAC
 from viapoint.training.cli import main as cli
-from viapoint.training.config.checks import SHIPPED_IDS
-from viapoint.training.io.mp4 import write_mp4
-from viapoint.training.live import drawing, movements, obstacle_editing, playback
+from viapoint.training.live import drawing, movements, obstacle_editing
 from viapoint.training.live.decisions import APART, plan_by_hand
 from viapoint.training.live.page import LivePage, is_loopback
-from viapoint.training.live.scene_draws import (
-    benchmark_problems,
-    scene_kinds,
-)
+from viapoint.training.live.scene_draws import benchmark_problems, scene_kinds
 from viapoint.training.live.scene_file import LiveScene, from_json, to_json, to_python
 from viapoint.training.live.setting import Setting, Shared
 from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -91,7 +85,6 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
         segments = movements.execute_whole(env, scene, decision.chosen.plan)
     (*_, last) = segments
     assert last.info["is_success"][0]
-    assert "Success" in movements.describe_outcome({name: v[0] for name, v in last.info.items()})
     paths = np.array([each.path() for each in proposals])
     for i, j in np.argwhere(~np.eye(len(paths), dtype=bool)):
         assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * APART
@@ -161,9 +154,7 @@ def test_a_dragged_goal_is_reached_without_a_jump():
 def test_methods_are_compared_in_a_scene(shared):
     some = shared(PLANAR)
     scene, _ = some.scene_kinds()["Hard"]()
-    scene = scene.with_shapes(("capsule",))
-    results = {name: result() for name, result in some.own.compare(scene)}
-    assert list(results) == ["straight", "geometry search", "planner"]
+    results = {name: result() for name, result in some.own.compare(scene.with_shapes(("capsule",)))}
     assert not results["straight"].success
     assert results["planner"].success
     assert results["straight"].jerk_ratio == pytest.approx(1.0)
@@ -180,17 +171,6 @@ def test_sizes_of_obstacles_are_set_and_read(d, radius, length, heading, elevati
     for name in ("half-length", *values):
         row = obstacle_editing.resized(row, name, values[name])
     assert obstacle_editing.sizes_of(row) == pytest.approx(values, abs=1e-6)
-
-
-def test_films_have_every_frame(tmp_path):
-    frames = [np.full((48, 64, 3), 40 * k, dtype=np.uint8) for k in range(5)]
-    path = tmp_path / "film.mp4"
-    assert write_mp4(path, frames, 25.0) == 5
-    number, seconds = imageio_ffmpeg.count_frames_and_secs(path)
-    assert number == 5
-    assert seconds == pytest.approx(0.2, abs=0.05)
-    with pytest.raises(ValueError, match="at least one frame"):
-        playback.Playback(None, None, None).film(iter(()), 1.0, print)
 
 
 @pytest.mark.parametrize(
@@ -226,10 +206,6 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
     for mine, theirs in zip(*map(ve.obstacles_from_rows, (again.obstacles, scene.obstacles)), strict=True):
         np.testing.assert_allclose(mine.distance(points), theirs.distance(points), atol=1e-9)
     assert len(again.obstacles) > number
-    names = {}
-    drawn = scene._replace(obstacles=scene.obstacles[:number])
-    exec(to_python(drawn, env_id, {"shapes": shapes}, changing=False), names)
-    assert names["env"].observation_space.contains(names["observation"])
     env.close()
 
 
@@ -276,7 +252,7 @@ def test_an_arm_of_ones_own_is_drawn_from_its_file():
         away.append(np.linalg.norm(np.concatenate(corners, axis=1).T - hand, axis=-1).min())
     assert max(away) < 0.08
     np.testing.assert_allclose(away, away[0], atol=1e-6)  # the hand does not move in its link
-    with pytest.raises(ValueError, match="cannot be drawn"):
+    with pytest.raises(ValueError):
         drawing.ArmDrawing(arm, arm.compile(0, True), file.with_name("index.md"))
 
 
@@ -306,34 +282,6 @@ def test_python_code_sets_the_scene_up(env_id, shared):
     assert isinstance(names["gym"].spec(env_id), gym.envs.registration.EnvSpec)
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"format": "other"}, "viapoint-scene"),
-        ({"start": [0.1]}, "start of the scene file"),
-        ({"goal": [0.1, float("nan")]}, "goal of the scene file"),
-        ({"goal": None}, "goal of the scene file"),
-        ({"obstacles": 3}, "must be a list"),
-        ({"obstacles": [3]}, "obstacle 0 of the scene file"),
-        ({"obstacles": [{"shape": "cube"}]}, "unknown shape 'cube'"),
-        ({"obstacles": [{"shape": "sphere", "radius": "x"}]}, "obstacle 0 of the scene file"),
-        ({"obstacles": [{"shape": "sphere", "radius": -1.0}]}, "radius must be greater than 0"),
-        (
-            {"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 1]]}]},
-            "obstacle 0 'point_cloud point 0': sphere must lie",
-        ),
-        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "position": [0, 0, 1]}]}, "plane, with z = 0"),
-        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": [1]}]}, "courses of the scene file"),
-        ({"obstacles": [{"shape": "sphere", "radius": 0.1, "course": 1}]}, "courses of the scene file"),
-        ({"jumps": [[1.0]]}, "jumps"),
-    ],
-)
-def test_bad_scene_files_are_named(change, reason):
-    record = {"format": "viapoint-scene", "start": [0.1, 0.2], "goal": [0.2, 0.3], "obstacles": []}
-    with pytest.raises(ValueError, match=reason):
-        from_json(json.dumps({**record, **change}), dimension=2)
-
-
 def test_scene_files_are_exact_and_keep_names_and_courses():
     """The page writes what `scene_from_json` reads, and reads the files of earlier versions."""
     ball = {"shape": "sphere", "radius": 0.1 / 3.0, "position": [-0.05, 0.35, 0.0], "name": "ball"}
@@ -361,47 +309,34 @@ def test_scene_files_are_exact_and_keep_names_and_courses():
         from_json(ve.scene_to_json(env.batch.scenes.as_options()), 2), of_env, strict=True
     ):
         np.testing.assert_array_equal(mine, theirs)
-    with pytest.raises(ValueError, match="obstacles of the scene file must be numbers"):
-        from_json(json.dumps({**old, "obstacles": [[0.1, 0.2]]}), dimension=2)
 
 
-def test_text_that_is_no_json_is_named():
-    for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20)):
-        with pytest.raises(ValueError, match="scene file"):
-            from_json(text, dimension=2)
+def test_the_page_is_private_unless_one_says_otherwise():
+    assert all(map(is_loopback, ("127.0.0.1", "127.8.8.8", "::1", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.0.1", "example.org")))
+    with LivePage(env=PLANAR, port=0) as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        assert page._server.request_share_url() is None
 
 
-def failure(capsys, *words):
-    with pytest.raises(SystemExit) as end:
-        cli.main(["live", *words])
-    assert end.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
-def test_bad_input_is_said_in_one_line(capsys, tmp_path):
+def test_what_cannot_be_served_is_refused(capsys, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        assert f"127.0.0.1:{port}" in failure(capsys, "--port", port)
-    assert "no such folder" in failure(capsys, str(tmp_path / "none"))
-    assert "from 0 to 65535" in failure(capsys, "--port", "70000")
-    assert "cannot listen on 203.0.113.7" in failure(capsys, "--host", "203.0.113.7", "--port", "0")
-    with pytest.raises(ValueError, match="decides in"):
-        LivePage(PLANAR, env=PANDA, port=0)
-
-
-def test_only_loopback_addresses_are_private():
-    assert all(map(is_loopback, ("127.0.0.1", "127.8.8.8", "::1", "localhost")))
-    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.0.1", "example.org")))
-
-
-def test_the_page_never_asks_for_a_public_address():
-    with LivePage(env=PLANAR, port=0) as page:
-        assert page.url.startswith("http://127.0.0.1:")
-        assert page._server.request_share_url() is None
-    assert PLANAR in SHIPPED_IDS
+        for words, named in (
+            (["--port", port], port),
+            ([str(tmp_path / "none")], "none"),
+            (["--host", "203.0.113.7", "--port", "0"], "203.0.113.7"),
+        ):
+            with pytest.raises(SystemExit) as end:
+                cli.main(["live", *words])
+            assert end.value.code == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert named in line
+    for call in (lambda: LivePage(PLANAR, env=PANDA, port=0),):
+        with pytest.raises(ValueError):
+            call()
 
 
 def test_scenes_that_exceed_the_environment_of_the_agent_go_to_a_wider_one(shared):
@@ -412,8 +347,8 @@ def test_scenes_that_exceed_the_environment_of_the_agent_go_to_a_wider_one(share
     while len(crowded.obstacles) <= some.own.task.observation.n_rows:
         crowded = crowded.with_obstacle(obstacle_editing.new_obstacle(crowded, "post"))
     boxed = scene.with_obstacle(obstacle_editing.new_obstacle(scene, "box"))
-    for other, limit in ((crowded, "with at most 5 obstacles"), (boxed, "without box obstacles")):
-        assert some.own.limit(other) == limit
+    for other in (crowded, boxed):
+        assert some.own.limit(other)
         wide = some.setting_of(other)
         assert wide is not some.own
         fitted = other.with_shapes(wide.task.scenes.shapes)
@@ -423,7 +358,7 @@ def test_scenes_that_exceed_the_environment_of_the_agent_go_to_a_wider_one(share
         env.close()
     for _ in range(30):
         crowded = crowded.with_obstacle(crowded.obstacles[0])
-    with pytest.raises(ValueError, match="at most 24 obstacles"):
+    with pytest.raises(ValueError):
         some.setting_of(crowded)
 
 
@@ -440,10 +375,3 @@ def test_problems_of_the_benchmark_are_possible_near_its_ends():
             moved = np.linalg.norm(PANDA_ARM.hand_position(np.array(record[f"{name}_joints"])) - end)
             assert moved <= 0.2001
             assert f" {100 * moved:.0f} " in origin
-
-
-def test_only_pages_of_the_panda_have_the_benchmark(shared):
-    kinds = {env_id: set(shared(env_id).scene_kinds()) for env_id in ENV_IDS}
-    assert {env_id for env_id in ENV_IDS if "Benchmark" in kinds[env_id]} == {
-        env_id for env_id in ENV_IDS if "Planar" not in env_id
-    }

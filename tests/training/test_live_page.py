@@ -1,7 +1,6 @@
 """The live page in a real browser: decisions follow what a user does, and errors are said on the page."""
 
 import gc
-import io
 import time
 
 import numpy as np
@@ -11,21 +10,18 @@ pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from browser import Browser, chromium, wait_for
-from PIL import Image
 from viser import transforms
 
 from viapoint.training.live.page import LivePage
 from viapoint.training.live.scene_file import LiveScene, to_json
 
-pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
+pytestmark = [
+    pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine"),
+    pytest.mark.xdist_group("browser"),  # two browsers at once are slow
+]
 
 PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v0"
 MESSAGE = "#viapoint-message"
-HIDE_NOTICES = """
-document.head.append(Object.assign(document.createElement("style"), {
-    textContent: ".mantine-Notifications-root { display: none }"
-}))
-"""
 SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
 """Displacements, [m]."""
 UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
@@ -164,48 +160,6 @@ def test_scenes_that_the_agent_does_not_know_are_searched(opened):
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
 
 
-def test_a_proposal_is_highlighted_under_the_pointer(opened):
-    """All of its path is outlined, and the row of the table under the pointer has another colour."""
-    open_page, open_tab = opened
-    tab, session = open_tab(open_page(PLANAR))
-    settled(session)
-    tab.run(HIDE_NOTICES)  # without a graphics card there may be a notice about it above the scene
-    paths = np.stack([each.path() for each in session._proposals])
-    away = np.linalg.norm(paths[:, :, None, None] - paths, axis=-1).min(axis=-1)
-    away = np.sort(away, axis=-1)[..., 1]  # distances from the other paths
-    away *= [[each.clear and each is not session.proposal] for each in session._proposals]
-    which, where = np.unravel_index(away.argmax(), away.shape)
-    pixels = np.array([on_screen(tab, session, point) for point in paths[which]])
-    alone = away[which] > 0.5 * away[which, where]
-    along = np.gradient(pixels, axis=0)
-    across = along[:, ::-1] * (1.0, -1.0) / np.linalg.norm(along, axis=1, keepdims=True)
-
-    def picture():
-        return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), dtype=int)
-
-    def highlighted():
-        """Return the share of pixels beside the path that have changed, away from other paths."""
-        changed = np.abs(picture() - before).sum(axis=-1) > 30
-        beside = np.stack((pixels + 6.0 * across, pixels - 6.0 * across))[:, alone]
-        x, y = beside.round().astype(int).reshape(-1, 2).T
-        return changed[y, x].mean()
-
-    left, top, width, height = tab.canvas()
-    tab.mouse("Moved", (left + 0.1 * width, top + 0.9 * height))
-    time.sleep(0.3)
-    before = picture()
-    assert highlighted() == 0.0
-    tab.mouse("Moved", pixels[where])
-    wait_for(lambda: highlighted() > 0.9, seconds=10.0)
-
-    row = "document.querySelector('.viapoint-table tbody tr')"
-    colour = f"getComputedStyle({row}).backgroundColor"
-    plain = tab.run(colour)
-    box = tab.run(f"{row}.getBoundingClientRect().toJSON()")
-    tab.mouse("Moved", (box["x"] + 20, box["y"] + 0.5 * box["height"]))
-    wait_for(lambda: tab.run(colour) != plain, seconds=5.0)
-
-
 def test_tabs_are_independent_and_leave_nothing_behind(opened):
     open_page, open_tab = opened
     page = open_page(PLANAR)
@@ -233,7 +187,7 @@ def test_tabs_are_independent_and_leave_nothing_behind(opened):
 def test_a_goal_is_dragged_while_the_arm_moves(opened):
     open_page, open_tab = opened
     tab, session = open_tab(open_page(REPLANNING))
-    for attempt in range(4):  # on a busy machine the movement may be over before the goal is dragged
+    for attempt in range(8):  # on a busy machine the movement may be over before the goal is dragged
         goal = session.scene.goal
         aside = goal + (ASIDE, -ASIDE)[attempt % 2]
         tab.press("button", "Execute")

@@ -1,4 +1,4 @@
-"""What a training tells about itself: the tags of its TensorBoard log, the axes of its learning curve."""
+"""What a training tells about itself: the values of its TensorBoard log, its learning curve, its progress."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.runs import callback
-from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import BANDS
-
-STANDARD = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "time/fps")
-"""Stable-Baselines3's own."""
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +33,6 @@ def log(run):
     return {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
 
 
-def test_every_tag_is_in_the_event_file(log):
-    tags = (*STANDARD, *callback.OUTCOMES, *callback.VALIDATED, *callback.BAND_TAGS.values())
-    assert [tag for tag in tags if tag not in log] == []
-    assert {"train/clearance_loss", "train/arrival_loss", "time/simulated_seconds"} <= set(log)
-
-
 def test_the_log_says_what_the_learning_curve_says(run, log):
     assert [event.step for event in log["validation/success_rate"]] == [0, 64, 128]
     for tag, name in callback.VALIDATED.items():
@@ -54,35 +44,23 @@ def test_the_log_says_what_the_learning_curve_says(run, log):
         assert shown == pytest.approx([record["success_by_band"][band]["rate"] for record in run.curve])
 
 
-def test_rates_are_rates_and_times_are_times(log):
+def test_rates_are_rates_and_times_are_times(run, log):
+    assert {"rollout/success_rate", "train/clearance_loss", *callback.OUTCOMES} <= set(log)
     for tag, events in log.items():
         values = np.array([event.value for event in events])
         if tag.endswith("_rate") or "_rate_" in tag:
             assert ((values >= 0.0) & (values <= 1.0)).all(), tag
         if tag.endswith("duration"):
             assert ((values > 0.5) & (values < 1.3)).all(), tag
-    assert all(event.value > 0.0 for event in log["validation/decision_time"])
-
-
-def test_a_curve_has_decisions_simulated_seconds_and_wall_time(run):
     for record in run.curve:
         assert record["simulated_seconds"] == pytest.approx(0.002 * record["physics_steps"])
     last = run.curve[-1]
     assert 0.6 < last["simulated_seconds"] / last["decisions"] < 1.3  # a movement and its settling
-    assert last["seconds"] > 0.0
 
 
-def test_arguments_of_the_action_leave_the_validation_scenes_as_they_are(shipped, tmp_path):
-    for kwargs, same in (({"n_via": 2, "timing": "learned"}, True), ({"n_obstacles": 2}, False)):
-        run = Run.create(TrainConfig(out=tmp_path / str(same), env_kwargs=kwargs, eval_scenes=8))
-        scenes = callback.validation_scenes(run)
-        assert (scenes.sha256 == shipped.take(slice(0, 8)).sha256) == same
-
-
-def test_the_bar_says_what_learning_waits_for_and_shows_the_last_validation(shipped, tmp_path, capsys):
+def test_the_bar_shows_the_last_validation(shipped, tmp_path, capsys):
     run = train(
         TrainConfig(
-            algo="viaq",
             n_timesteps=64,
             n_envs=32,
             eval_every=32,
@@ -93,17 +71,6 @@ def test_the_bar_says_what_learning_waits_for_and_shows_the_last_validation(ship
             hyperparameters={"learning_starts": 32},
         )
     )
-    shown = capsys.readouterr().err
-    for words in (
-        "viaq on PlanarObstacles-v0",
-        "validating in 4 scenes",
-        "saving a checkpoint",
-        "saving the best model",
-    ):
-        assert words in shown
     success = f"{100.0 * run.curve[-1]['success']['rate']:.1f} %"
-    assert shown.rstrip().splitlines()[-1].count(f"validation={success}")
-    assert repr(run) == (
-        f"Run({str(run.folder)!r}: viaq on viapoint/PlanarObstacles-v0, seed 0, 64 of 64 decisions, success {success} "
-        "on validation scenes)"
-    )
+    assert f"validation={success}" in capsys.readouterr().err.rstrip().splitlines()[-1]
+    assert f"success {success}" in repr(run)

@@ -10,11 +10,10 @@ import pytest
 
 from viapoint.training.cli import main as cli
 from viapoint.training.paper import run
-from viapoint.training.paper.claim import SUBJECTS, Claim, at_least, at_most, near
-from viapoint.training.paper.passage_polynomial import count_roots, passage_polynomial, root_of
-from viapoint.training.paper.profiles import Profile
-from viapoint.training.paper.reference_movements import construction, via_waypoints
+from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper.movements import Profile, construction, via_waypoints
 from viapoint.training.paper.rows import obstacles
+from viapoint.training.paper.rows.curved import count_roots, passage_polynomial, root_of
 from viapoint.training.paper.rows.double_step import double_step, excess_cost
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
@@ -30,7 +29,7 @@ def made(tmp_path_factory):
     every = obstacles.light_scenes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(obstacles, "light_scenes", lambda: every.take(slice(None, None, FEWER)))
-        cli.main(["paper", "--out", str(out), "--guide", str(out / "guide")])
+        cli.main(["paper", "--out", str(out)])
     return out
 
 
@@ -44,22 +43,19 @@ def is_within(value, ends):
 
 
 def test_every_number_is_as_promised(made):
-    for claim in claims_of(made):
+    claims = claims_of(made)
+    assert {claim["row"] for claim in claims} == {*ROWS, 12}
+    for claim in claims:
         numbers = [name for name in ("model", "arm") if claim[name] is not None]
         assert numbers, claim["claim"]
         for name in numbers:
             assert is_within(claim[name], claim[f"{name}_expected"]), claim
         assert claim["verdict"] == "holds"
-        assert (claim["arm"] is None) == (claim["deviation_mm"] is None)
-
-
-def test_all_rows_are_there_and_most_are_carried_out(made):
-    claims = claims_of(made)
-    assert {claim["row"] for claim in claims} == set(SUBJECTS) == {*ROWS, 12}
     carried = [claim for claim in claims if claim["arm"] is not None]
     assert len(carried) > 0.7 * len(claims)
-    usual = [claim["deviation_mm"] for claim in carried if "torque" not in claim["claim"]]
-    assert max(usual) < 1.0
+    assert max(claim["deviation_mm"] for claim in carried if "torque" not in claim["claim"]) < 1.0
+    for drawing in DRAWINGS:
+        assert (made / f"{drawing.name}.png").stat().st_size > 5_000
 
 
 @pytest.mark.parametrize(
@@ -84,35 +80,6 @@ def test_the_model_has_the_values_of_the_mathematics(made, row, words, value, to
     assert claim["model"] == pytest.approx(value, abs=tolerance)
 
 
-def test_the_files_are_complete(made):
-    for drawing in DRAWINGS:
-        for kind in ("png", "svg"):
-            assert (made / f"{drawing.name}.{kind}").stat().st_size > 5_000
-    page = (made / "index.html").read_text()
-    assert page.count("data:image/png;base64,") == len(DRAWINGS)
-    assert not re.search(r'(?:src|href)="(?!data:)', page)
-    table = (made / "table.md").read_text()
-    assert table.count("| holds |") == len(claims_of(made))
-    small = list((made / "guide").glob("paper_*.png"))
-    assert {path.stem for path in small} == {f"paper_{name}" for name in run.GUIDE_FIGURES}
-    assert sum(path.stat().st_size for path in small) < 600_000
-
-
-def test_the_table_beside_the_guide_is_that_of_the_command(made):
-    """Apart from row 12, which has fewer scenes here."""
-    stored = json.loads((GUIDE.parent / "flash-hogan.json").read_text())["claims"]
-    texts = [
-        [(each["row"], each["claim"]) for each in some if each["row"] != 12]
-        for some in (stored, claims_of(made))
-    ]
-    assert texts[0] == texts[1]
-    for one, other in zip(stored, claims_of(made), strict=True):
-        assert one["verdict"] == "holds"
-        for name in ("model", "arm") if one["row"] != 12 else ():
-            assert (one[name] is None) == (other[name] is None)
-            assert (one[name] or 0.0) == pytest.approx(other[name] or 0.0, rel=1e-3, abs=1e-9)
-
-
 def test_the_guide_says_what_the_command_computes(made):
     lines = [
         line.strip("| ").split(" | ") for line in GUIDE.read_text().splitlines() if re.match(r"\| \d", line)
@@ -127,20 +94,6 @@ def test_the_guide_says_what_the_command_computes(made):
             assert float(arm) == pytest.approx(claim["arm"], rel=5e-3)
 
 
-def test_the_pictures_of_the_guide_are_there_and_small():
-    shown = re.findall(r"!\[.+?\]\((images/paper_\w+\.png)\)", GUIDE.read_text())
-    assert {Path(path).stem for path in shown} == {f"paper_{name}" for name in run.GUIDE_FIGURES}
-    assert sum((GUIDE.parent / path).stat().st_size for path in shown) < 600_000
-
-
-def test_row_12_has_at_least_200_scenes():
-    scenes = obstacles.light_scenes()
-    assert len(scenes.start) >= 200
-    assert len(
-        np.unique(np.concatenate((scenes.start, scenes.goal, scenes.obstacles[:, 0]), axis=-1), axis=0)
-    ) == len(scenes.start)
-
-
 def test_a_claim_fails_where_a_number_is_not_as_promised():
     holds = Claim(row=1, claim="x", model=1.0, expected=near(1.0, 0.1), arm=2.0, arm_expected=at_least(2.0))
     assert holds.verdict == "holds"
@@ -149,10 +102,6 @@ def test_a_claim_fails_where_a_number_is_not_as_promised():
             row=1, claim="x", model=model, expected=near(1.0, 0.1), arm=arm, arm_expected=at_least(2.0)
         )
         assert claim.verdict == "FAILS"
-    with pytest.raises(ValueError, match="belong together"):
-        _ = Claim(row=1, claim="x", model=1.0).holds
-    with pytest.raises(ValueError, match="without a number"):
-        _ = Claim(row=1, claim="x", model=None).holds
 
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):

@@ -1,18 +1,13 @@
-"""Laws of learning and measuring where plans are revised: whole episodes, the true course for the planner alone."""
+"""Laws of measuring where plans are revised: whole episodes, the true course for the planner alone."""
 
 import numpy as np
 import pytest
 from scene_sets.replanning import SIZES, solution_shares
 
-from viapoint.training.algorithms.model_io import load_model
-from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.io.files import read_json
 from viapoint.training.planners.baselines import make_method
-from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.scene_set import FrozenScenes, load
+from viapoint.training.rollouts.rollout import EpisodeSimulation
+from viapoint.training.scene_sets.scene_set import load
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
 
@@ -22,11 +17,6 @@ def results(env_id, *names, number=12):
     methods = [make_method(name, env_id) for name in names]
     found = evaluate_methods(methods, frozen, env_id, time_decisions=False).results
     return {name: each.summary()["success"]["rate"] for name, each in zip(names, found, strict=True)}
-
-
-def test_the_trial_is_of_the_kind_that_an_environment_needs():
-    assert isinstance(new_simulation(MOVING, 2), EpisodeSimulation)
-    assert type(new_simulation("viapoint/PlanarReach-v0", 2)) is SceneSimulation
 
 
 def test_the_planner_solves_frozen_scenes_and_straight_movements_do_not():
@@ -73,25 +63,6 @@ def test_shipped_sets_hold_what_they_promise(env_id):
 def test_files_of_changing_scenes_come_back_whole(tmp_path):
     frozen = load("validation", JUMPS).take(slice(0, 3))
     frozen.save(tmp_path / "some.npz")
-    again: FrozenScenes = load(tmp_path / "some.npz", JUMPS)
+    again = load(tmp_path / "some.npz", JUMPS)
     assert again.sha256 == frozen.sha256
     np.testing.assert_array_equal(again.scenes.jumps, frozen.scenes.jumps)
-
-
-def settings(folder, n_timesteps, **changes):
-    hyperparameters = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16, "gamma": 0.99}
-    return TrainConfig(
-        env=MOVING, n_timesteps=n_timesteps, n_envs=16, out=folder, eval_every=0, checkpoint_every=48,
-        hyperparameters={"learning_rate": 1e-3, **hyperparameters}, discount_unit=0.1, progress=False, **changes,
-    )  # fmt: skip
-
-
-def test_training_that_is_taken_up_ends_where_it_would_have(tmp_path):
-    whole = train(settings(tmp_path / "whole", 96))
-    train(settings(tmp_path / "parts", 48))
-    parts = train(TrainConfig(out=tmp_path / "parts", resume=True, n_timesteps=96, progress=False))
-    first, second = (
-        load_model(run.folder / "final").policy.state_dict() for run in (whole, Run(parts.folder))
-    )
-    assert all((first[name] == second[name]).all() for name in first)
-    assert read_json(whole.folder / "final" / "model.json")["discount_unit"] == 0.1

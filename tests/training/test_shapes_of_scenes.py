@@ -8,11 +8,9 @@ from stable_baselines3 import PPO, SAC
 from viapoint.envs import Box, Cylinder, obstacles_from_rows
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.training import GeometrySearch, SceneExtractor, ViaQ, ViaVecEnv
-from viapoint.training.algorithms.sb3_minimum_critic import MinimumCriticSACPolicy
 from viapoint.training.planners.cma_planner import Planner, PlannerBudget
 from viapoint.training.plotting.top_view import widened_outline
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.search.candidates import candidate_actions
 from viapoint.training.search.plan_checks import check_plans
 from viapoint.training.search.planned_movements import take_rows
 
@@ -28,28 +26,6 @@ CAN = Cylinder(0.02, 0.1, position=(0.25, 0.5, 0.0))
 ENDS = {"start": (-0.2, 0.35), "goal": (0.15, 0.35)}
 
 
-@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA])
-def test_computed_clearance_is_that_of_densely_sampled_movements(env_id):
-    envs = gym.make_vec(env_id, num_envs=16, threads=1, shapes=SHAPES).unwrapped
-    observation, _ = envs.reset(seed=0)
-    task, scenes, plans = envs.task, envs.scenes, 8
-    actions = np.broadcast_to(
-        candidate_actions(task, plans, replanning=False), (16, plans, task.action.size)
-    ).astype(np.float64)
-    checks = check_plans(observation, actions, task)
-    for h in range(plans):
-        plan = task.action.decode(actions[:, h], scenes.start, scenes.goal)
-        time = plan.durations.sum(axis=-1)[:, None] * np.linspace(0.0, 1.0, 400)
-        hand = np.asarray(plan.trajectory()(time))
-        dense = task.collision_model.least_clearance(hand, scenes.obstacles, scenes.present)
-        inside = checks.reach_margin[:, h] > 0.0
-        near = inside & (dense > -0.005) & (dense < 0.09)
-        assert np.abs(checks.clearance[:, h] - dense)[near].max(initial=0.0) < 1e-3
-        assert (checks.clearance[:, h][inside & (dense < -0.06)] < -0.05).all()
-        assert (checks.clearance[:, h][inside & (dense > 0.1)] > 0.09).all()
-    envs.close()
-
-
 def test_checks_of_one_plan_are_those_of_a_batch():
     envs = gym.make_vec(PANDA, num_envs=24, threads=1).unwrapped
     observation, _ = envs.reset(seed=2)
@@ -60,15 +36,6 @@ def test_checks_of_one_plan_are_those_of_a_batch():
         for i in range(24)
     ]
     np.testing.assert_allclose(np.concatenate([each.clearance for each in alone]), together, atol=1e-6)
-    envs.close()
-
-
-@pytest.mark.parametrize("env_id", [PLANE, PANDA])
-def test_the_search_solves_random_scenes(env_id):
-    envs = gym.make_vec(env_id, num_envs=16, threads=1, shapes=SHAPES).unwrapped
-    observation, _ = envs.reset(seed=1)
-    info = envs.execute_actions(GeometrySearch(envs.task, 512).decide(observation)).info
-    assert info["is_success"].mean() > 0.9
     envs.close()
 
 
@@ -88,9 +55,7 @@ def test_plans_without_an_environment_are_those_of_an_environment():
     np.testing.assert_allclose(
         agent.plan(**ENDS, obstacles=[WALL, CAN]).waypoints, env.last_plan.waypoints, atol=1e-5
     )
-    with pytest.raises(
-        ValueError, match="obstacle 0: the scenes of this environment have the shapes capsule"
-    ):
+    with pytest.raises(ValueError):
         GeometrySearch(PLANE, 8).plan(**ENDS, obstacles=[WALL])
     env.close()
 
@@ -117,8 +82,7 @@ def test_algorithms_learn_from_rows_of_shapes(env_id):
     for algorithm, settings in ((SAC, {"learning_starts": 8}), (PPO, {"n_steps": 2, "n_epochs": 1})):
         extractor = {"features_extractor_class": SceneExtractor}
         algorithm("MultiInputPolicy", env, batch_size=8, policy_kwargs=extractor, **settings).learn(16)
-    SAC(MinimumCriticSACPolicy, env, learning_starts=8, batch_size=8).learn(16)
-    small = {"candidates": 16, "refinements": 1, "per_refinement": 8, "form": "action", "width": 8}
+    small = {"candidates": 16, "refinements": 1, "per_refinement": 8, "width": 8}
     ViaQ("ViaQPolicy", env, learning_starts=8, batch_size=8, policy_kwargs=small).learn(16)
     env.close()
 

@@ -33,28 +33,6 @@ def test_wilson_solves_the_score_equation(trials):
     assert statistics.wilson(trials, trials).high == 1.0
 
 
-def test_wilson_is_symmetric_and_narrows():
-    left, right = statistics.wilson(3, 40), statistics.wilson(37, 40)
-    assert left.low == pytest.approx(1 - right.high)
-    widths = [np.subtract(*statistics.wilson(n // 2, n)[:0:-1]) for n in (10, 100, 1000)]
-    assert widths[0] > widths[1] > widths[2] > 0
-    assert math.isnan(statistics.wilson(0, 0).estimate)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((5, 4), "must not be greater than n"),
-        ((-1, 4), "not less than 0"),
-    ],
-)
-def test_wilson_refuses_what_cannot_be(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        statistics.wilson(*arguments)
-    with pytest.raises(TypeError, match="must be an integer"):
-        statistics.wilson(1.5, 4)
-
-
 def test_mcnemar_is_the_exact_binomial_test():
     """With the sum over the tail of the binomial distribution as an independent computation."""
     generator = np.random.default_rng(0)
@@ -130,92 +108,7 @@ def test_across_seeds_without_any_spread_is_wilsons():
     assert interval == statistics.wilson(5, 20)
 
 
-def test_probability_of_improvement_is_mann_and_whitneys():
-    from scipy.stats import mannwhitneyu
-
-    generator = np.random.default_rng(6)
-    first, second = generator.integers(0, 6, 5), generator.integers(0, 5, 4)
-    expected = mannwhitneyu(first, second).statistic / 20
-    result = statistics.probability_of_improvement(first, second, np.random.default_rng(0), samples=500)
-    assert result.estimate == pytest.approx(expected)
-    assert result.low < result.estimate < result.high
-    other = statistics.probability_of_improvement(second, first, np.random.default_rng(0), samples=10)
-    assert other.estimate == pytest.approx(1.0 - expected)
-    better = statistics.probability_of_improvement(second + 9, second, np.random.default_rng(0), samples=10)
-    assert better == (1.0, 1.0, 1.0)
-
-
-def test_probability_of_improvement_draws_runs_of_both_methods(monkeypatch):
-    """With two runs each, all 16 draws can be written down."""
-    first, second = np.array([1.0, 3.0]), np.array([2.0, 4.0])
-    draws = sorted(
-        np.mean([[a > b for a in x] for b in y])
-        for x in itertools.product(first, repeat=2)
-        for y in itertools.product(second, repeat=2)
-    )
-    for confidence in (0.5, 0.8):
-        monkeypatch.setattr(statistics, "CONFIDENCE", confidence)
-        _, low, high = statistics.probability_of_improvement(
-            first, second, np.random.default_rng(0), samples=20_000
-        )
-        tail = 0.5 - confidence / 2
-        assert (low, high) == tuple(np.quantile(draws, (tail, 1 - tail), method="inverted_cdf"))
-    monkeypatch.undo()
-    single = statistics.probability_of_improvement([2.0], [1.0, 3.0], np.random.default_rng(0))
-    assert single == (0.5, 0.0, 1.0)
-
-
 def test_spl_by_its_formula():
     assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
         2.5 / 4
     )
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: statistics.mcnemar([True], [True, False]),
-        lambda: statistics.mcnemar([], []),
-        lambda: statistics.interquartile_mean([]),
-        lambda: statistics.across_seeds([1.0], [0], np.random.default_rng(0)),
-        lambda: statistics.across_seeds([[1.0, 0.0]], [0], np.random.default_rng(0)),
-        lambda: statistics.probability_of_improvement([[1.0]], [1.0, 2.0], np.random.default_rng(0)),
-        lambda: statistics.success_weighted_path_length([1], [0.0], [1.0]),
-        lambda: statistics.success_weighted_path_length([1], [1.0, 2.0], [1.0]),
-    ],
-)
-def test_wrong_shapes_are_refused(call):
-    with pytest.raises(ValueError, match="must"):
-        call()
-
-
-def draws():
-    """Every statistic that draws, as a call on scores."""
-    generator = np.random.default_rng(0)
-    return (
-        lambda scores, **kwargs: statistics.across_seeds(
-            [scores], np.zeros(len(scores)), generator, **kwargs
-        ),
-        lambda scores, **kwargs: statistics.probability_of_improvement(scores, scores, generator, **kwargs),
-    )
-
-
-@pytest.mark.parametrize("call", draws())
-def test_no_number_makes_no_result(call):
-    with pytest.raises(ValueError, match="must be numbers, got nan"):
-        call([0.5, math.nan])
-    for samples in (0, -1, 1.5):
-        with pytest.raises(ValueError, match="samples must be a whole number, 1 or more"):
-            call([0.5, 1.0], samples=samples)
-
-
-def test_successes_are_told_from_other_numbers():
-    with pytest.raises(ValueError, match=r"successes must be 0 or 1, got 0\.5"):
-        statistics.mcnemar([0.5, 1.0], [0.0, 1.0])
-    with pytest.raises(ValueError, match="successes must be 0 or 1, got nan"):
-        statistics.mcnemar([0.0, 1.0], [math.nan, 1.0])
-    assert statistics.mcnemar([0.0, 1.0], [0.0, 0.0]) == statistics.mcnemar([False, True], [False, False])
-    with pytest.raises(ValueError, match="got nan"):
-        statistics.interquartile_mean([math.nan])
-    with pytest.raises(ValueError, match="shortest must be more than 0 and finite"):
-        statistics.success_weighted_path_length([1.0], [math.inf], [1.0])

@@ -1,34 +1,19 @@
 """Agents that act in every control step, beside those that decide once."""
 
-import dataclasses
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.training.algorithms.model_io import build, load_model
-from viapoint.training.config.configs import TrainConfig
+from viapoint.training.algorithms.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planners.baselines import Straight, agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.callback import validation_scenes
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import load
 
 STEP, WHOLE = "viapoint/PlanarObstaclesStep-v0", "viapoint/PlanarObstacles-v0"
-SMALL = {"learning_starts": 64, "gradient_steps": 1, "batch_size": 16, "buffer_size": 500}
-
-
-def config(out, **changes):
-    settings = {
-        "env": STEP, "algo": "sac", "out": out, "n_timesteps": 160, "n_envs": 16, "eval_scenes": 8, "eval_every": 80,
-        "hyperparameters": SMALL, "progress": False,
-    }  # fmt: skip
-    return TrainConfig(**{**settings, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -84,26 +69,3 @@ def test_it_stands_in_one_table_with_the_others(model):
     for each in result.results:
         assert each.summary()["scenes"] == 12
     assert set(result.results[1].outcomes) <= set(result.results[0].outcomes)
-
-
-def test_a_run_is_validated_on_the_scenes_of_the_twin_and_resumes_exactly(tmp_path):
-    whole = train(config(tmp_path / "whole", checkpoint_every=10_000))
-    assert validation_scenes(whole).env_id == WHOLE
-    assert [record["decisions"] for record in whole.curve] == [0, 80, 160]
-    train(config(tmp_path / "parts", n_timesteps=80, checkpoint_every=10_000))
-    parts = train(config(tmp_path / "parts", n_timesteps=160, resume=True))
-    assert parts.config.eval_every == 80
-    one, other = (load_model(run.folder / "final").policy.state_dict() for run in (whole, parts))
-    for name, tensor in one.items():
-        np.testing.assert_array_equal(tensor.numpy(), other[name].numpy(), err_msg=name)
-
-
-def test_presets_say_how_often_to_look(tmp_path):
-    for algo, preset in STEP_PRESETS.items():
-        asked = TrainConfig(env=STEP, algo=algo)
-        assert asked.total_timesteps == preset.n_timesteps
-        assert asked.evaluation_interval == preset.eval_every
-        assert asked.checkpoint_interval == preset.checkpoint_every
-        assert dataclasses.replace(asked, eval_every=0).evaluation_interval == 0
-    run = train(config(tmp_path / "run", n_timesteps=16, eval_every=0))
-    assert Run(run.folder).config.checkpoint_every == STEP_PRESETS["sac"].checkpoint_every

@@ -1,381 +1,256 @@
-"""Studies: what a YAML file may say, that nothing is done twice, and that pages hold what was measured."""
+"""Studies: what a file means, what is refused, and that a study which was killed or runs on two nodes ends alike."""
 
-import dataclasses
+import doctest
 import json
+import os
 import re
-import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 import pytest
-from PIL import Image
+import yaml
 
 from viapoint.training import Study, run_study
-from viapoint.training.config.presets import PRESETS
-from viapoint.training.io.files import read_json
-from viapoint.training.study import jobs, run, timing
-from viapoint.training.study.config import rows_of
-from viapoint.training.study.page import effort, fill_tables, render_page, row, shown_bands, table
-from viapoint.training.study.results import gather, unpacked
+from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
+from viapoint.training.study.tables import COLUMNS, markdown
 
-ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
-SMALL = {
+pytestmark = pytest.mark.xdist_group("ray")  # one worker, so that all tests share a Ray and a study
+
+ENV = "viapoint/PlanarObstacles-v0"
+FEW = {"learning_starts": 64, "gradient_steps": 1}
+TRAINING = {
+    "n_timesteps": 256, "n_envs": 32, "eval_every": 64, "eval_scenes": 8, "checkpoint_every": 64,
+    "hyperparameters": FEW, "env_kwargs": {"threads": 1},
+}  # fmt: skip
+GIVEN = {
+    "environments": [ENV],
+    "scenes": ["test"],
+    "n_scenes": 12,
     "seeds": [0, 1],
-    "environments": {ENV: {"n_scenes": 8, "scenes": ["test", "hard"]}},
-    "agents": {
-        "viaq": {
-            "n_timesteps": 64,
-            "eval_scenes": 8,
-            "checks": [0, 4],
-            "untrained": True,
-            "hyperparameters": {"policy_kwargs": {"candidates": 16}},
-        }
-    },
-    "baselines": {
-        "stored": None,
-        "search{checks}": {"method": "search", "grid": {"checks": [16, 32]}},
-        "in-time": {"method": "search", "time_of": "viaq/4"},
-        "search-k{n_via}": {
-            "method": "search",
-            "checks": 16,
-            "scenes": ["test"],
-            "n_scenes": 4,
-            "grid": {"env_kwargs.n_via": [2]},
-        },
-    },
-    "compare": [["viaq", "viaq/untrained"], ["viaq/4", "search16"]],
+    "agents": {"viaq": TRAINING, "sac": {"algo": "sac", **TRAINING}},
+    "baselines": ["straight", "stored"],
 }
 
 
-def study_of(folder, **changes):
-    return Study.from_dict({**SMALL, "out": str(folder), **changes}, name="small")
+def results_in(folder):
+    """Return what may not depend on where and in how many pieces a study ran: weights, successes and curves."""
+    found = {}
+    for path in sorted(folder.glob("PlanarObstacles-v0/*/*/result.json")):
+        record = json.loads(path.read_text())
+        weights = path.parent / "best" / "weights.safetensors"
+        successes = [line["solved"] for line in record["rows"]]
+        found[path.relative_to(folder).as_posix()] = (
+            successes,
+            record.get("curve"),
+            weights.read_bytes() if weights.is_file() else b"",
+        )
+    return found
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study")
-    return folder, run_study(study_of(folder), workers=0)
+def ray():
+    """One Ray for all studies of this process, as each start takes seconds."""
+    ray, _ = _import_libraries()
+    with _connected(None, 2):
+        yield ray
 
 
-def rows(record, env=ENV):
-    return {each["row"]: each for each in record["environments"][env]["rows"]}
+@pytest.fixture(scope="module")
+def whole(ray, tmp_path_factory):
+    """A study that ran through: its folder, table, lines and results."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    told = []
+    table = run_study(Study.from_dict(GIVEN), out=folder, told=told.append)
+    return folder, table, told, results_in(folder)
 
 
-def test_every_row_is_that_of_its_files(done):
-    folder, record = done
-    found = rows(record)
-    modes = ["viaq", "viaq/4", "viaq/untrained", "viaq/untrained/4"]
-    assert list(found) == [*modes, "stored", "search16", "search32", "in-time", "search-k2"]
-    for name in modes:
-        for scenes in ("test", "hard"):
-            mode = name.removeprefix("viaq").strip("/").replace("/", "-") or "alone"
-            runs = [folder / "PlanarObstacles-v0" / "viaq" / f"seed-{seed}" for seed in (0, 1)]
-            files = [read_json(each / "evaluations" / f"{scenes}.{mode}.json") for each in runs]
-            each = [np.mean(file["outcomes"]["is_success"]) for file in files]
-            assert found[name]["sets"][scenes]["each"] == pytest.approx(each)
-        assert found[name]["seeds"] == [0, 1]
-    assert found["stored"]["sets"]["test"]["success"][0] == 1.0
-    assert found["stored"]["sets"]["test"]["jerk"] == [1.0, 1.0, 1.0]
-    assert found["search-k2"]["sets"]["test"]["scenes"] == 4
-    assert found["in-time"]["checks"] >= 4
-    assert all(0.0 < found[name]["decision_time"] < 10.0 for name in (*modes, "search16", "in-time"))
-    assert found["viaq"]["training"]["decisions"] == 64
-    compared = record["environments"][ENV]["compared"]
-    assert "probability" in compared[0]["sets"]["test"]
-    assert set(compared[1]["sets"]["hard"]) == {"difference", "p_values"}
+def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
+    folder, table, told, before = whole
+    assert list(table.columns) == COLUMNS
+    assert len(told) == 7  # how much there is to do; two agents with two seeds each, and two baselines
+    rows = table.set_index("method")
+    assert set(rows.index) == {"viaq", "sac", "straight", "stored"}
+    assert rows.seeds.to_dict() == {"viaq": 2, "sac": 2, "straight": 1, "stored": 1}
+    assert (rows.scenes == 12).all()
+    assert ((rows.low <= rows.success) & (rows.success <= rows.high)).all()
+    assert rows.success["stored"] == 1.0
+    assert rows.success["straight"] == 0.0
+    assert rows.decisions["viaq"] == 256
+    pd.testing.assert_frame_equal(pd.read_csv(folder / "results.csv"), table, check_dtype=False)
+    assert "| straight" in (folder / "results.md").read_text()
+    assert (folder / "PlanarObstacles-v0.png").stat().st_size > 10_000
+    again, lines = run_study(Study.from_dict(GIVEN), out=folder), []
+    pd.testing.assert_frame_equal(again, table, check_dtype=False)
+    assert results_in(folder) == before
+    more = {**GIVEN, "baselines": [*GIVEN["baselines"], "random"]}
+    assert len(run_study(Study.from_dict(more), out=folder, told=lines.append)) == len(table) + 1
+    assert len(lines) == 2
 
 
-def test_the_page_and_the_figures_are_made_of_the_record(done):
-    folder, record = done
-    study = study_of(folder)
-    text = (folder / "results.md").read_text()
-    assert render_page(json.loads((folder / "results.json").read_text()), study.page) == text
-    assert f"{100 * rows(record)['viaq']['sets']['test']['success'][0]:.1f} %" in text
-    pictures = re.findall(r"\((figures/\S+\.png)\)", text)
-    assert pictures == ["figures/results_planar_obstacles.png"]
-    assert (folder / pictures[0]).stat().st_size < 80_000
-    assert np.asarray(Image.open(folder / pictures[0]).convert("L")).std() > 5.0
+def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
+    folder = whole[0]
+    before = results_in(folder)
+    other = {**GIVEN, "agents": {"viaq": {**TRAINING, "hyperparameters": {**FEW, "batch_size": 8}}}}
+    with pytest.raises(StudyFailedError, match="other settings"):
+        run_study(Study.from_dict(other), out=folder)
+    assert results_in(folder) == before
 
 
-def test_a_second_call_does_nothing_again(done, monkeypatch):
-    folder, record = done
-
-    def never(*args, **kwargs):
-        pytest.fail("did again what was done")
-
-    for module, name in ((jobs, "train"), (jobs, "evaluate_methods"), (run, "make_runner")):
-        monkeypatch.setattr(module, name, never)
-    before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
-    assert run_study(study_of(folder), workers=0) == record
-    assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
-
-
-def test_what_is_lost_or_of_something_else_is_measured_again(done):
-    folder, record = done
-    lost = folder / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "test.4.json"
-    before = lost.read_bytes()
-    for content in (None, {**json.loads(before), "weights": "of another agent"}):
-        lost.unlink() if content is None else lost.write_text(json.dumps(content))
-        assert rows(gather(study_of(folder)))["viaq/4"]["seeds"] == [0]
-        assert run_study(study_of(folder), workers=0, only=["evaluate"]) == record
-        assert lost.read_bytes() == before
-
-
-def test_rows_are_measured_again_on_demand(done, tmp_path):
-    """Only those that the patterns name, by the steps that run; a mark in each file shows which are made again."""
-    folder, record = Path(shutil.copytree(done[0], tmp_path / "study")), done[1]
-    measured = sorted((folder / "PlanarObstacles-v0").glob("**/test*.json"))
-    for path in measured:
-        path.write_text(json.dumps({**read_json(path), "mark": True}))
+def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
+    """It is killed when its first training has a checkpoint and is not complete."""
+    folder = tmp_path / "out"
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(GIVEN))
+    command = "from viapoint.training.cli.entry import main; main()"
+    words = [sys.executable, "-c", command, "study", "study.yaml", "--out", str(folder)]
+    process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120.0
+    while not list(folder.glob("*/*/*/checkpoints/0*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    complete = len(results_in(folder))
+    assert complete < 6
     lines = []
-    again = run_study(
-        study_of(folder),
-        workers=0,
-        only=["evaluate", "page"],
-        redo=["viaq/untrained*", "PlanarObstacles-v0/viaq/4", "search16"],
-        report=lines.append,
+    run_study(Study.from_dict(GIVEN), out=folder, told=lines.append)
+    assert len(lines) == 7 - complete
+    assert results_in(folder) == whole[3]
+
+
+def test_two_nodes_have_the_same_results(whole, tmp_path):
+    """Two nodes of one core each that listen on 127.0.0.1; a process of its own, as Ray reads settings once."""
+    script = tmp_path / "nodes.py"
+    script.write_text(
+        "import os, sys\n"
+        'os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"\n'
+        "import yaml\n"
+        "from ray.cluster_utils import Cluster\n"
+        "from viapoint.training import Study, run_study\n"
+        'node = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}\n'
+        "cluster = Cluster(initialize_head=True, head_node_args=node)\n"
+        'cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")\n'
+        "run_study(Study.from_yaml(sys.argv[1]), out=sys.argv[2], address=cluster.address)\n"
+        "cluster.shutdown()\n"
     )
-    assert again == record
-    assert [line for line in lines if "removed" in line] == [
-        "PlanarObstacles-v0 viaq/4: 4 measurements removed",
-        "PlanarObstacles-v0 viaq/untrained: 4 measurements removed",
-        "PlanarObstacles-v0 viaq/untrained/4: 4 measurements removed",
-        "PlanarObstacles-v0 search16: 0 measurements removed",
-    ]
-    made = {path.name for path in measured if "mark" not in read_json(path)}
-    assert made == {"test.4.json", "test.untrained.json", "test.untrained-4.json"}
-    run_study(study_of(folder), workers=0, only=["baselines", "time"], redo=["search16"], report=lines.append)
-    assert "PlanarObstacles-v0 search16: 3 measurements removed" in lines  # two sets and a time
-    with pytest.raises(ValueError, match=r"redo must match rows; .* viaq, viaq/4, .*; got 'viaqs'"):
-        run_study(study_of(folder), workers=0, redo=["viaq", "viaqs"])
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(GIVEN))
+    words = [sys.executable, script, tmp_path / "study.yaml", tmp_path / "out"]
+    subprocess.run(words, check=True, timeout=300, capture_output=True)
+    assert results_in(tmp_path / "out") == whole[3]
 
 
-def of_seeds(record, seeds):
-    """Return a record in which the agent has been measured with some of its seeds only."""
-    changed = json.loads(json.dumps(record))
-    for each in changed["environments"][ENV]["rows"]:
-        if each["kind"] == "agent":
-            each["runs"] = [run for run in each["runs"] if run["seed"] in seeds]
-            each["seeds"] = seeds
-    return changed
-
-
-def test_rows_outlive_their_files_and_grow_by_seed(done, tmp_path):
-    folder, record = done
-    assert rows(gather(study_of(tmp_path / "empty"))) == {}
-    assert gather(study_of(tmp_path / "empty"), record) == record
-    other = Path(shutil.copytree(folder, tmp_path / "study"))
-    shutil.rmtree(other / "PlanarObstacles-v0" / "viaq" / "seed-1")
-    grown = gather(study_of(other), of_seeds(record, [1]))
-    assert [each["seeds"] for each in grown["environments"][ENV]["rows"][:4]] == [[0, 1]] * 4
-    assert grown == record
-
-
-def test_rows_without_runs_stay_until_as_many_seeds_are_measured(done):
-    folder, record = done
-    for seeds, expected in (([0], [0, 1]), ([0, 1, 2], [0, 1, 2])):
-        earlier = of_seeds(record, seeds)
-        for each in earlier["environments"][ENV]["rows"]:
-            each["runs"] = []
-        assert rows(gather(study_of(folder), earlier))["viaq"]["seeds"] == expected
-
-
-def test_a_run_that_solves_nothing_replaces_an_earlier_one(done, tmp_path):
-    folder, record = Path(shutil.copytree(done[0], tmp_path / "study")), done[1]
-    path = folder / "PlanarObstacles-v0" / "viaq" / "seed-1" / "evaluations" / "test.4.json"
-    measured = read_json(path)
-    measured["outcomes"]["is_success"] = [0.0] * len(measured["outcomes"]["is_success"])
-    path.write_text(json.dumps(measured))
-    assert rows(gather(study_of(folder), record))["viaq/4"]["sets"]["test"]["each"][1] == 0.0
-
-
-def test_the_solved_scenes_of_every_run_are_in_the_record(done):
-    folder, record = done
-    for each in rows(record)["viaq/4"]["runs"]:
-        path = folder / "PlanarObstacles-v0" / "viaq" / f"seed-{each['seed']}" / "evaluations" / "hard.4.json"
-        solved = unpacked(each["sets"]["hard"]["solved"], each["sets"]["hard"]["scenes"])
-        assert solved.tolist() == [value > 0.5 for value in read_json(path)["outcomes"]["is_success"]]
-
-
-def test_rows_of_other_scenes_do_not_stay(done, tmp_path):
-    _, record = done
-    changed = json.loads(json.dumps(record))
-    changed["environments"][ENV]["sets"]["test"]["sha256"] = "of other scenes"
-    found = rows(gather(study_of(tmp_path), changed))
-    assert {name for each in found.values() for name in each["sets"]} == {"hard"}
-
-
-@pytest.mark.parametrize("of", ["study", "preset"])
-def test_rows_of_other_settings_do_not_stay(done, tmp_path, monkeypatch, of):
-    _, record = done
-    changes = {"baselines": [], "compare": []}
-    if of == "study":  # in the record, a search of another kind has this name
-        changes |= {"agents": {}, "baselines": ["search16"]}
-    else:
-        slower = dataclasses.replace(PRESETS["viaq"], hyperparameters=(("learning_rate", 1e-4),))
-        monkeypatch.setitem(PRESETS, "viaq", slower)
-    assert rows(gather(study_of(tmp_path, **changes), record)) == {}
-
-
-def test_a_run_with_other_settings_is_refused_and_others_go_on(done):
-    folder, _ = done
-    other, lines = {"viaq": {**SMALL["agents"]["viaq"], "n_timesteps": 128}}, []
-    study = study_of(folder, agents=other, seeds=[0], baselines=["straight"], compare=[])
-    with pytest.raises(run.StudyFailedError, match="1 jobs failed: PlanarObstacles-v0 viaq seed 0"):
-        run_study(study, workers=0, only=["train", "baselines"], report=lines.append)
-    assert "was trained with other settings (n_timesteps)" in lines[1]
-    assert "PlanarObstacles-v0 straight: test" in lines[2]
-
-
-def test_what_is_interrupted_is_not_kept(tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("viapoint.training.planners.baselines.StoredSolutions.decide", interrupted)
-    study = study_of(tmp_path, agents={}, compare=[], baselines=["stored"])
-    with pytest.raises(KeyboardInterrupt):
-        run_study(study, workers=0, only=["baselines"])
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
-def test_a_grid_has_an_entry_for_each_point():
-    agents = {
-        "k{n_via}-{timing}": {
-            "grid": {"env_kwargs.n_via": [1, 2], "env_kwargs.timing": ["optimal", "learned"]}
-        },
-        "sac": {"algo": "sac", "grid": {"hyperparameters.batch_size": [64]}, "label": "SAC of {batch_size}"},
-        "ppo-step": {"algo": "ppo", "step_wise": True},
+def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path):
+    parameters = {
+        "hyperparameters.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+        "hyperparameters.batch_size": [16, 32],
     }
-    study = Study.from_dict({"environments": [ENV, MOVING], "agents": agents})
-    found = {each.name: each for each in study.agents}
-    assert list(found) == [
-        "k1-optimal", "k1-learned", "k2-optimal", "k2-learned", "sac-batch_size=64", "ppo-step",
-    ]  # fmt: skip
-    assert found["k2-learned"].training["env_kwargs"] == {"n_via": 2, "timing": "learned"}
-    assert found["sac-batch_size=64"].label == "SAC of 64"
-    assert found["ppo-step"].environments == (ENV,)
-    assert found["ppo-step"].config(study.environments[0], 0, Path("x")).env.endswith("ObstaclesStep-v0")
-    assert rows_of(found["sac-batch_size=64"]) == ["sac-batch_size=64"]
+    first = [{"hyperparameters.learning_rate": 1e-3, "hyperparameters.batch_size": 32}]
+    search = {**TRAINING, "algo": "sac", "trials": 3, "parameters": parameters, "first": first}
+    study = Study.from_dict({"environments": [ENV], "searches": {"tuned": search}})
+    told = []
+    assert run_study(study, out=tmp_path / "out", told=told.append).empty
+    place = tmp_path / "out" / "PlanarObstacles-v0" / "tuned"
+    trials = pd.read_csv(place / "trials.csv")
+    assert len(trials) == 3
+    assert trials["hyperparameters.learning_rate"].between(1e-4, 1e-2).all()
+    assert set(trials["hyperparameters.batch_size"]) <= {16, 32}
+    assert (trials["hyperparameters.learning_rate"] == 1e-3).any()
+    best = json.loads((place / "best.json").read_text())
+    assert best["success"] == trials.success[trials.decisions == trials.decisions.max()].max()
+    assert "batch_size=" in best["command"]
+    lines = []
+    run_study(study, out=tmp_path / "out", told=lines.append)
+    assert not lines
 
 
-def test_settings_of_the_policy_are_merged_with_those_of_the_preset(tmp_path):
-    agents = {"sac": {"algo": "sac", "hyperparameters": {"policy_kwargs": {"critic": "minimum"}}}}
-    study = Study.from_dict({"environments": [ENV], "agents": agents})
-    policy = study.agents[0].config(study.environments[0], 0, tmp_path).hyperparameters["policy_kwargs"]
-    assert policy["critic"] == "minimum"
-    assert policy["net_arch"] == [256, 256]
+def test_grids_and_checks_make_rows():
+    grid = {"hyperparameters.batch_size": [64, 128], "env_kwargs.n_via": [1, 2]}
+    given = {"environments": [ENV], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
+    trials = Study.from_dict(given).trials
+    assert [trial.row for trial in trials] == [
+        f"sac-batch_size={size}-n_via={number}" for size in (64, 128) for number in (1, 2)
+    ]
+    config = trials[-1].config(Path("out"))
+    assert config.folder == Path("out/PlanarObstacles-v0/sac-batch_size=128-n_via=2/seed-3")
+    assert config.hyperparameters == {"batch_size": 128}
+    assert config.env_kwargs == {"n_via": 2}
+    assert config.seed == 3
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"enviroments": [ENV]}, "the study: fields must be one of .*, got 'enviroments'; did you mean 'environments'"),
-        ({"environments": ["viapoint/PlanarObstacle-v0"]}, f"id must be one of .*did you mean '{ENV}'"),
-        ({"environments": []}, "environments must be a list of names"),
-        ({"seeds": [0, 0]}, "seeds must hold at least one number and none twice"),
-        ({"agents": {"a": {"algo": "sacc"}}}, "agents.a: algo must be one of .*did you mean 'sac'"),
-        ({"agents": {"a": {"n_timestep": 5}}}, "agents.a: fields must be one of .*did you mean 'n_timesteps'"),
-        ({"agents": {"a": {"n_timesteps": 0}}}, "agents.a in viapoint/PlanarObstacles-v0: n_timesteps must be"),
-        ({"agents": {"a": {"seed": 3}}}, "got 'seed'; did you mean 'seeds'"),
-        ({"agents": {"a": {"hyperparameters": {"batchsize": 3}}}}, "a.hyperparameters: .*you mean 'batch_size'"),
-        ({"agents": {"a": {"algo": "sac", "checks": [4]}}}, "sac has no proposals to check"),
-        ({"agents": {"a": {"environments": ["b"]}}}, "agents.a.environments must be one of"),
-        ({"agents": {"a": {"grid": {"n_step.x": [1]}}}}, "agents.a.grid must be one of .*, got 'n_step'"),
-        ({"agents": {"a-{x}": {"grid": {"n_timesteps": [64]}}}}, "got 'x'"),
-        ({"baselines": ["magic"]}, "baselines.magic: method must be one of .*search"),
-        ({"baselines": {"s": {"method": "search"}}}, "search needs checks, a number"),
-        ({"baselines": {"s": {"method": "search", "time_of": "viaq"}}, "agents": {}}, "time_of must be one of"),
-        ({"baselines": {"straight": {"checks": 4}}}, "checks and time_of are for search"),
-        ({"baselines": {"unrevised": {"environments": [ENV]}}}, f"does not exist in {ENV}"),
-        ({"agents": {"straight": {}}, "baselines": ["straight"]}, "straight is there twice"),
-        ({"compare": [["viaq", "magic"]]}, "compare must be one of"),
-        ({"page": {"template": "nowhere.j2"}}, "nowhere.j2 is missing"),
-        ({"scenes": ["tests"]}, "must be one of .*did you mean 'test'"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_meant_is_refused_with_what_is_allowed(changes, reason):
-    given = {"environments": [ENV], "agents": {"viaq": {}}, "baselines": [], **changes}
-    with pytest.raises(ValueError, match=reason):
-        Study.from_dict(given)
+def test_the_examples_of_the_page_and_of_the_function_run(ray):
+    page = Path(__file__).parents[2] / "docs" / "studies.md"
+    (example,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    exec(compile(example, page, "exec"), {})
+    finder = doctest.DocTestFinder(recurse=False)
+    for each in finder.find(run_study, "run_study", globs={}):
+        assert doctest.DocTestRunner().run(each).failed == 0
 
 
-def test_a_file_is_named_in_its_errors(tmp_path):
-    path = tmp_path / "bad.yaml"
-    for content, reason in (
-        ("agents: {}\n", "bad.yaml: environments must be"),
-        ("a: [", "bad.yaml: cannot be read"),
-    ):
-        path.write_text(content)
-        with pytest.raises(ValueError, match=reason):
-            Study.from_yaml(path)
-    with pytest.raises(ValueError, match=r"only must be some of train, .* got 'trian'"):
-        run_study(Study.from_dict({"environments": [ENV]}), only=["trian"])
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="name another folder"):
+        run_study(Study.from_dict(GIVEN), out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize(
-    ("stopped", "stalling", "words"),
+    "change",
     [
-        (["stalled", "stalled"], 0.3, "100-200, until it stalled"),
-        (["budget", "budget"], 0.3, "100-200, cut short"),
-        (["budget", "stalled"], 0.3, "100-200, 1 of 2 cut short"),
-        (["budget", "budget"], None, "100-200"),
+        {"environments": []},
+        {"environments": ["viapoint/PlanarObstaclesStep-v0"]},
+        {"environments": {"a": {"id": "CartPole-v1"}}},
+        {"environments": {"a": {"id": ENV, "env_kwargs": {"num_envs": 3}}}},
+        {"environments": {"../a": {"id": ENV}}},
+        {"seed": [0]},
+        {"seeds": [0, 0]},
+        {"seeds": [-1]},
+        {"n_scenes": 0},
+        {"scenes": ["tset"]},
+        {"agents": {"viaq": {"checks": [-1]}}},
+        {"agents": {"viaq": {"checks": 16}}},
+        {"agents": {"sac": {"algo": "sac", "checks": [16]}}},
+        {"agents": {"viaq": {"algo": "dqn"}}},
+        {"agents": {"viaq": {"hyperparameters": {"batchsize": 3}}}},
+        {"agents": {"viaq": {"hyperparameters": {"batch_size": 0}}}},
+        {"agents": {"viaq": {"hyperparameters": {"batch_size": "many"}}}},
+        {"agents": {"viaq": {"seed": 3}}},
+        {"agents": {"viaq": {"environments": ["PandaReach"]}}},
+        {"agents": {"viaq": {"grid": {"hyperparameters.gamma": 0.9}}}},
+        {"agents": {"viaq": {"grid": {"hyperparameters.gamma": [2.0]}}}},
+        {"agents": {"straight": {}}},
+        {"agents": {"viaq": 3}},
+        {"baselines": ["serach64"]},
+        {"baselines": ["search"]},
+        {"baselines": ["search0"]},
+        {"baselines": {"a": {"method": "planer"}}},
+        {"baselines": {"straight": {"checks": 3}}},
+        {"searches": {"a": {}}},
+        {"searches": {"a": {"parameters": {}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 1.0, "high": 0.5}}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 1.5}}}}},
+        {"searches": {"a": {"parameters": {"speed": [1, 2]}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "trials": 0}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "eval_every": 0}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": [0.9]}, "first": [{"gamma": 0.9}]}}},
+        {"agents": {}, "baselines": []},
     ],
 )
-def test_trainings_that_wait_for_a_stall_say_whether_it_came(stopped, stalling, words):
-    made = {"training": {"stop_when_stalled": stalling}}
-    row = {"made": made, "training": {"decisions": 100, "stopped": sorted(set(stopped))}}
-    runs = [{"training": {"decisions": 100 * i, "stopped": each}} for i, each in enumerate(stopped, 1)]
-    assert effort({**row, "runs": runs}) == words
-    assert effort(row) == "100" + words[7:].replace("1 of 2 ", "")  # a record without its runs
+def test_what_cannot_be_run_is_an_error_when_the_file_is_read(change, tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**GIVEN, **change}))
+    with pytest.raises(ValueError, match=r"study\.yaml"):
+        Study.from_yaml(path)
 
 
-def test_tables_of_other_pages_are_filled_in(done, tmp_path):
-    _, record = done
-    (tmp_path / "tables.j2").write_text(
-        "{% macro rates() %}{% for each in chosen(record.environments['" + ENV + "'], ['viaq', 'magic']) %}"
-        "{{ each.label }}: {{ each.sets.test.success | interval }}{% endfor %}{% endmacro %}"
-    )
-    page = Study.from_dict({"environments": [ENV], "page": {"tables": "tables.j2"}}, folder=tmp_path).page
-    text = fill_tables(record, page, "a\n<!-- table:rates -->\nold\n<!-- end -->\nb", Path("x.md"))
-    rate = 100 * row(record["environments"][ENV], "viaq")["sets"]["test"]["success"][0]
-    assert text.startswith(f"a\n<!-- table:rates -->\n\nviaq: {rate:.1f} % (")
-    assert text.endswith(")\n\n<!-- end -->\nb")
-    with pytest.raises(ValueError, match=r"has a table other, and .*tables.j2 has no macro"):
-        fill_tables(record, page, "<!-- table:other -->\n<!-- end -->", Path("x.md"))
+def test_an_unknown_field_comes_with_the_closest_one():
+    with pytest.raises(ValueError, match="did you mean 'seeds'"):
+        Study.from_dict({**GIVEN, "seedz": [0]})
 
 
-def test_tables_leave_out_columns_of_zeros():
-    text = table(
-        [["method", "success", "collision", "jerk"], ["a", "1", "0.0 %", "-"], ["b", "2", "0.0 %", "-"]]
-    )
-    assert text.splitlines() == ["| method | success |", "| --- | ---: |", "| a | 1 |", "| b | 2 |"]
-
-
-@pytest.mark.parametrize("power", [0.7, 1.0, 1.6])
-@pytest.mark.parametrize("seconds", [0.0005, 0.004, 0.031, 0.5])
-def test_a_search_of_equal_time_takes_nearly_the_whole_time(tmp_path, monkeypatch, power, seconds):
-    study = study_of(tmp_path)
-    (baseline,) = (each for each in study.baselines if each.name == "in-time")
-    monkeypatch.setattr(timing, "method_of", lambda search, *_, **__: search.checks)
-    monkeypatch.setattr(timing, "median_time", lambda _, checks, kwargs: 0.001 + 1e-5 * checks**power)
-    checks, took = timing.checks_within(study.environments[0], baseline, seconds)
-    assert took == pytest.approx(0.001 + 1e-5 * checks**power)
-    if took > seconds:
-        assert checks == timing.FEWEST_CHECKS
-    else:
-        assert took >= timing.NEARLY * seconds or checks == timing.MOST_CHECKS
-
-
-def test_bands_of_few_scenes_are_left_out_unless_all_have_few():
-    assert shown_bands({"bands": {"> 20 %": 110, "1-5 %": 25, "< 1 %": 6}}) == ["> 20 %", "1-5 %"]
-    assert shown_bands({"bands": {"1-5 %": 4, "< 1 %": 3}}) == ["1-5 %"]
-    assert shown_bands({"bands": {}}) == []
-
-
-def test_a_search_of_more_via_points_is_timed_in_a_task_of_replanning(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "N_TIMED", 3)
-    moving = {"viapoint/PlanarMovingObstacles-v0": {"n_scenes": 4}}
-    searches = {"search-k{n_via}": SMALL["baselines"]["search-k{n_via}"]}
-    study = study_of(tmp_path, environments=moving, agents={}, baselines=searches, compare=[])
-    (line,) = timing.time_decisions(study)
-    assert re.search(r"PlanarMovingObstacles-v0 search-k2: \d+\.\d+ ms", line)
+def test_pages_show_intervals_in_percent(whole):
+    text = markdown(whole[1], "small")
+    assert text.startswith("# small")
+    assert "100.0 % (75." in text  # Wilson's interval of 12 of 12

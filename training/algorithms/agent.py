@@ -16,8 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
-from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, own_environment, save_model
-from viapoint.training.algorithms.sb3_archive import algorithm_of, environment_of, open_archive
+from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
@@ -119,24 +118,18 @@ class Agent(BaseAlgorithm):
         write_folder(Path(os.fspath(path).removesuffix(".zip")), lambda folder: save_model(self, folder))
 
     @classmethod
-    def load(cls, path: str | Path, env: VecEnv | None = None, *, trust: bool = False) -> Self:  # type: ignore[override]
+    def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]
         """Load an agent of this algorithm; see :func:`load_agent`, which loads those of every algorithm.
 
         Args:
             path: Model folder, run folder, or id of an environment with a shipped agent.
             env: Environment to continue training on, with any number of copies; if not given, the agent can decide but
                 not learn.
-            trust: Allow `path` to be an archive of Stable-Baselines3, which `viapoint export` writes. Opening one runs
-                whatever code its author put into it.
 
         Raises:
             ValueError: There is no agent, its files are damaged, or it is of another algorithm.
         """
-        model: Any
-        if trust and Path(path).suffix == ".zip" and Path(path).is_file():
-            model = _from_archive(Path(path), env)
-        else:
-            model = load_model(find_model(path), env)
+        model: Any = load_model(find_model(path), env)
         if not isinstance(model, cls):
             raise ValueError(
                 f"{path} holds an agent of {type(model).__name__}, not of {cls.__name__}; load_agent() loads both"
@@ -172,7 +165,7 @@ class TQC(Agent, sb3_contrib.TQC):
 ALGORITHMS.update(sac=SAC, td3=TD3, ppo=PPO, tqc=TQC)
 
 
-def load_agent(source: str | Path, env: VecEnv | None = None, *, trust: bool = False) -> Agent:
+def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
     """Load a trained agent of any algorithm.
 
     Args:
@@ -180,7 +173,6 @@ def load_agent(source: str | Path, env: VecEnv | None = None, *, trust: bool = F
             model folder, such as `runs/first/final`.
         env: Environment to continue training on, with any number of copies; if not given, the agent can decide but not
             learn.
-        trust: Allow `source` to be an archive of Stable-Baselines3; see :meth:`Agent.load`.
 
     Returns:
         The agent, with `predict`, `plan`, `learn` and `save`.
@@ -199,19 +191,7 @@ def load_agent(source: str | Path, env: VecEnv | None = None, *, trust: bool = F
         >>> info["is_success"]
         True
     """
-    return Agent.load(source, env, trust=trust)
-
-
-def _from_archive(path: Path, env: VecEnv | None) -> Any:
-    """Open an archive of Stable-Baselines3, which runs its code; see :meth:`Agent.load`."""
-    kind, named = ALGORITHMS[algorithm_of(path)], environment_of(path)
-    if env is None and named is None:
-        raise BadFileError(path, "names no environment of this package; viapoint import-sb3 --env names it")
-    try:
-        chosen = env or own_environment(named or {})
-    except ValueError as error:
-        raise BadFileError(path, f"names an environment that cannot be made: {error}") from None
-    return open_archive(path, kind, chosen, trainable=env is not None)
+    return Agent.load(source, env)
 
 
 def find_model(source: str | Path) -> Path:
@@ -231,16 +211,8 @@ def find_model(source: str | Path) -> Path:
         return folder
     if (folder / "config.json").is_file():
         return best_model(folder)
-    reason = "there is no such folder"
-    if folder.is_dir():
-        reason = "it holds no config.json and no model.json"
-    elif folder.exists():
-        reason = (
-            "it is a file (viapoint import-sb3 converts archives of Stable-Baselines3; trust=True opens one)"
-        )
     raise BadFileError(
-        folder,
-        f"is no run folder or model folder: {reason}; ids of environments with a shipped agent are {known}",
+        folder, f"is no run folder or model folder; ids of environments with a shipped agent are {known}"
     )
 
 

@@ -10,7 +10,8 @@ import hashlib
 import importlib.metadata
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +23,18 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from viapoint.envs.actions.via_points import MOST_VIAS
+from viapoint.envs.scenes.families import MOST_OBSTACLES
 from viapoint.training.algorithms.extractors import EXTRACTORS
-from viapoint.training.algorithms.sb3_minimum_critic import POLICIES as MINIMUM
-from viapoint.training.algorithms.smdp_buffers import time_discount, unit_of
-from viapoint.training.config.discount import check_discount_unit
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
-from viapoint.training.io.model_limits import (
-    LARGEST_MODEL_JSON,
-    LARGEST_WEIGHTS,
-    check_env_arguments,
-    parameter_budget,
-)
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments, observed_candidates
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 }
-MINIMUM_CRITIC = "MinimumCriticPolicy"
-"""Name of the policies with a minimum critic."""
 FORMAT = 1
 """Version of the two files."""
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
@@ -51,6 +45,21 @@ NOT_STORED = frozenset(
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
 """Arguments of algorithms that model files do not hold."""
+
+LARGEST_MODEL_JSON = 1 << 20
+"""Greatest size of `model.json`, [bytes]."""
+LARGEST_WEIGHTS = 1 << 30
+"""Greatest size of `weights.safetensors`, [bytes]."""
+LARGEST_ARGUMENTS = {
+    "n_via": MOST_VIAS,
+    "n_obstacles": MOST_OBSTACLES,
+    "width": 8192,
+    "height": 8192,
+    "threads": 1024,
+}
+"""Greatest values in a file of those arguments of an environment that memory and time grow with."""
+SPARE_PARAMETERS = 100_000
+"""Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
@@ -80,16 +89,12 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         hyperparameters = dict(record["hyperparameters"])
-        if env is None:  # to decide, hardly any room is needed for experience
-            buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
-            hyperparameters[buffer] = 2
         with warnings.catch_warnings(), parameter_budget(arrays):
-            warnings.simplefilter(
-                "ignore", UserWarning
-            )  # PPO finds that its batches do not fill one environment
+            warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
+            if env is None:
+                hyperparameters = _to_decide(hyperparameters)
             chosen = env or own_environment(record["env"])
-            unit = record.get("discount_unit")
-            model = build(record["algorithm"], record["policy"], chosen, hyperparameters, discount_unit=unit)
+            model = build(record["algorithm"], record["policy"], chosen, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
         raise
@@ -108,7 +113,6 @@ def build(
     env: VecEnv,
     hyperparameters: Mapping[str, Any],
     *,
-    discount_unit: float | None = None,
     seed: int | None = None,
 ) -> BaseAlgorithm:
     """Build a new model from plain values.
@@ -119,70 +123,50 @@ def build(
         env: Environment to learn on.
         hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
             writes them.
-        discount_unit: Time that counts gamma [s]; None where a decision does, whatever it takes.
         seed: Seed of the algorithm.
 
     Raises:
-        ValueError: There is no such algorithm or policy, or it cannot discount by time.
+        ValueError: There is no such algorithm, policy or hyperparameter.
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
-    kind, policies = ALGORITHMS[algorithm], _policies(algorithm)
+    kind = ALGORITHMS[algorithm]
+    policies: dict[str, type[BasePolicy]] = kind.policy_aliases
     if policy not in policies:
         raise ValueError(f"policy of {algorithm} must be one of {', '.join(policies)}, got {policy!r}")
-    allowed = argument_names(kind)
-    unknown = sorted(set(hyperparameters) - allowed)
-    if unknown:
-        raise ValueError(
-            f"{algorithm} has no hyperparameter {unknown[0]!r}; it has {', '.join(sorted(allowed))}"
-        )
+    check_hyperparameters(algorithm, hyperparameters)
     size = int(np.prod(env.action_space.shape or ()))
     arguments = {name: _decode(value, size) for name, value in hyperparameters.items()}
-    if discount_unit is not None:
-        arguments |= _by_time(algorithm, env, arguments, discount_unit)
-    network = dict(arguments.get("policy_kwargs") or {})
-    if "critic" in network:
-        policy = _policy_with(network.pop("critic"), algorithm)
-        arguments["policy_kwargs"] = network
     return kind(policies[policy], env, seed=seed, device="cpu", **arguments)
 
 
-def _policies(algorithm: str) -> dict[str, type[BasePolicy]]:
-    """Return the policies of an algorithm by name."""
-    policies = dict(ALGORITHMS[algorithm].policy_aliases)
-    return policies | ({MINIMUM_CRITIC: MINIMUM[algorithm]} if algorithm in MINIMUM else {})
-
-
-def _policy_with(critic: Any, algorithm: str) -> str:
-    """Return the name of the policy with a critic of this name.
+def check_hyperparameters(algorithm: str, hyperparameters: Mapping[str, Any]) -> None:
+    """Check hyperparameters against the signature of an algorithm.
 
     Raises:
-        ValueError: There is no such critic, or none for the algorithm.
+        ValueError: A name is unknown, or a value has another type or is out of range.
     """
-    if critic != "minimum" or algorithm not in MINIMUM:
-        raise ValueError(
-            f"critic in policy_kwargs must be minimum, with algo one of {', '.join(MINIMUM)}, "
-            f"got {critic!r} with {algorithm}"
-        )
-    return MINIMUM_CRITIC
+    kind = ALGORITHMS[algorithm]
+    allowed = argument_names(kind)
+    for name in sorted(set(hyperparameters) - allowed):
+        raise ValueError(f"{algorithm} has no hyperparameter {name!r}; it has {', '.join(sorted(allowed))}")
+    check_arguments(kind, {name: _decode(value, 1) for name, value in hyperparameters.items()})
 
 
 def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
     """Return a model like this one before its training, with the weights of a seed."""
     record, env = describe(model), model.get_env()
     assert env is not None
-    hyperparameters = dict(record["hyperparameters"])
-    hyperparameters["buffer_size" if "buffer_size" in hyperparameters else "n_steps"] = 2
+    hyperparameters = _to_decide(record["hyperparameters"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # as in load_model
-        return build(
-            record["algorithm"],
-            record["policy"],
-            env,
-            hyperparameters,
-            discount_unit=record["discount_unit"],
-            seed=seed,
-        )
+        return build(record["algorithm"], record["policy"], env, hyperparameters, seed=seed)
+
+
+def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return hyperparameters with hardly any room for experience, which decisions do not need."""
+    buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
+    return {**hyperparameters, buffer: 2}
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
@@ -193,7 +177,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
     number = observed_candidates(model.get_env())  # type: ignore[arg-type]
-    policies = {kind: each for each, kind in _policies(name).items()}
+    policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
     stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
     return {
         "format": FORMAT,
@@ -202,7 +186,6 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         "policy": policies[model.policy_class],
         "env": {"id": env_id, "kwargs": _encode(env_kwargs), **({"candidates": number} if number else {})},
         "num_timesteps": model.num_timesteps,
-        "discount_unit": unit_of(model),
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
     }
 
@@ -246,30 +229,44 @@ def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
     """
     if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
         raise ValueError(f"environment {record['id']!r} is not known")
-    check_env_arguments(record["kwargs"])
+    for name, most in LARGEST_ARGUMENTS.items():
+        value = record["kwargs"].get(name, 0)
+        for each in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(each, int | float) and each > most:
+                raise ValueError(f"{name} may be at most {most} in a file, got {each}")
     return ViaVecEnv(record["id"], 1, observe_candidates=record.get("candidates", 0), **record["kwargs"])
 
 
-def _by_time(algorithm: str, env: VecEnv, arguments: Mapping[str, Any], unit: float) -> dict[str, Any]:
-    """Return arguments that make an algorithm discount by time."""
-    check_discount_unit(algorithm, unit, env_arguments(env)[0])
-    if "learning_starts" in arguments and arguments.get("n_steps", 1) != 1:
-        raise ValueError(f"n_steps must be 1 where discounts follow time, got {arguments['n_steps']!r}")
-    kind = ALGORITHMS[algorithm]
-    known = inspect.signature(kind).parameters
-    gamma = arguments["gamma"] if "gamma" in arguments else known["gamma"].default
-    return time_discount(kind, env.observation_space, gamma=gamma, unit=unit)
+@contextmanager
+def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
+    """Limit the parameters of new networks to the number in the weights, plus a few.
+
+    Torch reserves memory for a layer before it touches it, and the check comes between the two.
+
+    Raises:
+        ValueError: A network with more parameters is built.
+    """
+    there = sum(int(np.prod(array.shape)) for array in arrays.values())
+    left = there + SPARE_PARAMETERS
+
+    def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
+        nonlocal left
+        left -= parameter.numel() if parameter is not None else 0
+        if left < 0:
+            raise ValueError(
+                f"it describes larger networks than the {there} parameters in the weights can fill"
+            )
+
+    handle = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def argument_names(kind: type[BaseAlgorithm]) -> set[str]:
-    """Return the names of an algorithm's arguments, including those that `**kwargs` passes to base classes."""
-    names: set[str] = set()
-    for each in kind.__mro__:
-        parameters = inspect.signature(vars(each).get("__init__", object.__init__)).parameters.values()
-        names |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            break
-    return names - NOT_STORED
+    """Return the names of an algorithm's hyperparameters."""
+    return set(inspect.signature(kind.__init__).parameters) - NOT_STORED
 
 
 def _encode(value: Any) -> Any:
@@ -310,7 +307,10 @@ def _decode(value: Any, size: int) -> Any:
         if kind == "linear":
             return LinearSchedule(float(value["start"]), float(value["end"]), float(value["end_fraction"]))
         if kind == "normal":
-            return NormalActionNoise(np.zeros(size), np.full(size, float(value["sigma"])))
+            sigma = float(value["sigma"])
+            if not sigma >= 0.0:
+                raise ValueError(f"sigma of action_noise must be 0 or more, got {sigma}")
+            return NormalActionNoise(np.zeros(size), np.full(size, sigma))
         if kind == "activation":
             return ACTIVATIONS[value["name"]]
         if kind == "extractor":

@@ -10,9 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 
 from viapoint.envs.common.types import Single
 from viapoint.primitives.array_api import Array
-from viapoint.training.algorithms.smdp_buffers import TimedDictReplayBuffer
-from viapoint.training.config.discount import ELAPSED, TimeDiscount
-from viapoint.training.rollouts.vec_env import TERMS
+from viapoint.training.rollouts.vec_env import ELAPSED, TERMS
 
 LOWER = 1e-6
 """Smallest decrease of the clearance term that counts as a decrease."""
@@ -45,33 +43,23 @@ class OutcomeSamples(NamedTuple):
     next_observations: dict[str, Single]
     ended: Single
     reward: Single
-    discount: Single
-    """Discount of the value of the next observation: gamma, or the discount of the elapsed time."""
     elapsed: Single
     """Duration of the executed part of the plan, [s]; infinite if the plan was executed to its end."""
     outcomes: Outcomes
 
 
-class OutcomeReplayBuffer(TimedDictReplayBuffer):
+class OutcomeReplayBuffer(DictReplayBuffer):
     """Replay buffer for dictionary observations that stores the outcome of each decision from `info`.
 
     Args:
         *args: Arguments of :class:`stable_baselines3.common.buffers.DictReplayBuffer`.
-        gamma: Discount of one unit of time.
-        unit: Length of the unit of time, [s]; None discounts each decision by gamma, whatever its duration.
-        key: Key of `info` that holds the elapsed time, [s].
         **kwargs: Keyword arguments of the same class.
     """
 
-    def __init__(
-        self, *args: Any, gamma: float = 0.0, unit: float | None = None, key: str = ELAPSED, **kwargs: Any
-    ) -> None:
-        DictReplayBuffer.__init__(self, *args, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         if self.optimize_memory_usage:
             raise ValueError("optimize_memory_usage must be False: the buffer stores the terms of the reward")
-        self.gamma = gamma
-        self.time_discount = None if unit is None else TimeDiscount(gamma=gamma, unit=unit, key=key)  # type: ignore[assignment]
-        self.discounts = np.full((self.buffer_size, self.n_envs), gamma, dtype=np.float32)
         self._begins = False
         self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
@@ -82,13 +70,11 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
     ) -> None:
         """Add one transition of each environment."""
-        if self.time_discount is not None:
-            self.discounts[self.pos] = self.time_discount.of(infos)
         before = self._clearance_before()
         for i, info in enumerate(infos):
             self.elapsed[self.pos, i] = info.get(ELAPSED, np.inf)
             self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
-        DictReplayBuffer.add(self, obs, next_obs, action, reward, done, infos)
+        super().add(obs, next_obs, action, reward, done, infos)
 
     def begin(self) -> None:
         """Mark the beginning of new episodes in all environments, after a reset."""
@@ -113,7 +99,6 @@ class OutcomeReplayBuffer(TimedDictReplayBuffer):
             {name: part[at] for name, part in self.next_observations.items()},
             np.asarray(self.dones[at] * (1.0 - self.timeouts[at]), dtype=np.float32),
             self.rewards[at],
-            self.discounts[at],
             self.elapsed[at],
             Outcomes(*self.outcomes[at].T),
         )

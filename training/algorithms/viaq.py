@@ -7,7 +7,6 @@ The critic is regressed on the terms of the reward that `info` reports; training
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
@@ -28,11 +28,9 @@ from viapoint.training.algorithms.model_io import ALGORITHMS
 from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
 from viapoint.training.algorithms.viaq_critic import Values
 from viapoint.training.algorithms.viaq_policy import KEEP, ViaQPolicy
-from viapoint.training.config.checks import PARTICULAR, check_hyperparameters, check_via_policy
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.search.candidates import candidate_actions
 
-OWN = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
-"""Hyperparameters that other off-policy algorithms do not have."""
 FIXED_PARTS = ("arm", "whole_arm", "action")
 """Parts of the task that agent and environment must share, because the policy plans with them."""
 CLEARANCE_SCALE = 0.4
@@ -59,10 +57,14 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         temperature: Temperature of the softmax of Q over candidates.
         explore_candidates: Candidates of each decision during training.
         next_candidates: Candidates over which the value of the next observation is maximised.
+        train_freq: Steps of all environments between two rounds of updates.
+        tau: Rate at which the target critic follows, in tasks with replanning.
         policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
-        replay_buffer_kwargs: Arguments of :class:`OutcomeReplayBuffer`.
-        replay_buffer_class: Not used; the replay buffer is an :class:`OutcomeReplayBuffer`.
-        **kwargs: Arguments of :class:`OffPolicyAlgorithm`.
+        stats_window_size: Episodes over which the logged success is averaged.
+        tensorboard_log: Folder of a TensorBoard log.
+        verbose: 0 for no output, 1 for information, 2 for more of it.
+        seed: Seed of all random numbers.
+        device: Device of the networks.
 
     Raises:
         ValueError: A hyperparameter is out of range, or the environment has no task of this package.
@@ -83,7 +85,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         self,
         policy: str | type[ViaQPolicy],
         env: Any,
-        learning_rate: Any = 3e-3,
+        learning_rate: float | Schedule = 3e-3,
         *,
         buffer_size: int = 50_000,
         learning_starts: int = 4_096,
@@ -94,17 +96,20 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         temperature: float = 0.1,
         explore_candidates: int = 32,
         next_candidates: int = 8,
+        train_freq: int | tuple[int, str] = 1,
+        tau: float = 0.005,
         policy_kwargs: dict[str, Any] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        replay_buffer_class: Any = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
-        **kwargs: Any,
     ) -> None:
         self.explore_uniformly, self.temperature = explore_uniformly, temperature
         self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
-        narrower = {name: kwargs[name] for name in PARTICULAR["viaq"] if name in kwargs}
-        check_hyperparameters("viaq", _plain({**narrower, **{name: getattr(self, name) for name in OWN}}))
-        check_via_policy(_plain(policy_kwargs or {}))
+        own = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
+        check_arguments(ViaQ, {name: getattr(self, name) for name in own})
         super().__init__(
             policy,
             env,
@@ -115,11 +120,16 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             gamma=gamma,
             gradient_steps=gradient_steps,
             replay_buffer_class=OutcomeReplayBuffer,
-            replay_buffer_kwargs={"gamma": gamma, **(replay_buffer_kwargs or {})},
             policy_kwargs=dict(policy_kwargs or {}),
+            train_freq=train_freq,
+            tau=tau,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
             support_multi_env=True,
             sde_support=False,
-            **kwargs,
         )
         if self.env is not None:
             self.policy_kwargs.setdefault("task", task_of(self.env).as_dict())
@@ -195,13 +205,13 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             inputs = inputs._replace(until=torch.from_numpy(batch.elapsed)[:, None])
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
-        ended, discount = torch.from_numpy(batch.ended), torch.from_numpy(batch.discount)
-        goes_on = (1.0 - ended) * discount if following is not None else torch.zeros_like(ended)
+        ended = torch.from_numpy(batch.ended)
+        goes_on = (1.0 - ended) * self.gamma if following is not None else torch.zeros_like(ended)
         known = torch.from_numpy(np.isfinite(batch.outcomes.success))
         outcomes = Outcomes(*(torch.nan_to_num(torch.from_numpy(each)) for each in batch.outcomes))
         contact, arrival, effort = outcomes.contact, outcomes.success, outcomes.effort_terms
         if following is not None:
-            arrival = torch.where(ended > 0.5, arrival, discount * torch.sigmoid(following.arrival))
+            arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
             effort = effort + goes_on * following.effort_terms
         carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
         losses = {
@@ -305,11 +315,6 @@ def _mean(losses: Tensor, counted: Tensor) -> Tensor:
 
 def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
-
-
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with NumPy scalars converted to Python numbers."""
-    return {name: each.item() if isinstance(each, np.generic) else each for name, each in settings.items()}
 
 
 ALGORITHMS["viaq"] = ViaQ

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from viapoint.envs.geometry.rows import CAPSULES
-from viapoint.envs.mdp.observation import ObservationLayout
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.algorithms.obstacle_parts import Parts, Poses, ShapePairs
 from viapoint.training.algorithms.pair_networks import PairMinimum, dense, networks_of
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
-
-Form = Literal["poses", "action"]
-Pooling = Literal["minimum", "sum"]
 
 EFFORT = 4
 """Number of effort features: log jerk, duration, log duration, and spare time if time is limited."""
@@ -47,12 +43,8 @@ class SceneInputs(NamedTuple):
 
     ends: Tensor
     """Start, goal and, in replanning tasks, the present motion, shape (B, E)."""
-    rows: Tensor
-    """Obstacles in the frame of start and goal, shape (B, n, F)."""
-    present: Tensor
-    """Mask of the rows that hold an obstacle, shape (B, n), bool."""
-    parts: Parts | None
-    """Parts of the obstacles; None for the form `action`."""
+    parts: Parts
+    """Parts of the obstacles."""
 
 
 class PlanInputs(NamedTuple):
@@ -65,15 +57,10 @@ class PlanInputs(NamedTuple):
     """Shape (B, H, EFFORT)."""
     reach: Tensor
     """Minimum reach margin of the planned hand, shape (B, H), [m]; negative if the plan leaves the reach of the arm."""
-    poses: Poses | None
-    """Planned poses of the arm; None for the form `action`."""
+    poses: Poses
+    """Planned poses of the arm."""
     until: Tensor | None = None
     """Time after which contact does not count, shape (B, H), [s]; None if plans are executed to their end."""
-
-
-def seen_row_size(layout: ObservationLayout) -> int:
-    """Return the number of values of an obstacle, without its velocity, in the frame of start and goal."""
-    return layout.row_size - 1
 
 
 class _Saturated(torch.autograd.Function):
@@ -104,29 +91,17 @@ class ViaQCritic(nn.Module):
     Args:
         task: Task of the environment.
         replanning: True if an episode consists of several decisions.
-        form: Input of the pair networks: `poses`, the planned poses of the arm, or `action`.
-        pooling: `minimum` over obstacles, or `sum` of their features (Deep Sets).
-        heads: Number of outputs for the form `action`, of which the minimum is taken.
         width: Width of the hidden layers of the pair networks.
     """
 
-    def __init__(
-        self, task: Task, *, replanning: bool, form: Form, pooling: Pooling, heads: int, width: int
-    ) -> None:
+    def __init__(self, task: Task, *, replanning: bool, width: int) -> None:
         super().__init__()
         d, size = task.arm.dimension, task.action.size
         ends = (4 * d + 3) if replanning else (2 * d + 1)
-        row = seen_row_size(task.observation) + (d if replanning else 0)
-        self.form, self.pooling, self.replanning = form, pooling, replanning
-        self.pairs: Any = None
-        if form == "poses":
-            networks, shapes = networks_of(task), task.scenes.shapes
-            geometry = None if shapes == CAPSULES else ShapePairs(len(shapes), bool(networks))
-            self.pairs = PairMinimum(d, networks, width, geometry=geometry)
-        else:
-            outputs = heads if pooling == "minimum" else width
-            self.pairs = dense(ends + row + size, width, width, outputs)
-            self.pooled = dense(width + ends + size, width, 1) if pooling == "sum" else None
+        self.replanning = replanning
+        networks, shapes = networks_of(task), task.scenes.shapes
+        geometry = None if shapes == CAPSULES else ShapePairs(len(shapes), bool(networks))
+        self.pairs = PairMinimum(d, networks, width, geometry=geometry)
         self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
         """Logarithm of l [1/m], and d."""
         self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
@@ -150,17 +125,15 @@ class ViaQCritic(nn.Module):
             near: Gap up to which pairs are evaluated, without gradients, see :meth:`PairMinimum.of_near_pairs`, [m];
                 None for all pairs.
         """
-        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
-        plan = torch.cat((ends, inputs.actions), dim=-1)
-        if self.form == "poses" and near is not None:
-            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts, near)
-        elif self.form == "poses":
+        if near is None:
             margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
         else:
-            margin = self._of_actions(plan, inputs.scene)
+            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts, near)
         reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
         # Keeping a plan and planning the same movement again have the same value, so the action itself is not an input.
-        rest = self.rest(torch.cat((ends if self.replanning else plan, inputs.effort), dim=-1))
+        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        known = ends if self.replanning else torch.cat((ends, inputs.actions), dim=-1)
+        rest = self.rest(torch.cat((known, inputs.effort), dim=-1))
         low, high = CLEARANCE_RANGE
         clip: Any = _Saturated.apply
         clearance = clip(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
@@ -189,23 +162,3 @@ class ViaQCritic(nn.Module):
         success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
         merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
         return merit
-
-    def _of_actions(self, plan: Tensor, scene: SceneInputs) -> Tensor:
-        """Return the margin for the form `action`, shape (B, H), [m]."""
-        plans, rows = plan.shape[1], scene.rows.shape[1]
-        pairs = torch.cat(
-            (
-                plan[:, :, None].expand(-1, -1, rows, -1),
-                scene.rows[:, None].expand(-1, plans, -1, -1),
-            ),
-            dim=-1,
-        )
-        values = self.pairs(pairs)
-        present = scene.present[:, None, :, None]
-        if self.pooled is not None:
-            summed = (values.relu() * present).sum(dim=2)
-            pooled: Tensor = 0.05 * self.pooled(torch.cat((summed, plan), dim=-1))[..., 0]
-            return pooled
-        far = torch.where(present, values, torch.full_like(values, 20.0))
-        margin: Tensor = 0.05 * far.amin(dim=(2, 3)) if rows else torch.ones_like(plan[..., 0])
-        return margin

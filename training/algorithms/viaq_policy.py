@@ -15,19 +15,13 @@ from torch import Tensor
 
 from viapoint.envs.actions.via_points import frame
 from viapoint.envs.arms import ARMS
-from viapoint.envs.geometry.rows import CAPSULES, has_shapes
+from viapoint.envs.geometry.rows import has_shapes
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.outcome import SETTLING
 from viapoint.training.algorithms.obstacle_parts import Poses, cut_obstacles, whole_obstacles
-from viapoint.training.algorithms.viaq_critic import (
-    Form,
-    PlanInputs,
-    Pooling,
-    SceneInputs,
-    ViaQCritic,
-    seen_row_size,
-)
+from viapoint.training.algorithms.viaq_critic import PlanInputs, SceneInputs, ViaQCritic
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.search.candidates import candidate_actions, normal_steps
 from viapoint.training.search.geometry_search import best_actions, score_plans
 from viapoint.training.search.plan_checks import (
@@ -71,11 +65,8 @@ class ViaQPolicy(BasePolicy):
         action_space: Action space of the environment.
         lr_schedule: Learning rate as a function of the remaining progress.
         task: Task of the environment as plain values, see :meth:`viapoint.envs.mdp.task.Task.as_dict`.
-        form: Input of the pair networks: `poses`, the planned poses of the arm, or `action`.
-        pooling: `minimum` over obstacles, or `sum` (only with the form `action`).
-        heads: Number of outputs for the form `action`, of which the minimum is taken.
         width: Width of the hidden layers of the pair networks. The default is 32 if every link must clear obstacles,
-            16 if only the hand must, and 160 for the form `action`.
+            and 16 if only the hand must.
         instants: Instants of a plan at which the pair networks are evaluated. The default is 16 if every link must
             clear obstacles, and 32 if only the hand must.
         candidates: Number of Sobol points in the action space.
@@ -92,9 +83,6 @@ class ViaQPolicy(BasePolicy):
         lr_schedule: Any,
         *,
         task: Mapping[str, Any],
-        form: Form = "poses",
-        pooling: Pooling = "minimum",
-        heads: int = 1,
         width: int | None = None,
         instants: int | None = None,
         candidates: int = 256,
@@ -105,6 +93,17 @@ class ViaQPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
+        check_arguments(
+            ViaQPolicy,
+            {
+                "width": width,
+                "instants": instants,
+                "candidates": candidates,
+                "refinements": refinements,
+                "per_refinement": per_refinement,
+                "checks": checks,
+            },
+        )
         super().__init__(
             observation_space,
             action_space,
@@ -118,8 +117,7 @@ class ViaQPolicy(BasePolicy):
         self.checks = checks
         self.instants = instants or (16 if self.task.whole_arm else 32)
         self.shares = instants_of(self.instants)
-        width = width or (160 if form == "action" else 32 if self.task.whole_arm else 16)
-        self.settings: dict[str, Any] = {"form": form, "pooling": pooling, "heads": heads, "width": width}
+        self.width = width or (32 if self.task.whole_arm else 16)
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
         if self.critic_target is not None:
@@ -133,12 +131,12 @@ class ViaQPolicy(BasePolicy):
 
     def make_critic(self) -> ViaQCritic:
         """Return a new critic for the task."""
-        return ViaQCritic(self.task, replanning=self.replanning, **self.settings)
+        return ViaQCritic(self.task, replanning=self.replanning, width=self.width)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
-            **self.settings,
+            "width": self.width,
             "task": self.task.as_dict(),
             "lr_schedule": self._dummy_schedule,
             "instants": self.instants,
@@ -150,9 +148,8 @@ class ViaQPolicy(BasePolicy):
 
     def scene(self, observation: Observation) -> SceneInputs:
         """Return the inputs of the critic that depend on B scenes only."""
-        ends, rows, present = seen_from_line(observation, self.task)
-        parts = None
-        if self.settings["form"] == "poses" and "obstacles" in observation:
+        ends = seen_ends(observation)
+        if "obstacles" in observation:
             whole: Any = self.task.observation.scene_rows(observation["obstacles"])
             velocity = observation.get("obstacle_velocities")
             moving = None if velocity is None else velocity.reshape(*whole.shape[:2], -1)
@@ -160,10 +157,10 @@ class ViaQPolicy(BasePolicy):
                 parts = whole_obstacles(whole, self.task.scenes.shapes, moving)
             else:
                 parts = cut_obstacles(whole, whole[..., -1] > 0.0, moving)
-        elif self.settings["form"] == "poses":
+        else:
             none = np.zeros((len(ends), 1, 2 * self.task.arm.dimension + 1))
             parts = cut_obstacles(none, np.zeros((len(ends), 1), dtype=bool))
-        return SceneInputs(_tensor(ends), _tensor(rows), torch.from_numpy(present), parts)
+        return SceneInputs(_tensor(ends), parts)
 
     def inputs(
         self,
@@ -191,9 +188,7 @@ class ViaQPolicy(BasePolicy):
             spare = np.clip(observation["time_left"] - moves.duration - SETTLING, -0.2, 0.2)
         effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
         reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
-        poses = None
-        if self.settings["form"] == "poses":
-            poses = planned_poses(self.task, moves.path, moves.duration[..., None] * shares)
+        poses = planned_poses(self.task, moves.path, moves.duration[..., None] * shares)
         scene = scene or self.scene(observation)
         return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
 
@@ -245,10 +240,8 @@ class ViaQPolicy(BasePolicy):
         coarse, rounds, size = self.checks > 0, self.refinements, self.per_refinement
         if coarse and rounds and self.task.action.n_via <= 1 and not (self.task.whole_arm or self.replanning):
             rounds, size = 1, rounds * size
-        near = None
-        if self.settings["form"] == "poses":
-            geometry = self.critic.pairs.geometry
-            near = geometry.near_coarse if coarse else geometry.near
+        geometry = self.critic.pairs.geometry
+        near = geometry.near_coarse if coarse else geometry.near
         values = self.values(observation, actions, scene, near=near, coarse=coarse)
         for each in range(rounds):
             some = self._near(actions, values, each, size)
@@ -375,55 +368,20 @@ def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
     return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time), *sizes)
 
 
-def seen_from_line(observation: Observation, task: Task) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
-    """Return ends, obstacle rows and their presence in the frame of the line from hand to goal.
+def seen_ends(observation: Observation) -> Numbers:
+    """Return start, goal, distance and, in replanning tasks, the present motion, scaled to order one, shape (B, E).
 
-    Returns:
-        Start, goal, distance and, in replanning tasks, the present motion, shape (B, E); rows of centre, half-axis and
-        radius (or shape, centre, rotation and half lengths) and, in replanning tasks, velocity, shape (B, n, F);
-        presence, shape (B, n). Lengths are scaled to order one.
+    Velocity and acceleration of the hand are in the frame of the line from hand to goal.
     """
-    start, goal, line = observation["hand"], observation["goal"], direction(observation)
-    axes = np.stack(frame(line), axis=-1)
-    ends = [2.0 * start, 2.0 * goal, 2.0 * np.sqrt((line * line).sum(axis=-1, keepdims=True))]
+    line = direction(observation)
+    distance = np.sqrt((line * line).sum(axis=-1, keepdims=True))
+    ends = [2.0 * observation["hand"], 2.0 * observation["goal"], 2.0 * distance]
     if is_replanning(observation):
+        axes = np.stack(frame(line), axis=-1)
         for name, scale in (("velocity", 1.0), ("acceleration", 0.1)):
             ends.append((observation[name][:, None] @ axes)[:, 0] * scale)
         ends += [observation["remaining"], observation["time_left"]]
-    together = np.concatenate(ends, axis=-1)
-    width = seen_row_size(task.observation) + (task.arm.dimension if is_replanning(observation) else 0)
-    if "obstacles" not in observation:
-        return together, np.zeros((len(start), 1, width)), np.zeros((len(start), 1), dtype=bool)
-    if task.scenes.shapes != CAPSULES:
-        return together, *_shapes_from_line(observation, axes, len(task.scenes.shapes))
-    rows = task.observation.capsules(observation["obstacles"])
-    centre = (rows.centre - 0.5 * (start + goal)[:, None]) @ axes
-    half = rows.half_axis @ axes
-    half = np.where(half[..., 1:2] < 0.0, -half, half)  # the sign of a half-axis has no meaning
-    seen = [5.0 * centre, 5.0 * half, 5.0 * rows.radius[..., None]]
-    if is_replanning(observation):
-        seen.append(3.0 * observation["obstacle_velocities"].reshape(centre.shape) @ axes)
-    return together, np.concatenate(seen, axis=-1), np.asarray(rows.present > 0.5)
-
-
-def _shapes_from_line(
-    observation: Observation, axes: Numbers, n_shapes: int
-) -> tuple[Numbers, NDArray[np.bool_]]:
-    """Return rows of shape, centre, rotation and half lengths in the frame of the line, and their presence."""
-    rows, (number, d, _) = observation["obstacles"], axes.shape
-    frame, middle = np.tile(np.eye(3, dtype=axes.dtype), (number, 1, 1)), np.zeros((number, 3), axes.dtype)
-    frame[:, :d, :d], middle[:, :d] = axes, 0.5 * (observation["hand"] + observation["goal"])
-    pose = rows[..., n_shapes:]
-    turned = [pose[..., first : first + 3] @ frame for first in (3, 6)]
-    seen = [
-        rows[..., :n_shapes],
-        5.0 * (pose[..., :3] - middle[:, None]) @ frame,
-        *turned,
-        5.0 * pose[..., 9:12],
-    ]
-    if is_replanning(observation):
-        seen.append(3.0 * observation["obstacle_velocities"].reshape(*rows.shape[:2], d) @ axes)
-    return np.concatenate(seen, axis=-1), np.asarray(rows[..., -1] > 0.5)
+    return np.concatenate(ends, axis=-1)
 
 
 def instants_of(number: int) -> NDArray[np.float32]:

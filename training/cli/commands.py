@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 
-from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
@@ -15,7 +14,6 @@ from viapoint.training.evaluation.evaluator import check_baselines, evenly_sprea
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planners.baselines import agent_method
-from viapoint.training.plotting.failure_report import classify_failures, write_failures
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
@@ -47,9 +45,6 @@ def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     agent = None if config.agent is None else load_agent(config.agent)
     run = Run(str(config.agent)) if config.agent and (Path(config.agent) / "config.json").is_file() else None
-    mine = agent.env_id if config.failures is not None and agent is not None else ""
-    if mine in STEP_TASKS or mine in REPLANNING_TASKS:
-        raise ValueError(f"failures are sorted where one action is a whole movement; in {mine} it is not")
     env_id, env_kwargs = task_of(agent, config.env, None)
     check_baselines(config.baselines, agent, env_id)
     whole = scenes_for(config.scenes, env_id, env_kwargs)
@@ -68,13 +63,6 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"results, scene by scene: {config.json}")
     if result.partial:
         raise EvaluationStoppedError("stopped: the results are partial")
-    if config.failures is not None:
-        last = [each for each in result.results if each.name.startswith("agent")][-1]
-        failures = classify_failures(
-            last, scenes.take(slice(0, len(last.success))), agent, env_id, **env_kwargs
-        )
-        write_failures(failures, config.failures, env_id, **env_kwargs)
-        print(f"{len(failures.rows)} failures by kind: {config.failures}")
 
 
 def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:

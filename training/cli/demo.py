@@ -15,7 +15,7 @@ from viapoint.training.algorithms.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
-from viapoint.training.io.files import BadFileError, read_json
+from viapoint.training.io.files import BadFileError, check_ours, read_json
 from viapoint.training.planners.baselines import Method, StoredSolutions, agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery, play
@@ -25,6 +25,15 @@ from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
 
 BASELINES = ("search16", "search512", "straight", "random")
+FILES = (
+    "table.md",
+    "table.json",
+    "learning_curve.png",
+    "success_by_band.png",
+    "gallery.png",
+    "movements.mp4",
+)
+"""Files besides those of the run."""
 PICTURES = 12
 """Number of movements in the gallery."""
 MOVEMENTS = 4
@@ -38,6 +47,8 @@ def run(config: DemoConfig) -> None:
     """
     began = time.monotonic()
     folder = config.out
+    for name in FILES:
+        check_ours(folder / name)
     trained = _trained(config)
     model_folder = find_model(folder)
     agent = load_agent(model_folder)

@@ -16,18 +16,14 @@ import tyro
 from viapoint.envs.registration import ENV_IDS
 from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.config.configs import (
-    BenchConfig,
     DemoConfig,
     DoctorConfig,
     EvaluateConfig,
-    ExportConfig,
-    ImportConfig,
     LiveConfig,
     PaperConfig,
     PlayConfig,
     StudyConfig,
     TrainConfig,
-    TuneConfig,
 )
 
 
@@ -51,15 +47,11 @@ COMMANDS: dict[str, Command] = {
     "train": Command(TrainConfig, "viapoint.training.cli.commands", "train"),
     "evaluate": Command(EvaluateConfig, "viapoint.training.cli.commands", "evaluate"),
     "play": Command(PlayConfig, "viapoint.training.cli.commands", "play"),
-    "bench": Command(BenchConfig, "viapoint.training.cli.bench", "run"),
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
     "study": Command(StudyConfig, "viapoint.training.study.run", "run"),
     "live": Command(LiveConfig, "viapoint.training.live.page", "run"),
     "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
-    "tune": Command(TuneConfig, "viapoint.training.study.tuning_report", "run"),
-    "export": Command(ExportConfig, "viapoint.training.cli.archives", "export"),
-    "import-sb3": Command(ImportConfig, "viapoint.training.cli.archives", "import_sb3"),
 }
 """Subcommands by name."""
 

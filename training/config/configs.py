@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
 import tyro
 
-from viapoint.envs.registration import ENV_IDS, STEP_TASKS
-from viapoint.training.config.base import Config
+from viapoint.envs.common.validation import is_number
+from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
-    check_baselines,
     check_env,
     check_env_kwargs,
     check_file,
     check_folder,
-    check_has_scenes,
-    check_hyperparameters,
-    check_observed,
-    check_rollout_workers,
-    check_stalling,
     check_whole,
-    check_whole_movements,
 )
-from viapoint.training.config.discount import check_discount_unit
-from viapoint.training.config.key_values import NamedValues, to_words
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
+from viapoint.training.io.files import parse_yaml
 
 ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
@@ -44,6 +39,90 @@ if TYPE_CHECKING:
     AnyPath = str | Path
 else:
     AnyPath = Path  # the command line makes paths of words
+
+
+def _from_words(words: list[str]) -> dict[str, Any]:
+    """Return NAME=VALUE words as a dictionary; values are YAML, so that lists and settings by name have a form."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name:
+            raise ValueError(f"must be NAME=VALUE, got {word!r}")
+        if name in values:
+            raise ValueError(f"{name} is there twice")
+        values[name] = parse_yaml(text)
+    return values
+
+
+def _to_words(values: Mapping[str, Any]) -> list[str]:
+    """Return a dictionary as NAME=VALUE words; :func:`_from_words` is the inverse."""
+    words = []
+    for name, value in values.items():
+        plain = isinstance(value, str) and parse_yaml(value) == value
+        words.append(f"{name}={value if plain else json.dumps(value)}")
+    return words
+
+
+# tyro reads a dictionary of one type of values only.
+NamedValues = Annotated[
+    dict[str, Any],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME=VALUE",
+        instance_from_str=_from_words,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=_to_words,
+    ),
+]
+"""Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Configuration of a command; paths may be given as strings."""
+
+    least: ClassVar[Mapping[str, int]] = {}
+    """Least values of the whole numbers, by name; None is allowed where it is the default."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, str) and "Path" in str(each.type):
+                object.__setattr__(self, each.name, Path(value))
+            if each.name in self.least and not (value is None and each.default is None):
+                object.__setattr__(self, each.name, check_whole(each.name, value, self.least[each.name]))
+        self._check()
+
+    def _check(self) -> None:
+        """Check what is not a whole number."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return {
+            name: f"{value}"
+            if isinstance(value, Path)
+            else list(value)
+            if isinstance(value, tuple)
+            else value
+            for name, value in values.items()
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> Self:
+        """Return the configuration that plain values describe.
+
+        Raises:
+            ValueError: A name is unknown or a value is not allowed.
+        """
+        names = [each.name for each in dataclasses.fields(cls)]
+        unknown = sorted(set(record) - set(names))
+        if unknown:
+            raise ValueError(f"{cls.__name__} knows {', '.join(names)}, not {unknown[0]!r}")
+        return cls(
+            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +141,9 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 40000)
     """
 
-    least: ClassVar = dict.fromkeys(
-        ("seed", "eval_every", "observe_candidates", "rollout_workers"), 0
-    ) | dict.fromkeys(("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1)
+    least: ClassVar = dict.fromkeys(("seed", "eval_every", "observe_candidates"), 0) | dict.fromkeys(
+        ("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
+    )
 
     env: EnvId = DEFAULT_ENV
     """Id of the environment."""
@@ -93,17 +172,11 @@ class TrainConfig(Config):
     observe_candidates: int = 0
     """Plans whose clearance is observed; not for viaq."""
     env_kwargs: NamedValues = field(default_factory=dict)
-    """Arguments of the environment, words or JSON: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
+    """Arguments of the environment, values in YAML: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
     """Hyperparameters that replace those of the preset, in the same form: batch_size=256."""
-    discount_unit: float | None = None
-    """Time that gamma discounts once, [s]; default: that of the preset."""
     progress: bool = True
     """Show a progress bar."""
-    rollout_workers: int = 0
-    """Processes that share the environments, 0 for none."""
-    on: str = "local"
-    """Place of rollout workers: local, ray or ray://HOST:PORT."""
 
     def _check(self) -> None:
         check_env(self.env)
@@ -114,14 +187,28 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        check_observed(self.observe_candidates, self.algo, self.env)
+        if self.observe_candidates and (self.algo == "viaq" or self.env in STEP_TASKS):
+            raise ValueError(
+                "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
+                f"control step, got {self.observe_candidates} for {self.algo} on {self.env}"
+            )
         check_env_kwargs(self.env_kwargs)
-        check_rollout_workers(self.rollout_workers, self.on, None if self.resume else self.copies)
-        check_hyperparameters(self.algo, self.hyperparameters)
-        if self.discount_unit is not None:
-            check_discount_unit(self.algo, self.discount_unit, self.env)
-        limits = self.least_timesteps, self.total_timesteps
-        check_stalling(self.stop_when_stalled, self.min_timesteps, self.evaluation_interval, limits)
+        if not isinstance(self.hyperparameters, Mapping):
+            raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
+        share = self.stop_when_stalled
+        if share is None:
+            if self.min_timesteps is not None:
+                raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
+            return
+        if not is_number(share) or not 0.0 < share < 1.0:
+            raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
+        if not self.evaluation_interval:
+            raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
+        if self.least_timesteps >= self.total_timesteps:
+            raise ValueError(
+                f"n_timesteps must be over min_timesteps ({self.least_timesteps}) with stop_when_stalled, "
+                f"got {self.total_timesteps}"
+            )
 
     @property
     def preset(self) -> Preset:
@@ -154,22 +241,17 @@ class TrainConfig(Config):
         return self.checkpoint_every or self.preset.checkpoint_every
 
     @property
-    def time_unit(self) -> float | None:
-        """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
-        return self.preset.discount_unit if self.discount_unit is None else self.discount_unit
-
-    @property
     def command(self) -> str:
         """Command that trains with this configuration, apart from where it is written and what is shown."""
         words = ["viapoint", "train"]
-        for name in ("env", "algo", "seed", "n_timesteps", "n_envs", "discount_unit"):
+        for name in ("env", "algo", "seed", "n_timesteps", "n_envs"):
             value = getattr(self, name)
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", f"{value}"]
         for name in ("env_kwargs", "hyperparameters"):
             values = getattr(self, name)
             if values:
-                words += [f"--{name.replace('_', '-')}", *to_words(values)]
+                words += [f"--{name.replace('_', '-')}", *_to_words(values)]
         return shlex.join(words)
 
     @property
@@ -206,9 +288,9 @@ class EvaluateConfig(AgentConfig):
     """
 
     baselines: tuple[str, ...] = ("straight", "random", "planner")
-    """Some of straight, constant, random, random16, random80, planner, ompl, search16, search64, search512 and
-    search4096 (the best of that many computed plans); with an agent, untrained (its network before training); in tasks
-    with replanning, unrevised (the first plan alone)."""
+    """Some of straight, constant, random, random16, random80, planner, ompl, search512 or another number (the best of
+    that many computed plans), sobol512 (of fixed plans), random_order512; with an agent, untrained (its network before
+    training); in tasks with replanning, unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
@@ -217,8 +299,6 @@ class EvaluateConfig(AgentConfig):
     """Number of scenes, evenly spread over the set; all if not given."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
-    failures: Path | None = None
-    """Folder for counts and pictures of the agent's failures by kind, those of its last row in the table."""
     env: Annotated[str | None, ENV] = None
     """Id of the environment; default: that of the agent."""
 
@@ -226,7 +306,8 @@ class EvaluateConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        check_baselines(self.baselines)
+        if len(set(self.baselines)) < len(self.baselines):
+            raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
         if self.env is not None:
             check_env(self.env)
         if self.agent is None and self.env is None:
@@ -236,10 +317,8 @@ class EvaluateConfig(AgentConfig):
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         check_file("json", self.json)
-        check_folder("failures", self.failures)
-        for name, asked in (("checks", any(self.checks)), ("failures", self.failures is not None)):
-            if asked and self.agent is None:
-                raise ValueError(f"{name} concerns an agent, and none is given")
+        if any(self.checks) and self.agent is None:
+            raise ValueError("checks concerns an agent, and none is given")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,36 +371,6 @@ class LiveConfig(AgentConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig(Config):
-    """Measure throughput relative to the physics engine alone and to a plain array copy.
-
-    Example: viapoint bench --json bench.json
-    """
-
-    env: EnvId = DEFAULT_ENV
-    """Id of the environment."""
-    num_envs: int = 512
-    """Environments in the batch."""
-    repeats: int = 9
-    """Alternating measurements of each side; environments count with their mean, primitives with the fastest."""
-    workers: int = 0
-    """Worker processes to compare with as many threads; 0 leaves the comparison out."""
-    json: Path | None = None
-    """JSON file for the figures."""
-
-    least: ClassVar = {"num_envs": 1, "repeats": 1, "workers": 0}
-
-    def _check(self) -> None:
-        check_env(self.env)
-        if self.workers > self.num_envs:
-            raise ValueError(
-                f"workers must be at most num_envs, which is {self.num_envs}, got {self.workers}"
-            )
-        check_whole_movements(self.env)
-        check_file("json", self.json)
-
-
-@dataclass(frozen=True, kw_only=True)
 class PaperConfig(Config):
     """Reproduce the claims and figures of Flash & Hogan 1985 with the model and on the simulated arm.
 
@@ -332,12 +381,9 @@ class PaperConfig(Config):
     """Folder for the figures and the table."""
     agent: Path | None = None
     """Run folder or model folder of the agent that moves around the rows of lights; default: the shipped agent."""
-    guide: Path | None = None
-    """Folder for the small pictures of docs/flash-hogan.md."""
 
     def _check(self) -> None:
         check_folder("out", self.out)
-        check_folder("guide", self.guide)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,8 +410,11 @@ class DemoConfig(Config):
 
     def _check(self) -> None:
         check_env(self.env)
-        check_whole_movements(self.env)
-        check_has_scenes(self.env)
+        if self.env in {*STEP_TASKS, *REPLANNING_TASKS, *OWN_ARM_TASKS}:
+            like = STEP_TASKS.get(self.env) or OWN_ARM_TASKS.get(self.env, DEFAULT_ENV)
+            raise ValueError(
+                f"env must have frozen scenes and whole movements as actions, {like} for one, got {self.env!r}"
+            )
         check_folder("out", self.out)
 
     @property
@@ -388,98 +437,24 @@ class DoctorConfig(Config):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportConfig(Config):
-    """Convert an archive of Stable-Baselines3 into a model folder. Opening such an archive runs its code.
-
-    Example: viapoint import-sb3 model.zip --env viapoint/PlanarObstacles-v0 --out models/mine --trust
-    """
-
-    file: tyro.conf.Positional[Path]
-    """Archive that `model.save` of Stable-Baselines3 wrote."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment that the model was trained on, with default arguments; default: the one that an archive by
-    `viapoint export` names, otherwise viapoint/PlanarObstacles-v0."""
-    out: Path
-    """Folder for the model, which must be new."""
-    algo: Algorithm | None = None
-    """Algorithm; recognised from the archive if not given."""
-    trust: bool = False
-    """Open the archive without asking, because you trust its source."""
-
-    def _check(self) -> None:
-        if self.env is not None:
-            check_env(self.env)
-        check_folder("out", self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TuneConfig(Config):
-    """Search for hyperparameters with Optuna. The same command continues a search; several may work on one folder.
-
-    Example: viapoint tune benchmarks/tuning/sac_obstacles.yaml --workers 2 --out runs/tune
-    """
-
-    file: tyro.conf.Positional[Path]
-    """YAML file that describes the search: environment, algorithm, budget, parameters with ranges (docs/tuning.md)."""
-    out: Path | None = None
-    """Folder of the search; default: runs/tune-<name of the file>."""
-    trials: int | None = None
-    """Number of trials in total, over all calls and processes; default: that of the file."""
-    workers: int | None = None
-    """Number of trainings at the same time; default: 1, or on Ray as many as fit."""
-    on: str = "local"
-    """Place of the trainings: local, ray, or ray://HOST:PORT."""
-
-    least: ClassVar = {"trials": 1, "workers": 1}
-
-    def _check(self) -> None:
-        check_folder("out", self.out)
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the search."""
-        return self.out or Path("runs") / f"tune-{self.file.stem}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportConfig(Config):
-    """Write an agent as an archive of Stable-Baselines3 with a model card, for example to share it on Hugging Face.
-
-    Example: viapoint export viapoint/PlanarObstacles-v0 --out shared/planar-obstacles --scenes test
-    """
-
-    agent: Annotated[tyro.conf.Positional[str], AGENT]
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    out: Path
-    """Folder for the archive and its card README.md, or a file that ends in .zip, with the card beside it."""
-    scenes: tuple[str, ...] = ()
-    """Scene sets in which the agent is measured for the card, such as test hard; measurements that a run folder holds
-    are there already."""
-    license: str | None = None
-    """Licence of the model in its card, such as mit; default: mit for shipped agents, none for others."""
-
-    def _check(self) -> None:
-        check_folder("out", self.out.parent if self.out.suffix == ".zip" else self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
 class StudyConfig(Config):
-    """Run a study: trainings, evaluations, baselines and pages that a YAML file describes. A second call continues.
+    """Run a study: trainings, baselines and searches for hyperparameters that a YAML file describes.
+
+    The same command continues a study that was stopped, and does what was added to its file.
 
     Example: viapoint study benchmarks/results.yaml --workers 2
     """
 
     file: tyro.conf.Positional[Path]
     """YAML file that describes the study (docs/studies.md)."""
-    on: str = "local"
-    """Place of the jobs: local, ray, or ray://HOST:PORT."""
+    out: Path | None = None
+    """Folder of runs and results; default: the one in the file, or runs/<name of the file>."""
+    address: str | None = None
+    """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
-    """Number of jobs at the same time; default: 1, or on Ray as many as fit."""
-    only: tuple[Literal["train", "evaluate", "baselines", "time", "page"], ...] = (
-        "train", "evaluate", "baselines", "time", "page",
-    )  # fmt: skip
-    """Steps to run."""
-    redo: tuple[str, ...] = ()
-    """Patterns of rows whose measurements these steps make again, such as viaq, 'viaq/*' or 'PandaReach-v0/*'."""
+    """Number of trials at the same time; default: as many as the cores allow."""
 
-    least: ClassVar = {"workers": 0}
+    least: ClassVar = {"workers": 1}
+
+    def _check(self) -> None:
+        check_folder("out", self.out)

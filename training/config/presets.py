@@ -26,8 +26,6 @@ class Preset:
     """Decisions between two evaluations on the validation scenes."""
     checkpoint_every: int = 5_000
     """Decisions between two checkpoints."""
-    discount_unit: float | None = None
-    """Time after which gamma discounts once, [s]; None if each decision is discounted once."""
     hyperparameters: tuple[tuple[str, Any], ...]
     """Hyperparameters; schedules and noise as :mod:`viapoint.training.algorithms.model_io` writes them."""
 
@@ -108,22 +106,22 @@ REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"],
 """Presets of tasks without obstacles, which need fewer decisions."""
 
 REPLANNING_PRESETS: dict[str, Preset] = {
-    name: dataclasses.replace(preset, discount_unit=0.1) for name, preset in PRESETS.items()
-} | {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
         hyperparameters=(*PRESETS["viaq"].hyperparameters, ("gradient_steps", 6), ("next_candidates", 4)),
     )
 }
-"""Presets of replanning tasks, in which discounts follow time; viaq does not discount, as episodes end in seconds."""
+"""Presets of replanning tasks."""
 
 
 def preset_of(env_id: str, algo: Algorithm) -> Preset:
     """Return the default settings of an algorithm in an environment."""
     if env_id in STEP_TASKS:
         return STEP_PRESETS[algo]
-    if env_id in REPLANNING_TASKS:
-        return REPLANNING_PRESETS[algo]
     task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
-    presets = REACH_PRESETS if task.get("n_obstacles") == 0 else PRESETS
+    presets = PRESETS
+    if env_id in REPLANNING_TASKS:
+        presets = REPLANNING_PRESETS
+    elif task.get("n_obstacles") == 0:
+        presets = REACH_PRESETS
     return presets.get(algo, PRESETS[algo])

@@ -21,8 +21,10 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.algorithms.model_io import untrained
+from viapoint.training.config.checks import check_whole
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
+from viapoint.training.io.files import versions
 from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task
@@ -69,7 +71,7 @@ class MethodResult:
 
     def summary(self) -> dict[str, Any]:
         """Return the metrics by name; those of successes are None without successes."""
-        success, median = self.success, _median
+        success = self.success
         return {
             "scenes": len(success),
             "partial": self.partial,
@@ -84,16 +86,16 @@ class MethodResult:
             },
             "collision": _rate(np.asarray(self.outcomes["collision"], dtype=bool)),
             "unreachable": _rate(~np.asarray(self.outcomes["reachable"], dtype=bool)),
-            "min_clearance": median(self.outcomes["min_clearance"]),
-            "goal_error": median(self.outcomes["goal_error"]),
-            "tracking_error": median(self.outcomes["tracking_error"]),
-            "jerk_ratio": median(self.outcomes["jerk_ratio"][success]),
-            "duration": median(self.outcomes["duration"][success]),
-            "path_length": median(self.outcomes["path_length"][success]),
+            "min_clearance": _quantile(self.outcomes["min_clearance"]),
+            "goal_error": _quantile(self.outcomes["goal_error"]),
+            "tracking_error": _quantile(self.outcomes["tracking_error"]),
+            "jerk_ratio": _quantile(self.outcomes["jerk_ratio"][success]),
+            "duration": _quantile(self.outcomes["duration"][success]),
+            "path_length": _quantile(self.outcomes["path_length"][success]),
             "spl": success_weighted_path_length(success, self.distance, self.outcomes["path_length"])
             if len(success) and np.isfinite(self.distance).all()
             else None,
-            "decision_time": median(self.decision_times),
+            "decision_time": _quantile(self.decision_times),
             "decision_time_98": _quantile(self.decision_times, 0.98)
             if len(self.decision_times) > 1
             else None,
@@ -151,6 +153,7 @@ class EvaluationResult:
     def to_dict(self) -> dict[str, Any]:
         """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
         return {
+            "viapoint": versions()["viapoint"],
             "env": self.env_id,
             "scenes": self.scenes,
             "sha256": self.sha256,
@@ -210,6 +213,11 @@ def evaluate(
         >>> [row["method"] for row in result.rows]
         ['agent', 'straight line']
     """
+    if n_scenes is not None:
+        check_whole("n_scenes", n_scenes, 1)
+    for number in [checks] if checks is None or isinstance(checks, int) else checks:
+        if number is not None:
+            check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
     env_id, kwargs = task_of(agent, env, env_kwargs)
@@ -450,11 +458,7 @@ def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
     }
 
 
-def _median(values: NDArray[Any]) -> float | None:
-    return _quantile(values, 0.5)
-
-
-def _quantile(values: NDArray[Any], share: float) -> float | None:
+def _quantile(values: NDArray[Any], share: float = 0.5) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
 
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from viapoint.training.io.files import write_bytes, write_json
+from viapoint.training.io.files import MARK, write_bytes, write_json
 from viapoint.training.scene_sets.scene_set import BANDS
 
 Summary = Mapping[str, Any]
@@ -82,7 +82,10 @@ def rows(record: Record) -> list[list[str]]:
     columns = _columns(record)
     heads = ["method", *(column.heading for column in columns)]
     table = [
-        [_name(name, summary), *(column.cell(summary) for column in columns)]
+        [
+            f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name,
+            *(column.cell(summary) for column in columns),
+        ]
         for name, summary in record["methods"].items()
     ]
     shown = [i for i in range(len(heads)) if any(line[i] != "-" for line in table)]
@@ -146,10 +149,6 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 def write(record: Record, folder: Path) -> tuple[Path, Path]:
     """Write the table as Markdown, and with the outcomes of every scene as JSON."""
     document, data = folder / "table.md", folder / "table.json"
-    write_bytes(document, markdown(record).encode())
+    write_bytes(document, f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
     write_json(data, dict(record))
     return document, data
-
-
-def _name(name: str, summary: Summary) -> str:
-    return f"{name} (partial: {summary['scenes']} scenes)" if summary["partial"] else name

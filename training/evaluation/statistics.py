@@ -141,42 +141,6 @@ def across_seeds(
     return Interval(float(interquartile_mean(table.mean(axis=1))), float(low), float(high))
 
 
-def probability_of_improvement(
-    first: ArrayLike, second: ArrayLike, generator: np.random.Generator, *, samples: int = 2_000
-) -> Interval:
-    """Return the probability that a run of the first method beats one of the second, with a bootstrap interval.
-
-        P(X > Y) = 1/(N M) sum_ij (1[x_i > y_j] + 1/2 1[x_i = y_j])
-
-    It is Mann and Whitney's U / (N M). The interval is the percentile interval of `scipy.stats.bootstrap`; a method
-    with a single run shows it no spread. Source: Agarwal et al. 2021, arXiv 2108.13264, section 4.3.
-
-    Args:
-        first: Scores of the runs, shape (N,).
-        second: Scores of the runs, shape (M,).
-        generator: Random generator of the draws.
-        samples: Number of draws.
-
-    Raises:
-        ValueError: The scores have other shapes, or one is no number.
-    """
-    whole_number("samples", samples, 1)
-    x, y = _scores(first), _scores(second)
-    if x.ndim != 1 or y.ndim != 1 or not x.size or not y.size:
-        raise ValueError(f"both must have shape (runs,), got {x.shape} and {y.shape}")
-    # SciPy asks for two runs at least; a single run twice gives the draws of a single run
-    low, high = stats.bootstrap(
-        [np.repeat(each, 2 if each.size == 1 else 1) for each in (x, y)],
-        _superiority,
-        n_resamples=samples,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        vectorized=True,
-        rng=generator,
-    ).confidence_interval
-    return Interval(float(_superiority(x, y)), float(low), float(high))
-
-
 def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:
     """Return SPL: the success rate with each success weighted by how short its path was.
 
@@ -199,11 +163,6 @@ def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken:
     if not ((shortest > 0.0) & np.isfinite(shortest)).all():
         raise ValueError(f"shortest must be more than 0 and finite, got {shortest.min()} to {shortest.max()}")
     return float((s * shortest / np.maximum(taken, shortest)).mean())
-
-
-def _superiority(x: Float, y: Float, axis: int = -1) -> Any:
-    """Compute the share of pairs in which x is greater, a tie counting half, over the last axis of both."""
-    return 0.5 + 0.5 * np.sign(x[..., :, None] - y[..., None, :]).mean(axis=(-2, -1))
 
 
 def _scores(values: ArrayLike) -> Float:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import uuid
@@ -27,8 +29,22 @@ LARGEST_YAML = 1 << 20
 """Greatest size of a YAML file, [bytes]."""
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 """Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
+MARK = b"written by viapoint"
+"""Text that every file of this package contains where a user names its place, apart from JSON."""
+JSON_MARK = b'"viapoint":'
+"""Name of the version in JSON files of this package."""
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
+PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+"""Packages that results depend on."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    return {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }
 
 
 class BadFileError(ValueError):
@@ -37,6 +53,22 @@ class BadFileError(ValueError):
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
         self.path = path
+
+
+def check_ours(path: Path) -> None:
+    """Check that a file may be written: there is none yet, or one that this package wrote.
+
+    Raises:
+        BadFileError: There is something else.
+    """
+    if path.is_symlink() or path.exists():
+        if not path.is_file():
+            raise BadFileError(path, "exists and is no file; name another one")
+        content = path.read_bytes()
+        if MARK not in content and JSON_MARK not in content:
+            raise BadFileError(
+                path, "exists and was not written by viapoint; name another file, or move it away"
+            )
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -61,14 +93,26 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
-    """Create or replace a folder atomically; `fill` writes its content."""
+def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = True) -> None:
+    """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
+
+    Args:
+        path: Folder to write.
+        fill: Function that writes the content to a temporary folder.
+        marked: Replace only folders whose JSON has the mark of this package; False where the name of the folder
+            suffices. Folders with further files are never replaced.
+
+    Raises:
+        BadFileError: There is something else, which stays as it is.
+    """
+    path = Path(os.path.realpath(path))  # a link to a folder stays a link
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     temporary.mkdir(parents=True)
     try:
         fill(temporary)
         _sync_folder(temporary)
         if path.exists():
+            _check_replaceable(path, {each.name for each in temporary.iterdir()}, marked)
             outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
             temporary.rename(path)
@@ -79,6 +123,24 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def _check_replaceable(path: Path, names: set[str], marked: bool) -> None:
+    """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
+    if not path.is_dir():
+        raise BadFileError(path, "exists and is no folder; name another one")
+    there = {each.name for each in path.iterdir()}
+    for name in sorted(there - names):
+        raise BadFileError(
+            path, f"holds {name}, which is not part of what is written; name a new or empty folder"
+        )
+    for name in sorted(there):
+        if not (path / name).is_file():
+            raise BadFileError(path / name, "exists and is no file; name a new or empty folder")
+        if marked and name.endswith(".json"):
+            check_ours(path / name)
+    if marked and there and not any(name.endswith(".json") for name in there):
+        raise BadFileError(path, f"holds {min(there)}, not written by viapoint; name a new or empty folder")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -143,17 +205,30 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
 
 
+def parse_yaml(text: str | bytes) -> Any:
+    """Return the plain values that a YAML text holds.
+
+    Raises:
+        ValueError: The text is no YAML, or a name is there twice.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"cannot be read as YAML ({' '.join(str(error).split())})") from None
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds values by name.
 
     Raises:
         BadFileError: It is missing, too large, no YAML, or holds something else.
     """
-    content = read_bytes(path, LARGEST_YAML)
     try:
-        value = yaml.load(content, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadFileError(path, f"cannot be read as YAML ({' '.join(str(error).split())})") from None
+        value = parse_yaml(read_bytes(path, LARGEST_YAML))
+    except BadFileError:
+        raise
+    except ValueError as error:
+        raise BadFileError(path, str(error)) from None
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise BadFileError(path, "must hold values by name, such as env: viapoint/PlanarObstacles-v0")
     return value

@@ -119,10 +119,8 @@ class DecisionMaker:
                 considered = self._considered(observation)
             action, maker = considered[0][considered[1].argmax()], "agent"
         else:
-            action, maker = (
-                self.action(observation, checks)[0],
-                f"agent, {checks} checks" if checks else "agent",
-            )
+            action = self.action(observation, checks)[0]
+            maker = f"agent, {checks} checks" if checks else "agent"
         seconds = time.perf_counter() - begin
         action = np.asarray(action, dtype=np.float32)
         (chosen,) = _computed_proposals(observation, task, action[None])
@@ -133,10 +131,9 @@ class DecisionMaker:
         if self._agent is None:
             return self._search_of(self.task).decide(observation)
         scenes: Any = None
+        method = agent_method("agent", self._agent, checks if self.ranks else None)
         with self._lock:
-            return agent_method("agent", self._agent, checks if self.ranks else None).decide(
-                observation, scenes
-            )
+            return method.decide(observation, scenes)
 
     def proposals(self, observation: Observation, decision: Decision) -> tuple[Proposal, ...]:
         """Return the chosen plan and the best others that differ from it, with their ranks."""

@@ -155,21 +155,16 @@ def _serve(host: str, port: int) -> viser.ViserServer:
         try:
             probe.bind((host, port))
         except OSError as error:
-            what = (
-                "is occupied: choose another with --port"
-                if error.errno in OCCUPIED
-                else f"({error.strerror})"
-            )
-            raise OSError(f"the page cannot listen on {host}:{port}: the port {what}") from None
+            raise OSError(
+                f"the page cannot listen on {host}:{port} ({error.strerror}); --host and --port choose another address"
+            ) from None
         port = probe.getsockname()[1]
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # the library prints a box with the address
         server = viser.ViserServer(host=host, port=port, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise OSError(
-            f"the page cannot listen on {host}:{port}: the port is occupied: choose another with --port"
-        )
+        raise OSError(f"the page cannot listen on {host}:{port}; --host and --port choose another address")
     # The page never asks for a public address, and a message that does gets none: no request leaves the machine.
     server.request_share_url = lambda *_, **__: None
     return server
@@ -181,7 +176,3 @@ def _light(scene: Any) -> None:
     scene.configure_default_lights(enabled=False)
     scene.add_light_ambient("/ambient", intensity=2.5)
     scene.add_light_directional("/lamp", intensity=1.2, position=(-0.6, -0.5, 2.0))
-
-
-OCCUPIED = (48, 98, 10048)
-"""Numbers of the error that an address is in use, on macOS, Linux and Windows."""

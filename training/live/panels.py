@@ -5,18 +5,19 @@ from __future__ import annotations
 import functools
 import html
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.training.live.obstacle_editing import BOX_SIZES
+from viapoint.training.live.obstacle_editing import BOX_SIZES, KINDS
 
 if TYPE_CHECKING:
     import viser
 
     from viapoint.training.live.decisions import Proposal
     from viapoint.training.live.movements import Profile
+    from viapoint.training.live.setting import MethodResult, Setting
 
 WIDTH = 330
 """Width of a panel, [pixels]."""
@@ -26,6 +27,8 @@ SHOWN_CLEARANCE = 0.25
 """Greatest clearance in the plot, [m]."""
 SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
 """Speeds of the playback."""
+MOST_VIAS = 4
+"""Greatest number of via-points of the slider."""
 RESET = "Reset"
 """Name of the button that undoes all changes of a scene."""
 CHECKS = {"none": 0, "16": 16, "64": 64}
@@ -34,65 +37,28 @@ GOOD, BAD, PLAIN = "#1b7f4b", "#c4202b", "#4a4f58"
 """Colours of messages."""
 
 
-class Actions(NamedTuple):
-    """Functions that the panels call."""
-
-    scene: Callable[[str], None]
-    """Called with the name of the wanted kind of scene."""
-    duration: Callable[[float], None]
-    vias: Callable[[int], None]
-    checks: Callable[[int], None]
-    pick: Callable[[int], None]
-    add: Callable[[str], None]
-    remove: Callable[[], None]
-    resize: Callable[[str, float], None]
-    decide: Callable[[], None]
-    execute: Callable[[], None]
-    compare: Callable[[], None]
-    save: Callable[[], None]
-    load: Callable[[bytes], None]
-    code: Callable[[], None]
-    picture: Callable[[], None]
-    film: Callable[[], None]
-    view: Callable[[], None]
-
-
-class Facts(NamedTuple):
-    """Facts about the page that do not change."""
-
-    title: str
-    subtitle: str
-    scene_kinds: Sequence[str]
-    obstacle_kinds: Sequence[str]
-    n_via: int
-    most_vias: int
-    duration_range: tuple[float, float]
-    ranks: bool
-    """True if the agent can check its proposals."""
-    spatial: bool
-
-
-class MethodResult(NamedTuple):
-    """Simulated outcome of a method in one scene."""
-
-    name: str
-    success: bool
-    reward: float
-    clearance: float
-    """Least clearance of the executed movement, [m]."""
-    jerk_ratio: float
-    seconds: float
-    """Time of the decision, [s]."""
-
-
 class Panels:
-    """Panels of one tab."""
+    """Panels of one tab.
 
-    def __init__(self, client: viser.ClientHandle, facts: Facts, actions: Actions) -> None:
-        self._gui, self._facts, self._actions = client.gui, facts, actions
+    Args:
+        client: Tab.
+        setting: Setting of the agent.
+        scene_kinds: Names of the buttons that draw scenes.
+        act: Function that is called with the name of a control and its values.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        setting: Setting,
+        scene_kinds: Sequence[str],
+        act: Callable[..., None],
+    ) -> None:
+        self._gui, self._setting, self._act = client.gui, setting, act
+        self._task = setting.task
         self._quiet = False
         self._build_decision()
-        self._build_controls()
+        self._build_controls(scene_kinds)
 
     def tell(self, text: str, colour: str = PLAIN, remark: str = "") -> None:
         """Show one sentence, and a remark on the scene below it."""
@@ -164,7 +130,7 @@ class Panels:
         """Set the sliders to a decision."""
         self._quiet = True
         try:
-            low, high = self._facts.duration_range
+            low, high = self._task.action.duration_range
             self._duration.value = float(np.clip(round(duration, 2), low, high))
             self._vias.value = n_via
         finally:
@@ -210,14 +176,12 @@ class Panels:
         return SPEEDS[self._speed.value]
 
     def _build_decision(self) -> None:
-        gui = self._gui
+        gui, act = self._gui, self._act
         panel = gui.add_panel()
         with panel.add_tab("Decision"):
             self._table = gui.add_html("")
             self._pick = gui.add_button_group("Show", ("#1",), visible=False)
-            self._pick.on_click(
-                lambda event: self._actions.pick(list(self._pick.options).index(event.target.value))
-            )
+            self._pick.on_click(lambda event: act("pick", list(self._pick.options).index(event.target.value)))
             self._plots = {
                 name: gui.add_uplot(
                     *_lines(()), title=title,
@@ -237,60 +201,64 @@ class Panels:
             )
         with panel.add_tab("Methods"):
             self._methods = gui.add_html("")
-            gui.add_button("Compare in this scene").on_click(lambda _: self._actions.compare())
+            gui.add_button("Compare in this scene").on_click(lambda _: act("compare"))
         panel.dock_left()
         panel.set_width(WIDTH)
         self.show_comparison(())
 
-    def _build_controls(self) -> None:
-        gui, facts, actions = self._gui, self._facts, self._actions
+    def _build_controls(self, scene_kinds: Sequence[str]) -> None:
+        gui, setting, act = self._gui, self._setting, self._act
+        title = setting.env_id.removeprefix("viapoint/")
+        subtitle = "no agent: the geometry search decides"
+        if setting.agent is not None:
+            subtitle = f"agent: {type(setting.agent).__name__}"
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH - 20)
         gui.add_html(
-            f'<div style="padding:0 0.9em"><div style="font-weight:600">{html.escape(facts.title)}</div>'
-            f'<div style="font-size:0.82em;color:#6b7078">{html.escape(facts.subtitle)}</div></div>'
+            f'<div style="padding:0 0.9em"><div style="font-weight:600">{html.escape(title)}</div>'
+            f'<div style="font-size:0.82em;color:#6b7078">{html.escape(subtitle)}</div></div>'
         )
         self._message = gui.add_html("")
         self.tell("Getting ready.")
         self._execute = gui.add_button("Execute", color="green", icon="player-play")
-        self._execute.on_click(lambda _: actions.execute())
+        self._execute.on_click(lambda _: act("execute"))
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/2 x")
         with gui.add_folder("Scene"):
-            kinds = gui.add_button_group("", (*facts.scene_kinds, RESET))
-            kinds.on_click(lambda event: actions.scene(event.target.value))
+            kinds = gui.add_button_group("", (*scene_kinds, RESET))
+            kinds.on_click(lambda event: act("scene", event.target.value))
         with gui.add_folder("Decision"):
             self._build_decision_controls()
         with gui.add_folder("Obstacles"):
             self._build_obstacle_controls()
         with gui.add_folder("Files", expand_by_default=False):
-            gui.add_button("Save scene (JSON)").on_click(lambda _: actions.save())
+            gui.add_button("Save scene (JSON)").on_click(lambda _: act("save"))
             upload = gui.add_upload_button("Load scene (JSON)", mime_type="application/json")
-            upload.on_upload(lambda event: actions.load(event.target.value.content))
-            gui.add_button("Copy as Python").on_click(lambda _: actions.code())
-            gui.add_button("Save picture (PNG)").on_click(lambda _: actions.picture())
-            gui.add_button("Save film (MP4)").on_click(lambda _: actions.film())
-        gui.add_button("Reset the view").on_click(lambda _: actions.view())
+            upload.on_upload(lambda event: act("load", event.target.value.content))
+            gui.add_button("Copy as Python").on_click(lambda _: act("code"))
+            gui.add_button("Save picture (PNG)").on_click(lambda _: act("picture"))
+        gui.add_button("Reset the view").on_click(lambda _: act("view"))
         drag = "Drag start, goal, via-point and obstacles with the mouse."
-        drag += " Hold Shift to move them up and down." if facts.spatial else ""
+        drag += " Hold Shift to move them up and down." if self._task.spatial else ""
         gui.add_html(_note(drag))
 
     def _build_decision_controls(self) -> None:
-        gui, facts, actions = self._gui, self._facts, self._actions
-        low, high = facts.duration_range
+        gui, act, action = self._gui, self._act, self._task.action
+        low, high = action.duration_range
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
-        self._duration.on_update(self._unless_quiet(lambda event: actions.duration(event.target.value)))
-        self._vias = gui.add_slider("Via-points", 0, facts.most_vias, 1, facts.n_via)
-        self._vias.disabled = facts.most_vias == facts.n_via
-        self._vias.on_update(self._unless_quiet(lambda event: actions.vias(int(event.target.value))))
-        if facts.ranks:
+        self._duration.on_update(self._unless_quiet(lambda event: act("duration", event.target.value)))
+        most = action.n_via if self._task.replanning else max(MOST_VIAS, action.n_via)
+        self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via)
+        self._vias.disabled = most == action.n_via
+        self._vias.on_update(self._unless_quiet(lambda event: act("vias", int(event.target.value))))
+        if self._setting.decisions.ranks:
             checks = gui.add_dropdown(
                 "Exact checks", tuple(CHECKS), hint="Proposals whose clearance is computed"
             )
-            checks.on_update(lambda event: actions.checks(CHECKS[event.target.value]))
-        gui.add_button("Decide anew").on_click(lambda _: actions.decide())
+            checks.on_update(lambda event: act("checks", CHECKS[event.target.value]))
+        gui.add_button("Decide anew").on_click(lambda _: act("decide"))
 
     def _build_obstacle_controls(self) -> None:
-        gui, actions = self._gui, self._actions
+        gui, act = self._gui, self._act
         self._selected = gui.add_html("")
         bounds = {"radius": (0.01, 0.1, 0.001), "half-length": (0.0, 0.3, 0.005)}
         bounds |= dict.fromkeys(BOX_SIZES, (0.005, 0.5, 0.005))
@@ -301,12 +269,12 @@ class Panels:
             for name, limits in bounds.items()
         }
         for name, slider in self._sizes.items():
-            resize = functools.partial(actions.resize, name)
+            resize = functools.partial(act, "resize", name)
             slider.on_update(self._unless_quiet(lambda event, resize=resize: resize(event.target.value)))  # type: ignore[misc]
-        add = gui.add_button_group("Add", self._facts.obstacle_kinds)
-        add.on_click(lambda event: actions.add(event.target.value))
+        add = gui.add_button_group("Add", tuple(KINDS[self._task.arm.dimension]))
+        add.on_click(lambda event: act("add", event.target.value))
         self._remove = gui.add_button("Remove the selected one", disabled=True)
-        self._remove.on_click(lambda _: actions.remove())
+        self._remove.on_click(lambda _: act("remove"))
         self.show_selected("", None)
 
     def _unless_quiet(self, function: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -322,16 +290,16 @@ class Panels:
 def _lines(lines: Sequence[tuple[Any, Any, str, Colour]]) -> tuple[Any, Any]:
     """Return data and series of a plot with lines on one common time axis."""
     if not lines:
-        return (np.zeros(2), np.zeros(2)), ({"label": "time"}, *_series("nothing", PALETTE.plan))
+        return (np.zeros(2), np.zeros(2)), ({"label": "time"}, _series("nothing", PALETTE.plan))
     time = max((line[0] for line in lines), key=lambda each: float(each[-1]))
     columns = [np.interp(time, x, y) for x, y, *_ in lines]
-    series = [each for *_, label, colour in lines for each in _series(label, colour)]
+    series = [_series(label, colour) for *_, label, colour in lines]
     return (time, *columns), ({"label": "time"}, *series)
 
 
-def _series(label: str, colour: Colour) -> tuple[Any, ...]:
+def _series(label: str, colour: Colour) -> dict[str, Any]:
     line: dict[str, Any] = {"label": label, "stroke": _css(colour), "width": 2, "points": {"show": False}}
-    return (line | ({"dash": (6, 5)} if label == "executed" else {}),)
+    return line | ({"dash": (6, 5)} if label == "executed" else {})
 
 
 def _table(

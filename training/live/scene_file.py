@@ -24,6 +24,7 @@ from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.search.geometry_search import numbers_of_shape
 
 SCENE_SHAPES = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 """Shapes that obstacles of a scene may have."""
@@ -112,18 +113,7 @@ class LiveScene(NamedTuple):
 
 
 def to_json(scene: LiveScene, env_id: str) -> str:
-    """Return a scene as the text of a JSON file.
-
-    Example:
-        >>> import numpy as np
-        >>> from viapoint.envs import Sphere, obstacle_rows
-        >>> from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json, to_json
-        >>> rows = obstacle_rows([Sphere(0.03, position=(-0.05, 0.35, 0.0))], 2, SCENE_SHAPES)
-        >>> none = np.zeros((1, 5)), np.zeros((0, 3))
-        >>> scene = LiveScene(np.array([-0.2, 0.3]), np.array([0.1, 0.4]), rows, *none)
-        >>> from_json(to_json(scene, "viapoint/PlanarObstacles-v0"), dimension=2).goal.tolist()
-        [0.1, 0.4]
-    """
+    """Return a scene as the text of a JSON file."""
     shapes = obstacles_from_rows(scene.obstacles)
     names = (*scene.names, *[""] * len(shapes))
     shapes = [replace(each, name=name) for each, name in zip(shapes, names, strict=False)]
@@ -149,12 +139,16 @@ def from_json(text: str | bytes, dimension: int) -> LiveScene:
     shapes, size = options.get("obstacles", []), 2 * dimension + 1
     rows = obstacle_rows(shapes or np.zeros((0, size)), dimension, SCENE_SHAPES)
     if np.shape(rows)[-1] != row_size(dimension, SCENE_SHAPES):
-        rows = widened(_numbers("obstacles", rows, (None, size)))
-    rows = _numbers("obstacles", rows, (None, row_size(dimension, SCENE_SHAPES)))
+        rows = widened(numbers_of_shape("obstacles", rows, (None, size)))
+    rows = numbers_of_shape("obstacles", rows, (None, row_size(dimension, SCENE_SHAPES)))
     names = tuple(obstacle_names(shapes)[0])
-    courses = _numbers("courses", options.get("courses", np.zeros((len(rows), size))), (len(rows), size))
-    jumps = _numbers("jumps", options.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1))
-    start, goal = (_numbers(name, options.get(name), (dimension,)) for name in ("start", "goal"))
+    courses = numbers_of_shape(
+        "courses", options.get("courses", np.zeros((len(rows), size))), (len(rows), size)
+    )
+    jumps = numbers_of_shape(
+        "jumps", options.get("jumps") or np.zeros((0, dimension + 1)), (None, dimension + 1)
+    )
+    start, goal = (numbers_of_shape(name, options.get(name), (dimension,)) for name in ("start", "goal"))
     present, jumps = rows.any(axis=-1), jumps[jumps.any(axis=-1)]
     return LiveScene(start, goal, rows[present], courses[present], jumps, names if any(names) else ())
 
@@ -176,19 +170,6 @@ def to_python(scene: LiveScene, env_id: str, env_kwargs: Mapping[str, Any], *, c
             lines += [f'    "{name}": [', *(f"        {_rounded(row)}," for row in value), "    ],"]
     lines += ["}", "observation, info = env.reset(options=options)"]
     return "\n".join(lines) + "\n"
-
-
-def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Float:
-    """Return finite numbers of a shape."""
-    wanted = "a number" if not shape else f"numbers of shape {shape}".replace("None", "n")
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.full(0, np.nan)
-    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
-    if not fits or not np.isfinite(array).all():
-        raise ValueError(f"{name} of the scene file must be {wanted}, finite, got {value!r:.60}")
-    return array
 
 
 def _rounded(values: Any) -> Any:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from viapoint.envs.common.types import Float
 from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
-from viapoint.training.live.job_thread import Job, JobThread
+from viapoint.training.live.job_thread import TICK, Job, JobThread
 from viapoint.training.live.movements import (
     Profile,
     Segment,
@@ -23,8 +25,7 @@ from viapoint.training.live.movements import (
     plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
-from viapoint.training.live.panels import BAD, GOOD, RESET, Actions, MethodResult, Panels
-from viapoint.training.live.playback import Playback, png
+from viapoint.training.live.panels import BAD, GOOD, RESET, Panels
 from viapoint.training.live.scene_file import LiveScene, to_json, to_python
 from viapoint.training.live.scene_view import SceneView
 
@@ -32,12 +33,16 @@ if TYPE_CHECKING:
     import viser
 
     from viapoint.envs.mdp.task import Task
-    from viapoint.training.live.setting import Setting, Shared
+    from viapoint.training.live.setting import MethodResult, Setting, Shared
 
 LATENCIES = 200
 """Changes whose latency is kept."""
 FADE_EVERY = 0.08
 """Time between two steps of fading, [s]."""
+PICTURE = 1280, 800
+"""Width and height of saved pictures, [pixels]."""
+RENDER_TIMEOUT = 20.0
+"""Time limit of one picture from the browser, [s]."""
 
 
 class Session:
@@ -60,6 +65,7 @@ class Session:
         self._proposals: tuple[Proposal, ...] = ()
         self._picked = 0
         self._playing: Iterator[float] | None = None
+        self._movement: list[Segment] = []
         self._next_picture = self._next_fade = 0.0
         self.decisions = 0
         """Number of decisions so far."""
@@ -93,7 +99,7 @@ class Session:
     @property
     def movement(self) -> tuple[Segment, ...]:
         """Last movement that was played."""
-        return tuple(self._playback.done)
+        return tuple(self._movement)
 
     @property
     def alive(self) -> bool:
@@ -119,7 +125,29 @@ class Session:
 
     def load(self, content: bytes) -> None:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
-        self.post("load", lambda: self._take(self._shared.read(content), ""))
+        self._act("load", content)
+
+    def _act(self, control: str, *values: Any) -> None:
+        """Post the job of a control of the panels, with its values."""
+        jobs: dict[str, Callable[..., None]] = {
+            "scene": self._draw_scene,
+            "duration": self._set_duration,
+            "vias": lambda n: self._redecide(_n_via=n, _by_hand=None),
+            "checks": lambda n: self._redecide(_checks=n),
+            "pick": self._pick,
+            "add": self._add,
+            "remove": self._remove,
+            "resize": self._resize,
+            "decide": self._decide_anew,
+            "execute": self._execute,
+            "compare": self._compare,
+            "save": self._save,
+            "load": lambda content: self._take(self._shared.read(content), ""),
+            "code": self._code,
+            "picture": self._picture,
+            "view": lambda: self._view.look_at_everything(),
+        }
+        self.post(control, lambda: jobs[control](*values))
 
     @property
     def _task(self) -> Task:
@@ -145,7 +173,7 @@ class Session:
         self._kinds = shared.scene_kinds()
         floor = float(shared.own.model.geom("table").pos[2])
         self._client.gui.set_panel_label("Viapoint")
-        self._panels = Panels(self._client, shared.facts(tuple(self._kinds)), self._actions())
+        self._panels = Panels(self._client, shared.own, tuple(self._kinds), self._act)
         with self._client.atomic():
             self._view = SceneView(
                 self._client, self._task, shared.drawing(), floor,
@@ -153,7 +181,6 @@ class Session:
                 on_pick=lambda index: self.post("pick", lambda: self._pick(index)),
                 on_select=lambda row: self.post("select", lambda: self._select(row)),
             )  # fmt: skip
-        self._playback = Playback(self._client, self._view, lambda: self._scene)
         self._jobs.guard(lambda: self._draw_scene(next(iter(self._kinds))))
 
     def _end(self) -> None:
@@ -375,7 +402,7 @@ class Session:
         if self.proposal is None:
             raise ValueError("there is no plan to execute: move what stands in the way first")
         self._panels.show_running(running=True)
-        self._playing = self._playback.play(self._segments(), self._panels.speed)
+        self._playing = self._play(self._segments(), self._panels.speed)
         self._next_picture = 0.0
 
     def _segments(self) -> Iterator[Segment]:
@@ -390,9 +417,43 @@ class Session:
             return execute_stepwise(self._step_env, self._setting.agent, self._fitted)
         return execute_whole(self._env, self._fitted, plan.plan)
 
+    def _play(self, segments: Iterator[Segment], speed: float) -> Iterator[float]:
+        """Show a movement at a speed relative to real time, and yield the time until the next picture, [s].
+
+        Each segment is computed when the one before it has been shown.
+        """
+        self._movement = []
+        began, hand = None, list[Float]()
+        for segment in segments:
+            if began is None:
+                began = time.monotonic() - float(segment.time[0]) / speed
+            if segment.restarted:
+                hand = []
+            if segment.path is not None:
+                self._view.show_plan(segment.path, np.zeros((0, segment.hand.shape[-1])), clear=True)
+            self._movement.append(segment)
+            shown = 0
+            while shown < len(segment.time):
+                elapsed = (time.monotonic() - began) * speed
+                ahead = int(np.searchsorted(segment.time, elapsed))
+                shown = min(max(ahead, shown + 1), len(segment.time))
+                self._show(segment, shown - 1, hand)
+                yield min(TICK, max((float(segment.time[shown - 1]) - elapsed) / speed, 0.0))
+            hand.append(segment.hand)
+
+    def _show(self, segment: Segment, row: int, hand: list[Float]) -> None:
+        """Show one instant of a segment after the hand positions of those before it."""
+        with self._client.atomic():
+            self._view.pose(segment.joints[row])
+            path = np.concatenate((*hand, segment.hand[: row + 1]))
+            self._view.show_executed(path, contact=bool(segment.contact[: row + 1].any()))
+            scene = self._scene.batch()
+            if scene.courses.any():
+                self._view.show_obstacles(scene.places(segment.time[None, row : row + 1])[0, 0])
+
     def _finish(self) -> None:
         """Say what came of the movement, and show its profile."""
-        segments = self._playback.done
+        segments = self._movement
         info = segments[-1].info
         text = describe_outcome({name: np.asarray(value).reshape(-1)[0] for name, value in info.items()})
         self._panels.tell(text, GOOD if text.startswith("Success") else BAD)
@@ -401,7 +462,8 @@ class Session:
 
     def _compare(self) -> None:
         """Compare methods, one job for each, so that changes of the scene come between."""
-        scene, setting, results = self._scene, self._setting, list[MethodResult]()
+        scene, setting = self._scene, self._setting
+        results: list[MethodResult] = []
         setting.observe(self._fitted, self._env)  # an impossible scene is refused
         rows = setting.compare(self._fitted, self._checks)
 
@@ -429,46 +491,22 @@ class Session:
         self._panels.show_code(to_python(self._fitted, setting.env_id, setting.env_kwargs, changing=changing))
 
     def _picture(self) -> None:
-        self._download("viapoint.png", png(self._playback.photograph("png")))
-
-    def _film(self) -> None:
-        """Render a film of the movement, picture by picture, in the browser."""
-        if self.proposal is None:
-            raise ValueError("there is no plan to film: move what stands in the way first")
-        self._stop()
-        film = self._playback.film(self._segments(), self._panels.speed, self._panels.tell)
-        self._download("viapoint.mp4", film)
-        self._finish()
+        """Save a picture of the present view, rendered by the browser, as a PNG file on white."""
+        self._client.flush()
+        width, height = PICTURE
+        picture = self._client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT)
+        image = Image.fromarray(picture).convert("RGBA")
+        ground = Image.new("RGBA", image.size, "white")
+        ground.alpha_composite(image)
+        file = io.BytesIO()
+        ground.convert("RGB").save(file, "PNG", optimize=True)
+        self._download("viapoint.png", file.getvalue())
 
     def _download(self, name: str, content: bytes) -> None:
         self._client.send_file_download(name, content, save_immediately=True)
 
-    def _actions(self) -> Actions:
-        """Return the functions that the panels call; each posts a job."""
-
-        def later(key: str, function: Callable[..., None]) -> Any:
-            return lambda *values: self.post(key, lambda: function(*values))
-
-        own = self._shared.own.task.action.n_via
-        return Actions(
-            scene=later("scene", self._draw_scene),
-            duration=later("duration", self._set_duration),
-            vias=later("vias", lambda n: self._redecide(_n_via=n, _by_hand=None)),
-            checks=later("checks", lambda n: self._redecide(_checks=n)),
-            pick=later("pick", self._pick),
-            add=later("add", self._add),
-            remove=later("remove", self._remove),
-            resize=later("resize", self._resize),
-            decide=later("decide", lambda: self._redecide(_by_hand=None, _duration=None, _n_via=own)),
-            execute=later("execute", self._execute),
-            compare=later("compare", self._compare),
-            save=later("save", self._save),
-            load=self.load,
-            code=later("code", self._code),
-            picture=later("picture", self._picture),
-            film=later("film", self._film),
-            view=later("view", lambda: self._view.look_at_everything()),
-        )
+    def _decide_anew(self) -> None:
+        self._redecide(_by_hand=None, _duration=None, _n_via=self._shared.own.task.action.n_via)
 
     def _set_duration(self, duration: float) -> None:
         if self._by_hand is not None:

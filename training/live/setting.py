@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -19,8 +19,6 @@ from viapoint.training.algorithms.agent import Agent
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
-from viapoint.training.live.obstacle_editing import KINDS
-from viapoint.training.live.panels import Facts, MethodResult
 from viapoint.training.live.scene_draws import Draw, scene_kinds
 from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
 from viapoint.training.planners.baselines import Method, agent_method, make_method
@@ -30,8 +28,19 @@ BASELINES = {"straight": "straight", "geometry search": "search512", "planner": 
 """Compared methods by their names in the table."""
 MOST_SHOWN = 24
 """Greatest number of obstacles of a scene."""
-MOST_VIAS = 4
-"""Greatest number of via-points of the slider."""
+
+
+class MethodResult(NamedTuple):
+    """Simulated outcome of a method in one scene."""
+
+    name: str
+    success: bool
+    reward: float
+    clearance: float
+    """Least clearance of the executed movement, [m]."""
+    jerk_ratio: float
+    seconds: float
+    """Time of the decision, [s]."""
 
 
 class Setting:
@@ -195,20 +204,6 @@ class Shared:
     def scene_kinds(self) -> dict[str, Draw]:
         """Return functions that draw scenes, by the names of their buttons."""
         return scene_kinds(self.own.whole_id, self.own.whole_kwargs, self.own.task, self._seed)
-
-    def facts(self, kinds: Sequence[str]) -> Facts:
-        """Return what the panels show of the page."""
-        own, task = self.own, self.own.task
-        n_via = task.action.n_via
-        who = "no agent: the geometry search decides"
-        if own.agent is not None:
-            who = f"agent: {type(own.agent).__name__}"
-        return Facts(
-            title=own.env_id.removeprefix("viapoint/"), subtitle=who, scene_kinds=kinds,
-            obstacle_kinds=tuple(KINDS[task.arm.dimension]), n_via=n_via,
-            most_vias=n_via if task.replanning else max(MOST_VIAS, n_via),
-            duration_range=task.action.duration_range, ranks=own.decisions.ranks, spatial=task.spatial,
-        )  # fmt: skip
 
     def close(self) -> None:
         """Close the environments of the comparisons."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -13,13 +14,14 @@ from tqdm import tqdm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.training.config.checks import unknown_name
 from viapoint.training.planners.cma_planner import Planner
 from viapoint.training.planners.ompl_planner import MotionPlanner
 from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
 from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, new_simulation
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.search.candidates import candidate_actions
-from viapoint.training.search.geometry_search import GeometrySearch, registered_task, score_plans
+from viapoint.training.search.geometry_search import GeometrySearch, score_plans
 from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 
@@ -98,9 +100,9 @@ class RandomVias:
 class RandomOrder:
     """Best of some plans that are drawn at random for each scene and checked with computed geometry."""
 
-    def __init__(self, env_id: str, checks: int, **kwargs: Any) -> None:
+    def __init__(self, simulation: SceneSimulation, checks: int) -> None:
         self.name, self._checks = f"random order, {checks} checks", checks
-        self._task = registered_task(env_id, **kwargs)
+        self._task = simulation.task
         self._generator = np.random.default_rng(0)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
@@ -173,16 +175,20 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     return AgentMethod(name, model, checks)
 
 
-def refined_search(total: int) -> Callable[[SceneSimulation], Method]:
-    """Return a factory of searches; half of the checks on refinement solve more scenes (docs/geometry-search.md)."""
-    rounds = 2 if total < 512 else 4
-    return lambda simulation: GeometrySearch(
-        simulation.task, total // 2, refinements=rounds, per_round=total // 2 // rounds
-    )
+def refined_search(simulation: SceneSimulation, checks: int) -> Method:
+    """Return a search that spends half of its checks on refinement, which solves more scenes."""
+    rounds = 2 if checks < 512 else 4
+    half = checks // 2
+    return GeometrySearch(simulation.task, half, refinements=rounds, per_round=half // rounds)
 
 
-SEARCHES = {f"search{number}": refined_search(number) for number in (16, 64, 512, 4096)}
-"""Factories of searches by name; the number is that of the plans checked in a decision."""
+COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
+    "search": refined_search,
+    "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
+    "random_order": RandomOrder,
+}
+"""Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
+FEWEST_CHECKS = {"search": 4, "sobol": 1, "random_order": 1}
 
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
@@ -192,7 +198,6 @@ METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "random80": lambda simulation: RandomVias(simulation, 80),
     "planner": Planner,
     "ompl": MotionPlanner,
-    **SEARCHES,
 }
 """Factories of baselines by their names on the command line."""
 
@@ -201,25 +206,32 @@ REPLANNING_METHODS: dict[str, Callable[[Any], Method]] = {
     "random": lambda simulation: RandomVias(simulation, 1),
     "planner": ReplanningPlanner,
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
-    **SEARCHES,
 }
 """Factories of baselines for replanning tasks."""
 
 
 def check_method(name: str, env_id: str) -> None:
     """Check that a baseline of this name exists for an environment."""
-    known = _known(env_id)
-    if name not in known:
-        raise ValueError(
-            f"baselines in {env_id} must be some of {', '.join(known)}, or untrained with an agent, got {name!r}"
-        )
+    factory(name, env_id)
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """Return a baseline for an environment made with `kwargs`."""
-    check_method(name, env_id)
-    return _known(env_id)[name](new_simulation(env_id, **kwargs))
+    return factory(name, env_id)(new_simulation(env_id, **kwargs))
 
 
-def _known(env_id: str) -> dict[str, Callable[[Any], Method]]:
-    return REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS
+def factory(name: str, env_id: str) -> Callable[[Any], Method]:
+    """Return the factory of a baseline for an environment.
+
+    Raises:
+        ValueError: There is no such baseline.
+    """
+    known = REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS
+    if name in known:
+        return known[name]
+    found = re.fullmatch(r"(\w+?)([0-9]+)", name)
+    if found is not None and found[1] in COUNTED and int(found[2]) >= FEWEST_CHECKS[found[1]]:
+        make, checks = COUNTED[found[1]], int(found[2])
+        return lambda simulation: make(simulation, checks)
+    counted = [f"{each}N" for each in COUNTED]  # N plans are checked
+    raise ValueError(unknown_name(f"baseline in {env_id}", name, [*known, *counted, "untrained"]))

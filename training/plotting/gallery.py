@@ -18,6 +18,7 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Observation
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Rollout
+from viapoint.training.io.files import MARK
 from viapoint.training.plotting.top_view import draw_movement
 
 TILE = 2.6
@@ -103,7 +104,7 @@ def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
     _legend(figure, columns)
     if lines:
         figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Software": MARK.decode()})
     return path
 
 

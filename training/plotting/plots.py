@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from viapoint.training.io.files import MARK
 from viapoint.training.scene_sets.scene_set import BANDS
 
 BLUE = "#1f5fa8"
@@ -72,6 +73,42 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
     return _save(figure, path)
 
 
+def success_of_rows(
+    path: Path, table: Any, curves: Mapping[str, Sequence[Sequence[Sequence[float]]]]
+) -> Path:
+    """Draw success with intervals of each row of a study, and success during the trainings.
+
+    Args:
+        path: PNG file.
+        table: Lines of one environment with `method`, `set`, `success`, `low` and `high`, a pandas table.
+        curves: Pairs of decisions and success in validation, for each run of each row.
+    """
+    methods = list(dict.fromkeys(table["method"]))
+    figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(methods)), layout="constrained")
+    axes, *others = figure.subplots(1, 2 if curves else 1, squeeze=False)[0]
+    for i, (name, part) in enumerate(table.groupby("set", sort=False)):
+        place = [methods.index(method) + 0.2 * i for method in part["method"]]
+        rate = 100.0 * part["success"].astype(float)
+        spread = np.stack((rate - 100.0 * part["low"], 100.0 * part["high"] - rate)).clip(0.0)
+        axes.errorbar(rate, place, xerr=spread, fmt="o", markersize=4, capsize=2, label=name)
+    axes.set_yticks(range(len(methods)), methods)
+    axes.invert_yaxis()
+    axes.set_xlim(-2.0, 102.0)
+    axes.set_xlabel("success [%], 95 % interval")
+    for ax in others:
+        for i, (row, runs) in enumerate(curves.items()):
+            for j, curve in enumerate(each for each in runs if each):
+                decisions, rate = np.array(curve).T
+                ax.plot(decisions, 100.0 * rate, color=f"C{i}", label=None if j else row)
+        ax.set_xlabel("decisions")
+        ax.set_ylabel("success in validation [%]")
+        ax.set_ylim(-2.0, 102.0)
+    for ax in (axes, *others):
+        ax.legend(frameon=False)
+        style_axes(ax)
+    return _save(figure, path)
+
+
 def style_axes(ax: Any) -> None:
     """Remove the upper and right spines and draw horizontal grid lines."""
     ax.spines[["top", "right"]].set_visible(False)
@@ -81,5 +118,5 @@ def style_axes(ax: Any) -> None:
 
 def _save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DOTS_PER_INCH, metadata={"Software": None})
+    figure.savefig(path, dpi=DOTS_PER_INCH, metadata={"Software": MARK.decode()})
     return path

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+import uuid
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,7 +21,7 @@ from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame, Observation
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.io.mp4 import write_mp4
+from viapoint.training.io.files import MARK, check_ours
 from viapoint.training.plotting.top_view import draw_movement
 
 Decide = Callable[[Observation, Scenes], Any]
@@ -51,9 +53,11 @@ def record_video(
         name: Name of the method, for the caption.
 
     Raises:
-        ValueError: The path has another suffix, the environment has another render mode, or there is no scene.
+        ValueError: The path has another suffix or is a file of something else, the environment has another render
+            mode, or there is no scene.
     """
     path = Path(path)
+    check_ours(path)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"path must end in .mp4, got {path}")
     if env.render_mode != "rgb_array_list":
@@ -61,9 +65,9 @@ def record_video(
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
     camera = Camera(env)
-    part = path.with_name(f".{path.stem}.part.mp4")
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     try:
-        count = write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
+        count = _write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
@@ -84,6 +88,27 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterat
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
         hold = round(PAUSE * SPEED * camera.fps)
         yield from _with_captions(camera.frames(scene), left, *describe_outcome(info), hold=hold)
+
+
+def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
+    """Encode frames of equal size, with even numbers of pixels, as an MP4 file (H.264), and return their number."""
+    count, writer = 0, None
+    try:
+        for frame in frames:
+            if writer is None:
+                height, width = frame.shape[:2]
+                writer = imageio_ffmpeg.write_frames(
+                    str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
+                    output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
+                    macro_block_size=1, ffmpeg_log_level="error",
+                )  # fmt: skip
+                writer.send(None)
+            writer.send(np.ascontiguousarray(frame))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.close()
+    return count
 
 
 def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:

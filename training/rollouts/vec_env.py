@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
@@ -17,20 +16,19 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ENV_IDS, check_registered
-from viapoint.envs.worker_env import WorkerVectorEnv
-from viapoint.training.config.discount import ELAPSED
 from viapoint.training.search.candidates import OBSERVED
+from viapoint.training.search.observe_candidates import VectorObserveCandidates
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
 Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
+ELAPSED = "elapsed"
+"""Name of the duration of a decision in infos, [s]."""
 REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration", "reachable")
 """Metrics of an episode that the info dictionaries report."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which the info dictionaries report."""
-OBSERVE_CANDIDATES = "viapoint.training.search.observe_candidates:VectorObserveCandidates"
-"""Entry point of the wrapper that adds the margins of candidates to observations."""
 
 
 def observed_candidates(env: VecEnv) -> int:
@@ -61,7 +59,7 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     return spec.id, {
         name: value
         for name, value in spec.kwargs.items()
-        if name not in ("render_mode", "threads", "workers") and (name not in usual or usual[name] != value)
+        if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
     }
 
 
@@ -69,14 +67,13 @@ class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
     It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy, and is 2 to 7 times as
-    fast (64 copies on two cores; `viapoint bench` measures the ratio). Episodes may have one step or many, and may end
-    at different times.
+    fast (64 copies on two cores; `benchmarks/throughput.py` measures the ratio). Episodes may have one step or many,
+    and may end at different times.
 
     Args:
         env_id: Id of a registered environment.
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
-        workers: Processes that share the copies; 0 for none. Results do not depend on it.
         observe_candidates: Number of candidate plans whose computed margins are part of the observation, see
             :class:`~viapoint.training.search.observe_candidates.ObserveCandidates`; 0 for none.
         **kwargs: Keyword arguments of the environment.
@@ -104,23 +101,20 @@ class ViaVecEnv(VecEnv):
         num_envs: int,
         seed: int | None = None,
         *,
-        workers: int = 0,
         observe_candidates: int = 0,
         **kwargs: Any,
     ) -> None:
         check_registered(env_id)
-        if workers and env_id not in ENV_IDS:
-            raise ValueError(
-                f"workers must be 0 for {env_id}; there are worker processes for {', '.join(ENV_IDS)}"
-            )
-        self.venv: Any = self._make(env_id, num_envs, workers, kwargs)
+        extra: dict[str, Any] = {}
+        if gym.spec(env_id).vector_entry_point is None:
+            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
         if self.venv.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
             raise ValueError(
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
             )
         if observe_candidates:
-            wrapper: Any = load_env_creator(OBSERVE_CANDIDATES)
-            self.venv = wrapper(self.venv, observe_candidates)
+            self.venv = VectorObserveCandidates(self.venv, observe_candidates)
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
@@ -134,20 +128,9 @@ class ViaVecEnv(VecEnv):
         if seed is not None:
             self.seed(seed)
 
-    def _make(self, env_id: str, num_envs: int, workers: int, kwargs: Mapping[str, Any]) -> Any:
-        """Return the vector environment of Gymnasium."""
-        extra: dict[str, Any] = {"workers": workers} if workers else {}
-        if gym.spec(env_id).vector_entry_point is None:
-            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        return gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
-
     @property
     def physics_steps(self) -> int:
-        """Number of physics steps so far; 0 if the environment does not count them.
-
-        Movements of similar length are simulated together, each as long as the longest, so the number also depends on
-        the workers.
-        """
+        """Number of physics steps so far; 0 if the environment does not count them."""
         return int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
     def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
@@ -256,11 +239,7 @@ class ViaVecEnv(VecEnv):
             raise ValueError(
                 f"the copies share {attr_name}: it can be set for all of them only, not for {indices}"
             )
-        inner = self.venv.unwrapped
-        if isinstance(inner, WorkerVectorEnv):
-            inner.set_attr(attr_name, value)
-        else:
-            setattr(inner, attr_name, value)
+        setattr(self.venv.unwrapped, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
@@ -293,24 +272,6 @@ def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
         raise ValueError(
             f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
         )
-    names = list(options[0])
-    for copy, each in enumerate(options):
-        if set(each) != set(names):
-            raise ValueError(
-                f"options must give the same for every copy: {_listed(names)} for copy 0, "
-                f"but {_listed(each)} for copy {copy}"
-            )
-    batched = {}
-    for name in names:
-        parts = [np.asarray(each[name]) for each in options]
-        shapes = [part.shape for part in parts]
-        if len(set(shapes)) > 1:
-            raise ValueError(
-                f"options[{name!r}] must have the same shape for every copy, got {', '.join(map(str, shapes))}"
-            )
-        batched[name] = np.stack(parts)
-    return batched
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(map(repr, names)) or "nothing"
+    if any(each.keys() != options[0].keys() for each in options):
+        raise ValueError(f"options must give the same names for every copy, got {options!r}")
+    return {name: np.stack([np.asarray(each[name]) for each in options]) for name in options[0]}

@@ -45,6 +45,8 @@ COUNTERS = (
     "_current_progress_remaining",
 )
 """Counters of Stable-Baselines3's algorithms."""
+FILES = ("state.json", "tensors.safetensors")
+"""Files of a checkpoint."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 
@@ -72,7 +74,20 @@ def write_checkpoint(model: BaseAlgorithm, folder: Path, extra: Mapping[str, Any
         state["digest"] = _digest(state)
         write_json(temporary / "state.json", state)
 
-    write_folder(folder, fill)
+    write_folder(folder, fill, marked=False)  # a damaged checkpoint is replaced, too
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Return whether a folder holds files of a checkpoint, damaged or not."""
+    return any((folder / name).is_file() for name in FILES)
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Remove the files of a checkpoint, and its folder unless it holds something else."""
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,18 +29,24 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import (
     UNFINISHED,
     BadFileError,
+    check_ours,
     read_json,
     tidy,
+    versions,
     write_bytes,
     write_folder,
     write_json,
 )
-from viapoint.training.io.installed import versions
-from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
+from viapoint.training.runs.checkpoints import (
+    is_checkpoint,
+    read_checkpoint,
+    remove_checkpoint,
+    write_checkpoint,
+)
 
 KEPT_CHECKPOINTS = 2
 
-MAY_CHANGE = {"n_timesteps", "out", "resume", "progress", "rollout_workers", "on"}
+MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """Fields that may differ when a run is resumed."""
 
 
@@ -68,9 +74,6 @@ class Run:
 
     def __init__(self, folder: str | Path) -> None:
         folder = Path(folder)
-        if not folder.is_dir():
-            what = "it is a file" if folder.exists() else "there is no such folder"
-            raise BadFileError(folder, f"is no run folder: {what}")
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder
@@ -162,11 +165,12 @@ class Run:
         """Write a checkpoint and remove outdated ones."""
         write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
-            shutil.rmtree(outdated)
+            remove_checkpoint(outdated)
 
     def checkpoints(self) -> list[Path]:
         """Folders of the checkpoints, oldest first."""
-        return sorted(path for path in self._checkpoints.glob("[0-9]*") if path.is_dir())
+        found = (path for path in self._checkpoints.glob("[0-9]*") if re.fullmatch(r"\d{10}", path.name))
+        return sorted(path for path in found if is_checkpoint(path))
 
     def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
         """Set a model to the state of the newest intact checkpoint.
@@ -256,6 +260,7 @@ def check_free(folder: Path) -> None:
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
     if names - begun - {"versions.json", "lock", "lock.pid"}:
         raise BadFileError(folder, "is not empty and is no run folder")
+    check_ours(folder / "versions.json")
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

@@ -8,23 +8,17 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from viapoint.envs.registration import REPLANNING_TASKS
-from viapoint.envs.worker_process import WorkerDiedError
 from viapoint.training.algorithms.model_io import build
-from viapoint.training.algorithms.smdp_buffers import ElapsedTimeCallback
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.config.discount import ELAPSED
 from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import BadFileError
-from viapoint.training.io.installed import versions
+from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStalledError
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
+from viapoint.training.runs.run_dir import MAY_CHANGE, Run, check_free, check_unchanged, write_config
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
@@ -35,7 +29,7 @@ UNFIT = (
 
 
 class TrainingFailedError(Exception):
-    """Training could not continue, as a disk is full or a worker died, for example; files saved before are intact."""
+    """Training could not continue, as a disk is full, for example; files saved before are intact."""
 
 
 def train(config: TrainConfig, callback: Callbacks = None) -> Run:
@@ -85,11 +79,34 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
         check_free(config.folder)
         begun = resolved(config)
         with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
-            _check_reports_duration(begun)
             run = Run.create(begun)
             with run.locked():
                 _continue_training(run, model, callback)
         return run
+
+
+def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
+    """Train, go on with a training of these settings that was interrupted, or return one that has ended.
+
+    Raises:
+        BadFileError: The folder holds a training with other settings, or something else.
+        ValueError, TrainingStoppedError, TrainingFailedError: As for :func:`train`.
+    """
+    if not (config.folder / "config.json").is_file():
+        return train(config, callback)
+    run = Run(config.folder)
+    wanted, found = (json.loads(json.dumps(each.as_json())) for each in (resolved(config), run.config))
+    pace = {*MAY_CHANGE, "eval_every", "checkpoint_every"}
+    others = [name for name in wanted if name not in pace and wanted[name] != found[name]]
+    if others:
+        names = ", ".join(others)
+        raise BadFileError(config.folder, f"was trained with other settings ({names}); name another folder")
+    if run.stopped is not None and run.config.total_timesteps == config.total_timesteps:
+        return run
+    again = TrainConfig(
+        out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
+    )
+    return train(again, callback)
 
 
 def resolved(config: TrainConfig) -> TrainConfig:
@@ -101,41 +118,22 @@ def resolved(config: TrainConfig) -> TrainConfig:
         n_envs=config.copies,
         eval_every=config.evaluation_interval,
         checkpoint_every=config.checkpoint_interval,
-        discount_unit=config.time_unit,
         hyperparameters={**config.preset.arguments(), **config.hyperparameters},
     )
-
-
-def new_model(config: TrainConfig, env: ViaVecEnv) -> BaseAlgorithm:
-    """Return the untrained model of a resolved configuration."""
-    unit, seed = config.discount_unit, config.seed
-    return build(
-        config.algo, config.preset.policy, env, config.hyperparameters, discount_unit=unit, seed=seed
-    )
-
-
-def training_env(config: TrainConfig) -> ViaVecEnv:
-    """Return the environments of a training, in this process or shared by rollout workers."""
-    shared = {"workers": config.rollout_workers, "observe_candidates": config.observe_candidates}
-    if config.on == "local":
-        return ViaVecEnv(config.env, config.copies, **shared, **config.env_kwargs)
-    from viapoint.training.rollouts.ray_vec_env import RayVecEnv
-
-    env = RayVecEnv(config.env, config.copies, on=config.on, **shared, **config.env_kwargs)
-    assert isinstance(env, ViaVecEnv)
-    return env
 
 
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
     try:
-        env = training_env(config)
+        env = ViaVecEnv(
+            config.env, config.copies, observe_candidates=config.observe_candidates, **config.env_kwargs
+        )
     except TypeError as error:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):
         try:
-            model = new_model(config, env)
+            model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
         except UNFIT as error:
             usual, asked = config.preset.arguments(), config.hyperparameters
             other = {name: value for name, value in asked.items() if usual.get(name) != value}
@@ -143,20 +141,6 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
             made = f"made with {given}" if given else f"made for {config.env}"
             raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
         yield model
-
-
-def _check_reports_duration(config: TrainConfig) -> None:
-    """Check that decisions report their duration if discounts depend on time."""
-    if config.discount_unit is None:
-        return
-    with closing(ViaVecEnv(config.env, 1, seed=0, **config.env_kwargs)) as env:
-        env.reset()
-        *_, infos = env.step(np.zeros((1, *(env.action_space.shape or ())), dtype=np.float32))
-    if ELAPSED not in infos[0]:
-        raise ValueError(
-            f"discount_unit must be left out for {config.env}: its info does not tell as {ELAPSED!r} how long a "
-            f"decision took; that of {', '.join(REPLANNING_TASKS)} does"
-        )
 
 
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
@@ -169,7 +153,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
         ):
             model.set_logger(logger)
             _learn(model, run, monitor, callback)
-    except (OSError, WorkerDiedError) as error:
+    except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
             f"{run.decisions}, and viapoint train --resume goes on from there"
@@ -188,9 +172,7 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         write_config(run.folder, run.config)
-    run.config = dataclasses.replace(
-        run.config, progress=config.progress, rollout_workers=config.rollout_workers, on=config.on
-    )
+    run.config = dataclasses.replace(run.config, progress=config.progress)
     began, now = run.versions, versions()
     others = [
         f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]
@@ -213,7 +195,7 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
     if remaining > 0 and not monitor.stalled:
         run.write_end(None)
         given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
-        callbacks = [monitor, ElapsedTimeCallback(), *given]
+        callbacks = [monitor, *given]
         try:
             model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
         except TrainingStalledError:

@@ -118,13 +118,11 @@ def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
         ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
     """
     path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
-    if str(name_or_path) in SETS and not path.is_file():
-        there = [name for name in SETS if shipped_path(name, env_id).is_file()]
-        raise ValueError(
-            f"no {name_or_path} scenes are shipped for {env_id}; there are: {', '.join(there) or 'none'}"
-        )
     if not path.is_file():
-        raise ValueError(f"scenes must be one of {', '.join(SETS)} or a file, got {name_or_path!s}")
+        shipped = [name for name in SETS if shipped_path(name, env_id).is_file()]
+        raise ValueError(
+            f"scenes for {env_id} must be one of {', '.join(shipped)} or a file, got {name_or_path!s}"
+        )
     kind, content = _read(path)
     scenes = kind(*(content[name] for name in kind._fields))
     rest: Any = {name: content[name] for name in PER_SCENE}
@@ -179,7 +177,7 @@ def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
 
 
 OTHER_ARGUMENTS = frozenset(
-    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height", "uniform_share"}
+    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
 )
 """Arguments of an environment with which frozen scenes remain scenes of it; without replanning, `duration_range` is
 another."""
@@ -238,15 +236,11 @@ def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
     simulation = new_simulation(frozen.env_id, 1, **env_kwargs)
     layout, shapes = simulation.task.observation, simulation.task.scenes.shapes
     simulation.close()
-    if has_shapes(frozen.scenes.obstacles) is (shapes == CAPSULES):
-        raise ValueError(
-            f"{frozen.name} holds scenes of {'several shapes' if shapes == CAPSULES else 'capsules'}; the environment, "
-            f"made with {dict(env_kwargs)}, has {', '.join(shapes)}"
-        )
     mine = layout.n_rows, layout.dimension
     theirs = frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]
-    if mine != theirs:
+    kind = "several shapes" if has_shapes(frozen.scenes.obstacles) else "capsules"
+    if mine != theirs or (kind == "capsules") != (shapes == CAPSULES):
         raise ValueError(
-            f"{frozen.name} holds scenes of {theirs[0]} obstacles at most in {theirs[1]} dimensions; the "
-            f"environment, made with {dict(env_kwargs)}, has {mine[0]} in {mine[1]}"
+            f"{frozen.name} holds scenes of at most {theirs[0]} obstacles, {kind}, in {theirs[1]} dimensions; the "
+            f"environment, made with {dict(env_kwargs)}, has {mine[0]} of {', '.join(shapes)} in {mine[1]}"
         )

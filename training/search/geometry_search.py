@@ -211,13 +211,13 @@ def scene_from_rest(
         ValueError: An argument has another shape or is not finite, or the scene is impossible.
     """
     d = task.arm.dimension
-    first, last = _numbers("start", start, (d,))[None], _numbers("goal", goal, (d,))[None]
+    first, last = numbers_of_shape("start", start, (d,))[None], numbers_of_shape("goal", goal, (d,))[None]
     shapes = task.scenes.shapes
     obstacles = [] if obstacles is None else obstacles
     given = obstacle_rows(obstacles, d, shapes)
     capsules = np.shape(given)[-1:] == (row_size(d),)
     size = row_size(d) if capsules else row_size(d, shapes)
-    rows = _numbers("obstacles", given if np.size(given) else np.zeros((0, size)), (None, size))
+    rows = numbers_of_shape("obstacles", given if np.size(given) else np.zeros((0, size)), (None, size))
     scene = Scenes(first, last, (rows if shapes == CAPSULES else widened(rows))[None])
     for wrong, reason in problems(scene, task.collision_model, obstacle_names(obstacles)):
         if wrong.any():
@@ -245,22 +245,18 @@ def best_actions(actions: Numbers, merits: Numbers) -> tuple[Single, Numbers]:
     return np.asarray(actions[each, order], np.float32), merits[each, order]
 
 
-def _numbers(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float:
-    """Return finite numbers of a shape.
+def numbers_of_shape(name: str, value: Any, shape: tuple[int | None, ...]) -> Float:
+    """Return finite numbers of a shape, in which None stands for any number.
 
     Raises:
         ValueError: The value has another type or shape, or is not finite.
     """
-    wanted = f"({', '.join('n' if size is None else str(size) for size in shape)}{',' * (len(shape) == 1)})"
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers [m] of shape {wanted}, got {value!r}") from None
-    fits = array.ndim == len(shape) and all(
-        size in (None, n) for size, n in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
-        raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+        array = np.full((), np.nan)
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        wanted = f"{shape}".replace("None", "n")
+        raise ValueError(f"{name} must be finite numbers of shape {wanted}, got {value!r:.60}")
     return array

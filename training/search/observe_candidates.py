@@ -97,14 +97,10 @@ class ObserveCandidates(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Execute an action; see the wrapped environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated:
-            return _ended(observation, self.n_candidates), reward, terminated, truncated, info
-        return (
-            with_candidates(observation, self._task, self.n_candidates),
-            reward,
-            terminated,
-            truncated,
-            info,
-        )
+            seen = _ended(observation, self.n_candidates)
+        else:
+            seen = with_candidates(observation, self._task, self.n_candidates)
+        return seen, reward, terminated, truncated, info
 
 
 class VectorObserveCandidates(VectorWrapper, RecordConstructorArgs):

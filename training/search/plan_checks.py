@@ -88,14 +88,6 @@ def check_plans(
         task: Task of the environment.
         until: Time after which clearance does not matter, [s].
         max_refined: Clearance above which no instant is refined, [m].
-
-    Example:
-        >>> import gymnasium, numpy, viapoint.envs
-        >>> env = gymnasium.make_vec("viapoint/PlanarReach-v0", num_envs=2).unwrapped
-        >>> observation, _ = env.reset(seed=0)
-        >>> checks = check_plans(observation, numpy.zeros((2, 1, 3)), env.task)
-        >>> checks.clearance.tolist(), checks.reward.astype(float).round(3).tolist()
-        ([[1.0], [1.0]], [[1.1], [1.1]])
     """
     found = PlanChecks(*(np.empty(actions.shape[:2], np.float32) for _ in PlanChecks._fields))
     obstacles = Obstacles.from_observation(observation, task)

@@ -144,11 +144,6 @@ def least_clearance(
     least: Single = np.full((number, plans), MAX_CLEARANCE, np.float32)
     bodies = _bodies(hand, task)
     count = len(bodies.radius) // plans
-    if task.collision_model.may_touch_itself:
-        assert bodies.second is not None
-        ends = np.stack((bodies.first, bodies.second)).reshape(2, number, instants, count, plans, 3)
-        links = np.moveaxis(ends[:, :, :, : len(task.arm.link_radii)], (3, 0), (-3, -2))
-        least = task.collision_model.with_self_clearance(least, links, time_axis=1)
     if not obstacles.rows.shape[1]:
         return least
     drift, elapsed = None, moves.duration[:, None].astype(np.float32) * FRACTIONS[:, None].astype(np.float32)

@@ -63,13 +63,6 @@ def plan_movements(
         task: Task of the environment.
         fractions: Fractions of the duration at which the path is sampled, in [0, 1], shape (T,).
         coarse: Compute passage times to a relative error of 1e-5, in less time; for one via-point at its optimal time.
-
-    Example:
-        >>> import gymnasium, numpy, viapoint.envs
-        >>> env = gymnasium.make_vec("viapoint/PlanarObstacles-v0", num_envs=2).unwrapped
-        >>> observation, _ = env.reset(seed=0)
-        >>> plan_movements(observation, numpy.zeros((2, 5, 3)), env.task, numpy.linspace(0, 1, 8)).path.shape
-        (2, 5, 8, 2)
     """
     block = max(1, PATH_BLOCK // max(actions.shape[1] * len(fractions), 1))
     if len(actions) > block:

@@ -1,1 +1,1 @@
-"""Studies: many trainings and evaluations described by one YAML file, on one machine or many."""
+"""Studies: many trainings, baselines and searches for hyperparameters from one file."""

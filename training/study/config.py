@@ -1,472 +1,399 @@
-"""Description of a study: environments, agents, grids of their settings, baselines and pages, read from YAML.
+"""Description of a study, read from YAML: environments, agents, baselines and searches for hyperparameters.
 
-Everything is checked when the file is read: unknown fields, ids, algorithms and baselines are errors that name what is
-allowed. docs/studies.md explains the fields.
+Everything is checked when the file is read, so that a mistake in its last line is an error before the first training.
+docs/studies.md explains the fields.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import hashlib
+import inspect
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_args
+from typing import Any, TypeVar
 
-from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
-from viapoint.training.algorithms.model_io import ALGORITHMS, argument_names
-from viapoint.training.config.checks import check_env_kwargs, check_whole
+from viapoint.envs.common.validation import is_number
+from viapoint.envs.registration import ENV_IDS, STEP_TASKS
+from viapoint.training.algorithms import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
+from viapoint.training.algorithms.model_io import check_hyperparameters
+from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.config.presets import Algorithm, preset_of
-from viapoint.training.io.files import read_yaml
-from viapoint.training.planners.baselines import METHODS, REPLANNING_METHODS
+from viapoint.training.config.presets import preset_of
+from viapoint.training.io.files import read_json, read_yaml
+from viapoint.training.planners.baselines import check_method
 from viapoint.training.scene_sets.scene_set import SETS, shipped_path
-from viapoint.training.study.fields import (
-    Values,
-    check_fields,
-    check_number,
-    expanded,
-    listed,
-    mapping,
-    named,
-    seeds_of,
-    unknown,
-)
 
-TWINS = {whole: step for step, whole in STEP_TASKS.items()}
-"""Environments in which an action lasts one control step, by the ids of those of whole movements."""
-MEASURED = tuple(name for name in SETS if name != "validation")
-"""Sets that are measured by default; models are selected on `validation`."""
-COUNTED = ("search", "sobol", "random_order")
-"""Baselines that check `checks` plans: the search with refinement, the points of a Sobol sequence, random plans."""
-OWN_METHODS = ("stored", *COUNTED)
-"""Baselines that only a study has; `stored` are the planner's solutions in the files of scenes."""
-UNTIMED = ("stored", "straight", "constant", "random", "unrevised")
-"""Baselines whose decisions are not timed by default, as they compute nothing."""
-FIXED = ("env", "seed", "out", "resume", "progress")
-"""Fields of a training that the study sets."""
-TRAINING_FIELDS = tuple(each.name for each in dataclasses.fields(TrainConfig) if each.name not in FIXED)
+Values = Mapping[str, Any]
+Made = TypeVar("Made")
+TRAINING_FIELDS = tuple(
+    each.name
+    for each in dataclasses.fields(TrainConfig)
+    if each.name not in ("env", "seed", "out", "resume", "progress")
+)
 """Fields of a training that an agent may set."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Environment:
-    """Environment of a study."""
+    """Environment of a study with its scenes."""
 
     name: str
     """Name in folders and tables."""
     id: str
     """Id of the registered environment."""
     env_kwargs: Values = field(default_factory=dict)
-    """Arguments of the environment, for agents and baselines."""
-    scenes: tuple[str, ...]
+    """Arguments of the environment."""
+    scenes: tuple[str, ...] = ()
     """Names of the measured sets, or files of scenes."""
     n_scenes: int | None = None
-    """Number of scenes of each set, from the first on; all if not given."""
-
-    @property
-    def folder(self) -> str:
-        """Name of its folder."""
-        return self.name.rpartition("/")[2]
+    """Number of scenes of each set, from the first on; None for all."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
-    """Agent or baseline of a study."""
+class Trial:
+    """One row of the results for one seed: what a worker trains and measures."""
 
-    name: str
-    """Name of its folder, and of its row."""
-    label: str
-    """Name in tables."""
-    environments: tuple[str, ...]
-    """Names of its environments."""
-    timed: bool = True
-    """True to measure the time of single decisions."""
-
-
-class Mode(NamedTuple):
-    """Decision mode of an agent."""
-
-    checks: int = 0
-    """Number of proposals that are checked with computed geometry."""
-    untrained: bool = False
-    """True for the network before training."""
-    unrevised: bool = False
-    """True for the first plan alone."""
-
-    @property
-    def _parts(self) -> list[str]:
-        parts = {"untrained": self.untrained, "unrevised": self.unrevised, f"{self.checks}": self.checks}
-        return [part for part, there in parts.items() if there]
-
-    @property
-    def name(self) -> str:
-        """Name in files."""
-        return "-".join(self._parts) or "alone"
-
-    def row(self, agent: str) -> str:
-        """Return the id of an agent's row, such as `viaq`, `viaq/16`, `viaq/untrained/16` and `viaq/unrevised`."""
-        return "/".join([agent, *self._parts])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Agent(Entry):
-    """Learning algorithm with its settings."""
-
-    training: Values
-    """Fields of :class:`TrainConfig`, without those that the study sets."""
-    seeds: tuple[int, ...]
-    """Seeds of its trainings."""
+    env: Environment
+    row: str
+    """Name of the row, which is also that of its folder."""
+    seed: int = 0
+    training: Values = field(default_factory=dict)
+    """Fields of :class:`TrainConfig`; empty for a baseline."""
     checks: tuple[int, ...] = (0,)
-    """Numbers of proposals that it checks with exact geometry, a row each; 0 for none."""
+    """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
     untrained: bool = False
-    """True for rows of its network before training, with each number of checks."""
-    unrevised: bool = False
-    """True for a row of its first plan alone, where plans are revised."""
+    """True to measure the network before training, too."""
     step_wise: bool = False
-    """True for training on the twin of the environment in which an action lasts one control step."""
-    cpus: int = 1
-    """Cores of each training."""
-    resources: Values = field(default_factory=dict)
-    """Resources of each training that a node of the cluster must have, such as {GPU: 1}."""
+    """True to train in the environment with an action in every control step."""
+    method: str = ""
+    """Name of a baseline; empty for an agent."""
+    resources: Values = field(default_factory=lambda: {"cpu": 1})
+    """Resources of a node that the trial takes, such as {"cpu": 2, "GPU": 1}."""
 
-    def modes(self, env_id: str | None = None) -> list[Mode]:
-        """Return all decision modes, or those in an environment, the network alone first if it is asked for."""
-        revised = env_id is None or env_id in REPLANNING_TASKS
-        found = [Mode(checks) for checks in self.checks]
-        found += [Mode(unrevised=True)] if self.unrevised and revised else []
-        return found + [Mode(checks, untrained=True) for checks in self.checks if self.untrained]
+    def folder(self, out: Path) -> Path:
+        """Return the folder of the trial."""
+        return out / self.env.name.rpartition("/")[2] / self.row / f"seed-{self.seed}"
 
-    def config(self, env: Environment, seed: int, out: Path) -> TrainConfig:
-        """Return the configuration of a training; `policy_kwargs` are merged with those of the preset."""
-        env_id = TWINS[env.id] if self.step_wise else env.id
+    def config(self, out: Path) -> TrainConfig:
+        """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
+        twins = {whole: step for step, whole in STEP_TASKS.items()}
+        env_id = twins[self.env.id] if self.step_wise else self.env.id
         given = dict(self.training)
         hyperparameters = dict(given.pop("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
             usual = preset_of(env_id, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
-        given["env_kwargs"] = {**env.env_kwargs, **given.get("env_kwargs", {})}
+        given["env_kwargs"] = {**self.env.env_kwargs, **given.get("env_kwargs", {})}
         return TrainConfig(
-            env=env_id, seed=seed, out=out, progress=False, hyperparameters=hyperparameters, **given
+            env=env_id,
+            seed=self.seed,
+            out=self.folder(out),
+            progress=False,
+            hyperparameters=hyperparameters,
+            **given,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baseline(Entry):
-    """Method without training."""
+class Search:
+    """Search for hyperparameters of one algorithm in one environment."""
 
-    method: str
-    """Name of the method."""
-    checks: int | None = None
-    """Number of plans that a search checks."""
-    time_of: str | None = None
-    """Row of an agent, in whose time of a decision a search checks as many plans as it can."""
-    env_kwargs: Values = field(default_factory=dict)
-    """Arguments of the environment besides its own, such as the number of via-points."""
-    scenes: tuple[str, ...] | None = None
-    """Sets that are measured; those of the environment if not given."""
-    n_scenes: int | None = None
-    """Number of scenes of each set; that of the environment if not given."""
+    name: str
+    trial: Trial
+    """Training that all trials of the search share."""
+    parameters: Values
+    """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
+    trials: int = 20
+    """Number of trials."""
+    first: tuple[Values, ...] = ()
+    """Parameters of the first trials."""
+
+    def with_parameters(self, values: Values) -> Trial:
+        """Return the trial with these parameters, under a name that equal parameters share."""
+        training: Values = self.trial.training
+        for path, value in values.items():
+            training = _with(training, path.split("."), value)
+        return dataclasses.replace(self.trial, training=training, row=f"{self.name}/{_hash(training)}")
+
+    @property
+    def key(self) -> str:
+        """Name that changes with the description of the search."""
+        return f"{self.name}-{_hash(dataclasses.asdict(self))}"
+
+    def folder(self, out: Path) -> Path:
+        """Return the folder of the search."""
+        return self.trial.folder(out).parent
+
+    def is_finished(self, out: Path) -> bool:
+        """Return whether the best parameters of this very search are there."""
+        path = self.folder(out) / "best.json"
+        return path.is_file() and read_json(path).get("key") == self.key
 
 
-@dataclass(frozen=True, kw_only=True)
-class Page:
-    """Files that are made of the measurements; templates are Jinja2 and may be beside the study."""
-
-    file: Path
-    """Page in Markdown."""
-    record: Path
-    """JSON file with every number."""
-    figures: Path
-    """Folder of the figures."""
-    template: Path | None = None
-    """Template of the page; that of the package if not given."""
-    tables: Path | None = None
-    """Template with a macro for each table of `into`."""
-    into: tuple[Path, ...] = ()
-    """Pages with tables between `<!-- table:NAME -->` and `<!-- end -->`, which the macro NAME writes."""
-    shown: tuple[str, ...] = ()
-    """Rows in figures; those of all agents if not given."""
+def _hash(values: Any) -> str:
+    """Return a short name for plain values, equal for equal ones."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Environments, agents and baselines, as a YAML file describes them.
+    """Environments, trials and searches that a YAML file describes.
 
     Example:
         >>> from viapoint.training import Study
-        >>> study = Study.from_dict(
-        ...     {
-        ...         "seeds": [0, 1],
-        ...         "environments": ["viapoint/PlanarReach-v0"],
-        ...         "agents": {
-        ...             "viaq": {"checks": [0, 16]},
-        ...             "sac-{batch_size}": {
-        ...                 "algo": "sac",
-        ...                 "grid": {"hyperparameters.batch_size": [128, 256]},
-        ...             },
-        ...         },
-        ...         "baselines": ["straight", "search64"],
-        ...     },
-        ...     name="small",
-        ... )
-        >>> [agent.name for agent in study.agents], [baseline.name for baseline in study.baselines]
-        (['viaq', 'sac-128', 'sac-256'], ['straight', 'search64'])
-        >>> study.out.as_posix()
-        'runs/small'
+        >>> agents = {"sac": {"algo": "sac", "grid": {"hyperparameters.batch_size": [128, 256]}}}
+        >>> given = {"environments": ["viapoint/PlanarReach-v0"], "agents": agents, "baselines": ["search64"]}
+        >>> [trial.row for trial in Study.from_dict(given).trials]
+        ['sac-batch_size=128', 'sac-batch_size=256', 'search64']
     """
 
     name: str
-    """Name of the study."""
     out: Path
-    """Folder of all runs and measurements."""
-    seeds: tuple[int, ...]
-    """Seeds of the trainings of agents that name none."""
-    environments: tuple[Environment, ...]
-    agents: tuple[Agent, ...]
-    baselines: tuple[Baseline, ...]
-    compare: tuple[tuple[str, str], ...]
-    """Pairs of rows that are compared scene by scene, or run by run."""
-    page: Page
+    """Folder of all runs and results."""
+    trials: tuple[Trial, ...]
+    searches: tuple[Search, ...] = ()
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> Self:
+    def from_yaml(cls, path: str | Path) -> Study:
         """Read a study from a YAML file.
 
         Raises:
-            ValueError: The file cannot be read, or something in it is not allowed; the message lists what is.
+            ValueError: The file cannot be read, or something in it is not allowed; the message says what is.
         """
         path = Path(path)
+        given = read_yaml(path)
         try:
-            return cls.from_dict(read_yaml(path), name=path.stem, folder=path.parent)
+            return cls.from_dict(given, name=path.stem, folder=path.parent)
         except ValueError as error:
-            raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+            raise ValueError(f"{path}: {error}") from error
 
     @classmethod
-    def from_dict(cls, given: Values, *, name: str = "study", folder: str | Path = ".") -> Self:
+    def from_dict(cls, given: Values, *, name: str = "study", folder: str | Path = ".") -> Study:
         """Return a study from plain values.
 
         Args:
             given: Values by the names of the YAML file's fields.
-            name: Name of the study, if `given` has none.
-            folder: Folder of templates and files of scenes.
+            name: Name of the study; its folder is `runs/<name>` if `given` has no `out`.
+            folder: Folder of files of scenes.
 
         Raises:
-            ValueError: Something is not allowed; the message lists what is.
+            ValueError: Something is not allowed; the message says what is.
         """
-        folder = Path(folder)
-        check_fields("the study", given, _TOP)
-        name = str(given.get("name", name))
-        out = Path(given.get("out", Path("runs") / name))
-        seeds = seeds_of("seeds", given.get("seeds", [0]))
-        environments = tuple(_environments(given.get("environments"), given.get("scenes"), folder))
-        known = {each.name: each for each in environments}
-        agents = tuple(
-            _agent(*each, known, seeds) for each in expanded("agents", given.get("agents", {}), AGENT_FIELDS)
+        return _made("the study", _study, given, name, Path(folder))
+
+
+def _made(where: str, make: Callable[..., Made], fields: Any, *args: Any) -> Made:
+    """Return the result of a function for fields of a file, which are its keyword arguments.
+
+    Raises:
+        ValueError: A field is unknown, or the function refuses it; the message begins with the place in the file.
+    """
+    if not isinstance(fields, Mapping):
+        raise ValueError(f"{where} must be values by name, got {fields!r}")
+    allowed = {
+        name: each
+        for name, each in inspect.signature(make).parameters.items()
+        if each.kind == each.KEYWORD_ONLY
+    }
+    known = [*allowed, *(TRAINING_FIELDS if make in (_agent, _search) else ())]
+    for name in fields:
+        if name not in known:
+            raise ValueError(unknown_name(f"{where}: fields", name, known))
+    try:
+        check_arguments(make, fields)
+        return make(*args, **fields)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _study(
+    default: str,
+    folder: Path,
+    *,
+    environments: Any,
+    out: str = "",
+    seeds: list[int] | None = None,
+    agents: Any = None,
+    baselines: Any = None,
+    searches: Any = None,
+    scenes: list[str] | None = None,
+    n_scenes: int | None = None,
+) -> Study:
+    """Return a study; the fields are those of the file."""
+    known = {}
+    for name, fields in _points(environments):
+        fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
+        known[name] = _made(f"environments.{name}", _environment, fields, name, folder)
+    found: list[Trial | Search] = []
+    rows: set[str] = set()
+    for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
+        for name, fields in _points(given or {}):
+            if name in rows:
+                raise ValueError(f"rows must have different names, {name} is there twice")
+            rows.add(name)
+            for env in fields.pop("environments", list(known)):
+                if env not in known:
+                    raise ValueError(unknown_name(f"{name}: environments", env, known))
+                shared = {} if make is _baseline else {"seeds": seeds or [0]}
+                found += _made(f"{name}", make, {**shared, **fields}, known[env], name)
+    if not found:
+        raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
+    trials = sorted((each for each in found if isinstance(each, Trial)), key=lambda each: each.seed)
+    every = tuple(each for each in found if isinstance(each, Search))
+    return Study(name=default, out=Path(out or f"runs/{default}"), trials=tuple(trials), searches=every)
+
+
+def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
+    if not isinstance(given, list | Mapping):
+        raise ValueError(
+            f"environments, agents and so on must be a list of names or values by name, got {given!r}"
         )
-        baselines = tuple(
-            _baseline(*each, known, agents)
-            for each in expanded("baselines", given.get("baselines", {}), BASELINE_FIELDS)
-        )
-        names = [each.name for each in (*agents, *baselines)]
-        for each in names:
-            if names.count(each) > 1:
-                raise ValueError(f"agents and baselines must have different names, {each} is there twice")
-        rows = [row for agent in agents for row in rows_of(agent)] + [each.name for each in baselines]
-        compare = tuple(_compared(pair, rows) for pair in listed("compare", given.get("compare", [])))
-        page = _page(given.get("page", {}), out, folder, rows)
-        return cls(
-            name=name,
-            out=out,
-            seeds=seeds,
-            environments=environments,
-            agents=agents,
-            baselines=baselines,
-            compare=compare,
-            page=page,
-        )
-
-    def environment(self, name: str) -> Environment:
-        """Return the environment of a name."""
-        return next(each for each in self.environments if each.name == name)
+    entries = dict.fromkeys(given) if isinstance(given, list) else given
+    for pattern, fields in entries.items():
+        if not str(pattern).strip("/. ") or ".." in str(pattern) or str(pattern).startswith("/"):
+            raise ValueError(f"names must be words, got {pattern!r}")
+        if not isinstance(fields, Mapping | None):
+            raise ValueError(f"{pattern} must be values by name, got {fields!r}")
+        grid = (fields or {}).get("grid", {})
+        if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
+            raise ValueError(f"grid of {pattern} must be lists by the path of a field, got {grid!r}")
+        for values in itertools.product(*grid.values()):
+            point, name = {key: value for key, value in (fields or {}).items() if key != "grid"}, str(pattern)
+            for path, value in zip(grid, values, strict=True):
+                point = _with(point, path.split("."), value)
+                name = f"{name}-{path.rpartition('.')[2]}={value}"
+            yield name, point
 
 
-_TOP = ("name", "out", "seeds", "scenes", "environments", "agents", "baselines", "compare", "page")
-_ENVIRONMENT_FIELDS = ("id", "env_kwargs", "scenes", "n_scenes")
-_ENTRY_FIELDS = ("label", "environments", "timed", "grid")
-_AGENT_OWN = ("seeds", "checks", "untrained", "unrevised", "step_wise", "cpus", "resources")
-_BASELINE_OWN = ("method", "checks", "time_of", "env_kwargs", "scenes", "n_scenes")
-AGENT_FIELDS = (*_ENTRY_FIELDS, *_AGENT_OWN, *TRAINING_FIELDS)
-"""Fields of an agent."""
-BASELINE_FIELDS = (*_ENTRY_FIELDS, *_BASELINE_OWN)
-"""Fields of a baseline."""
+def _with(fields: Values, path: list[str], value: Any) -> dict[str, Any]:
+    """Return fields in which the one at a path has another value."""
+    first, *rest = path
+    return {**fields, first: _with(fields.get(first) or {}, rest, value) if rest else value}
 
 
-def rows_of(agent: Agent) -> list[str]:
-    """Return the ids of an agent's rows."""
-    return [mode.row(agent.name) for mode in agent.modes()]
-
-
-def _environments(given: Any, scenes: Any, folder: Path) -> Iterator[Environment]:
-    """Yield environments from a list of ids, or from values by name."""
-    for name, fields in named("environments", given):
-        where = f"environments.{name}"
-        check_fields(where, fields, _ENVIRONMENT_FIELDS)
-        env_id = fields.get("id", name)
-        if env_id not in ENV_IDS or env_id in STEP_TASKS:
-            raise ValueError(
-                unknown(f"{where}: id", env_id, [each for each in ENV_IDS if each not in STEP_TASKS])
-            )
-        kwargs = mapping(f"{where}.env_kwargs", fields.get("env_kwargs", {}))
-        check_env_kwargs(kwargs)
-        sets = _sets(f"{where}.scenes", fields.get("scenes", scenes), env_id, folder)
-        n_scenes = fields.get("n_scenes")
-        check_number(f"{where}.n_scenes", n_scenes)
-        yield Environment(name=name, id=env_id, env_kwargs=kwargs, scenes=sets, n_scenes=n_scenes)
-
-
-def _sets(where: str, given: Any, env_id: str, folder: Path) -> tuple[str, ...]:
-    """Return the measured sets of an environment: by default those that are shipped for it."""
-    shipped = [name for name in SETS if shipped_path(name, env_id).is_file()] or list(SETS[:2])
-    if given is None:
-        return tuple(name for name in shipped if name in MEASURED)
-    found = []
-    for name in listed(where, given):
-        if name in SETS:
-            found += [name] if name in shipped else []
-        elif (folder / str(name)).is_file():
-            found.append(str(folder / str(name)))
+def _environment(
+    name: str,
+    folder: Path,
+    *,
+    id: str = "",  # noqa: A002 - the name in the file
+    env_kwargs: dict[str, Any] | None = None,
+    scenes: list[str] | None = None,
+    n_scenes: int | None = None,
+) -> Environment:
+    """Return an environment with its sets of scenes: by default those that are shipped for it."""
+    env_id = id or name
+    whole = [each for each in ENV_IDS if each not in STEP_TASKS]
+    if env_id not in whole:
+        raise ValueError(unknown_name("id", env_id, whole))
+    kwargs = env_kwargs or {}
+    check_env_kwargs(kwargs)
+    if n_scenes is not None:
+        check_whole("n_scenes", n_scenes, 1)
+    # Models are selected on `validation`, so it is measured only where it is asked for.
+    places = []
+    for each in [name for name in SETS if name != "validation"] if scenes is None else scenes:
+        if each in SETS:
+            drawn = each in ("test", "validation")  # the other sets exist only where they are shipped
+            places += [each] if drawn or shipped_path(each, env_id).is_file() else []
+        elif (folder / each).is_file():
+            places.append(str((folder / each).absolute()))
         else:
-            raise ValueError(unknown(where, name, SETS) + " (or the path of a file of scenes)")
-    return tuple(found)
+            raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
+    if not places:
+        there = [each for each in SETS if shipped_path(each, env_id).is_file()]
+        raise ValueError(
+            f"no set among {', '.join(scenes or SETS)} is shipped for {env_id}; there are {', '.join(there)}"
+        )
+    return Environment(name=name, id=env_id, env_kwargs=kwargs, scenes=tuple(places), n_scenes=n_scenes)
 
 
 def _agent(
-    where: str, name: str, label: str, fields: Values, known: Mapping[str, Environment], seeds: Sequence[int]
-) -> Agent:
-    """Return an agent whose configuration is allowed in each of its environments."""
-    algo = fields.get("algo", "viaq")
-    if algo not in get_args(Algorithm):
-        raise ValueError(unknown(f"{where}: algo", algo, get_args(Algorithm)))
-    step_wise = bool(fields.get("step_wise", False))
-    possible = [each for each, env in known.items() if not step_wise or env.id in TWINS]
-    checks = tuple(listed(f"{where}.checks", fields.get("checks", [0])))
-    for number in checks:
-        check_whole(f"{where}.checks", number, 0)
-    if any(checks) and algo != "viaq":
-        raise ValueError(f"{where}: checks are those of viaq; {algo} has no proposals to check")
-    check_whole(f"{where}.cpus", fields.get("cpus", 1), 1)
-    agent = Agent(
-        name=name,
-        label=label,
-        environments=_chosen(f"{where}.environments", fields.get("environments"), possible, known),
-        timed=bool(fields.get("timed", True)),
-        training={each: fields[each] for each in TRAINING_FIELDS if each in fields},
-        seeds=seeds_of(f"{where}.seeds", fields["seeds"]) if "seeds" in fields else tuple(seeds),
-        checks=checks,
-        untrained=bool(fields.get("untrained", False)),
-        unrevised=bool(fields.get("unrevised", False)),
+    env: Environment,
+    row: str,
+    *,
+    seeds: list[int],
+    checks: list[int] | None = None,
+    untrained: bool = False,
+    step_wise: bool = False,
+    resources: dict[str, float] | None = None,
+    **training: Any,
+) -> list[Trial]:
+    """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
+    if step_wise and env.id not in STEP_TASKS.values():
+        raise ValueError(f"there is no step-wise twin of {env.id}")
+    numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
+    if any(numbers) and training.get("algo", "viaq") != "viaq":
+        raise ValueError(f"checks are those of viaq; {training['algo']} has no proposals to check")
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
+    shared = Trial(
+        env=env,
+        row=row,
+        training=training,
+        checks=numbers,
+        untrained=untrained,
         step_wise=step_wise,
-        cpus=fields.get("cpus", 1),
-        resources=mapping(f"{where}.resources", fields.get("resources", {})),
+        resources={"cpu": 1, **(resources or {})},
     )
-    given = mapping(f"{where}.hyperparameters", fields.get("hyperparameters", {}))
-    check_fields(f"{where}.hyperparameters", given, sorted(argument_names(ALGORITHMS[algo])))
-    for env in agent.environments:
-        try:
-            agent.config(known[env], 0, Path("runs"))
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{where} in {env}: {error}") from error
-    return agent
+    trials = [dataclasses.replace(shared, seed=seed) for seed in seeds]
+    for trial in trials:
+        config = trial.config(Path())
+        check_hyperparameters(config.algo, config.hyperparameters)
+    return trials
 
 
-def _baseline(
-    where: str,
-    name: str,
-    label: str,
-    fields: Values,
-    known: Mapping[str, Environment],
-    agents: Sequence[Agent],
-) -> Baseline:
-    """Return a baseline that exists in each of its environments."""
-    method = fields.get("method", name)
-    allowed = tuple(dict.fromkeys([*OWN_METHODS, *METHODS, *REPLANNING_METHODS]))
-    if method not in allowed:
-        raise ValueError(unknown(f"{where}: method", method, allowed))
-    checks, time_of = fields.get("checks"), fields.get("time_of")
-    if method in COUNTED and (checks is None) is (time_of is None or method != "search"):
-        raise ValueError(f"{where}: {method} needs checks, a number, or search time_of, the row of an agent")
-    if method not in COUNTED and (checks is not None or time_of is not None):
-        raise ValueError(f"{where}: checks and time_of are for {', '.join(COUNTED)}")
-    for each, number in (("checks", checks), ("n_scenes", fields.get("n_scenes"))):
-        check_number(f"{where}.{each}", number, 2 if method == "search" and each == "checks" else 1)
-    rows = [row for agent in agents for row in rows_of(agent)]
-    if time_of is not None and time_of not in rows:
-        raise ValueError(unknown(f"{where}: time_of", time_of, rows))
-    possible = [each for each, env in known.items() if _exists(method, env)]
-    scenes = fields.get("scenes")
-    return Baseline(
-        name=name,
-        label=label,
-        environments=_chosen(f"{where}.environments", fields.get("environments"), possible, known),
-        timed=bool(fields.get("timed", method not in UNTIMED)),
-        method=method,
-        checks=checks,
-        time_of=time_of,
-        env_kwargs=mapping(f"{where}.env_kwargs", fields.get("env_kwargs", {})),
-        scenes=None if scenes is None else tuple(listed(f"{where}.scenes", scenes)),
-        n_scenes=fields.get("n_scenes"),
+def _baseline(env: Environment, row: str, *, method: str = "") -> list[Trial]:
+    """Return the trial of a baseline that exists in its environment."""
+    if (method or row) != "stored":  # the planner's solutions, which the files of scenes hold
+        check_method(method or row, env.id)
+    return [Trial(env=env, row=row, method=method or row)]
+
+
+def _search(
+    env: Environment,
+    row: str,
+    *,
+    seeds: list[int],
+    parameters: dict[str, Any],
+    trials: int = 20,
+    first: list[dict[str, Any]] | None = None,
+    **training: Any,
+) -> list[Search]:
+    """Return a search whose values, or whose lowest and highest ones, are allowed."""
+    search = Search(
+        name=row,
+        trial=_agent(env, row, seeds=seeds[:1], **training)[0],
+        parameters=parameters,
+        trials=check_whole("trials", trials, 1),
+        first=tuple(first or ()),
     )
+    if not parameters:
+        raise ValueError("parameters must hold at least one list or range")
+    if not search.trial.config(Path()).evaluation_interval:
+        raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
+    for path in [path for each in search.first for path in each if path not in parameters]:
+        raise ValueError(unknown_name("first", path, parameters))
+    for path, given in parameters.items():
+        if path.partition(".")[0] not in TRAINING_FIELDS:
+            raise ValueError(unknown_name("parameters", path.partition(".")[0], TRAINING_FIELDS))
+        for value in _ends(path, given):  # an impossible value is an error now, and not in the last trial
+            _agent(env, row, seeds=seeds[:1], **search.with_parameters({path: value}).training)
+    return [search]
 
 
-def _exists(method: str, env: Environment) -> bool:
-    """Return whether a baseline exists in an environment."""
-    if method in ("stored", "random_order"):
-        shipped = all(shipped_path(each, env.id).is_file() for each in env.scenes if each in SETS)
-        return env.id not in REPLANNING_TASKS and (method == "random_order" or shipped)
-    return method in OWN_METHODS or method in (REPLANNING_METHODS if env.id in REPLANNING_TASKS else METHODS)
-
-
-def _chosen(
-    where: str, given: Any, possible: Sequence[str], known: Mapping[str, Environment]
-) -> tuple[str, ...]:
-    """Return the environments of an entry: by default all in which it exists."""
-    if given is None:
-        return tuple(possible)
-    for name in listed(where, given):
-        if name not in known:
-            raise ValueError(unknown(where, name, list(known)))
-        if name not in possible:
-            raise ValueError(f"{where}: it does not exist in {name}, only in {', '.join(possible) or 'none'}")
-    return tuple(given)
-
-
-def _page(given: Any, out: Path, folder: Path, rows: Sequence[str]) -> Page:
-    """Return the files of the page, by default in the folder of the study's runs."""
-    names = [each.name for each in dataclasses.fields(Page)]
-    fields = mapping("page", given)
-    check_fields("page", fields, names)
-    found: dict[str, Any] = {
-        "file": Path(fields.get("file", out / "results.md")),
-        "record": Path(fields.get("record", out / "results.json")),
-        "figures": Path(fields.get("figures", out / "figures")),
-    }
-    for name in ("template", "tables"):
-        if name in fields:
-            found[name] = folder / fields[name]
-            if not found[name].is_file():
-                raise ValueError(f"page.{name}: {found[name]} is missing")
-    found["into"] = tuple(Path(each) for each in listed("page.into", fields.get("into", [])))
-    found["shown"] = tuple(listed("page.shown", fields.get("shown", [])))
-    for row in found["shown"]:
-        if row not in rows:
-            raise ValueError(unknown("page.shown", row, rows))
-    return Page(**found)
-
-
-def _compared(pair: Any, rows: Sequence[str]) -> tuple[str, str]:
-    if not isinstance(pair, list) or len(pair) != 2:
-        raise ValueError(f"compare must hold pairs of rows, such as [viaq, sac], got {pair!r}")
-    for row in pair:
-        if row not in rows:
-            raise ValueError(unknown("compare", row, rows))
-    return pair[0], pair[1]
+def _ends(path: str, given: Any) -> list[Any]:
+    """Return all values of a list, or the lowest and the highest of a range."""
+    if isinstance(given, list) and given:
+        return given
+    low: Any = given.get("low") if isinstance(given, Mapping) else None
+    high: Any = given.get("high") if isinstance(given, Mapping) else None
+    if not (is_number(low) and is_number(high) and low < high) or (given.get("log") and low <= 0):
+        raise ValueError(
+            f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
+        )
+    return [low, high]

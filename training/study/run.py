@@ -1,159 +1,293 @@
-"""Command `study`: run what is missing of a study, and write its pages."""
+"""Command `study`: run trials with Ray Tune, search hyperparameters with Optuna, and write tables."""
 
 from __future__ import annotations
 
-import fnmatch
-import functools
-import time
-from collections.abc import Callable, Sequence
+import dataclasses
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
+import pandas as pd
+
+from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.config.configs import StudyConfig
-from viapoint.training.io.files import read_json, write_json
-from viapoint.training.study.config import Environment, Study
-from viapoint.training.study.figures import draw_figures
-from viapoint.training.study.jobs import baseline_jobs, measured_files, training_jobs
-from viapoint.training.study.page import write_pages
-from viapoint.training.study.results import Row, gather, rows_in
-from viapoint.training.study.runners import Job, make_runner
-from viapoint.training.study.timing import remove_times, time_decisions
+from viapoint.training.io.files import BadFileError, read_json, write_bytes, write_json
+from viapoint.training.runs.trainer import train_or_resume
+from viapoint.training.study.config import Search, Study, Trial, Values
+from viapoint.training.study.tables import markdown, tables, write_results
+from viapoint.training.study.trials import ReportCallback, finished_record, run_trial
 
-Step = Literal["train", "evaluate", "baselines", "time", "page"]
-Report = Callable[[str], object]
-STEPS: tuple[Step, ...] = get_args(Step)
+RETRIES = 2
+"""Number of times that a trial whose worker died is begun again."""
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
+    "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
+}
+"""Environment variables of Ray, which reads them when it is imported."""
+Told = Callable[[str], None]
 
 
 class StudyFailedError(Exception):
-    """Some jobs of a study failed; the others are done, and the same command tries again."""
-
-    exit_code = 1
-    """Exit code of the command."""
+    """Error of a study in which some trials failed; the others are complete."""
 
 
 def run(config: StudyConfig) -> None:
-    """Run a study from the command line."""
-    report = functools.partial(print, flush=True)
-    run_study(
-        config.file, on=config.on, workers=config.workers, only=config.only, redo=config.redo, report=report
-    )
+    """Run a study from its file, and print where its tables are."""
+    study = Study.from_yaml(config.file)
+    table = run_study(study, out=config.out, address=config.address, workers=config.workers, told=print)
+    if len(table):
+        print(markdown(table, study.name))
+    print(f"tables and figures: {config.out or study.out}")
 
 
 def run_study(
-    study: Study | str | Path,
+    study: Study,
     *,
-    on: str = "local",
+    out: str | Path | None = None,
+    address: str | None = None,
     workers: int | None = None,
-    only: Sequence[str] = STEPS,
-    redo: Sequence[str] = (),
-    report: Report | None = None,
-) -> dict[str, Any]:
-    """Run what is missing of a study, and write its record, figures and pages.
+    told: Told = lambda line: None,
+) -> pd.DataFrame:
+    """Run what a study has not run yet, and write its tables.
 
-    Trainings and measurements that exist are kept, so the same call continues where another one stopped, on any
-    machine. Results do not depend on where and in which order jobs ran.
+    Ray Tune places the trials. The same call continues a study that was stopped or killed: complete trials are kept,
+    and interrupted trainings go on from their last checkpoints.
 
     Args:
-        study: Study, or its YAML file.
-        on: `local`; `ray` for the cluster of the environment variable RAY_ADDRESS, or without it for a Ray of this
-            machine; or `ray://HOST:PORT`.
-        workers: Number of parallel jobs. Locally 1 by default, and 0 for this process. On Ray all that fit by default.
-        only: Steps to run: `train`, `evaluate`, `baselines`, `time` and `page`.
-        redo: Patterns of rows, such as `viaq/*`, or of environments and rows, such as `PandaReach-v0/*`, whose
-            measurements by these steps are removed first and made again. Trainings are kept.
-        report: Function that takes a line about each finished job, timing and file, such as `print`.
+        study: Environments, agents, baselines and searches.
+        out: Folder of runs and results; that of the study if not given.
+        address: Address HOST:PORT of a Ray cluster whose nodes see the folder; a Ray of this machine if not given.
+        workers: Number of trials at the same time; as many as the cores allow if not given.
+        told: Function of one line for each trial that ends.
 
     Returns:
-        The record, which is in the study's JSON file as well.
+        Table with one line for each environment, set of scenes and row, as `results.csv` holds it.
 
     Raises:
-        ValueError: The study, a step, a pattern or the cluster is not allowed; the message lists what is.
-        StudyFailedError: Jobs failed; the others are done.
+        ImportError: Ray, or for a search Optuna, is not installed.
+        ValueError: A trial cannot be made, the folder holds something else, or there is no such cluster.
+        StudyFailedError: Some trials failed.
 
     Example:
         >>> import tempfile
         >>> from viapoint.training import Study, run_study
-        >>> given = {"environments": ["viapoint/PlanarReach-v0"], "baselines": ["straight", "search64"]}
-        >>> study = Study.from_dict({**given, "out": tempfile.mkdtemp()}, name="reach")
-        >>> record = run_study(study, workers=0, only=["baselines", "page"])
-        >>> [row["label"] for row in record["environments"]["viapoint/PlanarReach-v0"]["rows"]]
-        ['straight', 'search64']
+        >>> given = {"environments": ["viapoint/PlanarReach-v0"], "baselines": ["straight"], "n_scenes": 20}
+        >>> table = run_study(Study.from_dict({**given, "scenes": ["test"], "out": tempfile.mkdtemp()}), workers=1)
+        >>> table.success.tolist()
+        [1.0]
     """
-    for step in only:
-        if step not in STEPS:
-            raise ValueError(f"only must be some of {', '.join(STEPS)}, got {step!r}")
-    study = study if isinstance(study, Study) else Study.from_yaml(study)
-    report = report or (lambda line: None)
-    steps = set(only)
-    before = read_json(study.page.record) if study.page.record.is_file() else None
-    if redo:
-        _remove_measurements(study, redo, steps, report)
-    jobs = list(training_jobs(study, only)) if steps & {"train", "evaluate"} else []
-    jobs += baseline_jobs(study, of_equal_time=False) if "baselines" in steps else []
+    folder = Path(study.out if out is None else out).absolute()
+    _claim(folder, study.name)
+    missing = [trial for trial in study.trials if finished_record(trial, folder) is None]
+    searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
-    if jobs or steps & {"baselines", "time"}:
-        failed = _measure(study, jobs, steps, on, workers, report)
-    record = gather(study, before)
-    if "page" in steps:
-        write_json(study.page.record, record)
-        for path in [
-            *draw_figures(record, study.page.figures, study.page.shown),
-            *write_pages(record, study.page),
-        ]:
-            report(str(path))
+    if missing or searches:
+        told(
+            f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
+        )
+        with _connected(address, workers):
+            failed += _fit(missing, folder, workers, told) if missing else []
+            for search in searches:
+                failed += _search(search, folder, workers, told)
+    table = tables(study.trials, folder)
+    write_results(table, study, folder)
     if failed:
-        raise StudyFailedError(f"{len(failed)} jobs failed: {'; '.join(failed)}")
-    return record
+        raise StudyFailedError(
+            f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"
+        )
+    return table
 
 
-def _remove_measurements(study: Study, patterns: Sequence[str], steps: set[str], report: Report) -> None:
-    """Remove the measurements and decision times of rows, so that the steps make them again."""
-    rows = [(env, row) for env in study.environments for row in rows_in(study, env)]
-    for pattern in patterns:
-        if not any(_matches(row, env, pattern) for env, row in rows):
-            allowed = ", ".join(dict.fromkeys(row.id for _, row in rows))
-            raise ValueError(f"redo must match rows; those of the study are {allowed}; got {pattern!r}")
-    for env, row in rows:
-        if any(_matches(row, env, pattern) for pattern in patterns):
-            removed = 0
-            if ("baselines" if row.mode is None else "evaluate") in steps:
-                for path in measured_files(study, env, row.entry, row.mode):
-                    removed += path.is_file()
-                    path.unlink(missing_ok=True)
-            if "time" in steps:
-                removed += remove_times(study, env, row.id)
-            report(f"{env.folder} {row.id}: {removed} measurements removed")
+def _claim(folder: Path, name: str) -> None:
+    """Create the folder of a study, or check that it is one."""
+    mark = folder / "study.json"
+    if mark.is_file() and read_json(mark).get("viapoint") == "study":
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise BadFileError(folder, "holds something else than a study; name another folder")
+    write_json(mark, {"viapoint": "study", "name": name})
 
 
-def _matches(row: Row, env: Environment, pattern: str) -> bool:
-    return any(fnmatch.fnmatchcase(name, pattern) for name in (row.id, f"{env.folder}/{row.id}"))
+def _import_libraries() -> tuple[Any, Any]:
+    """Import Ray and Ray Tune, which take seconds, and Optuna only when a study runs."""
+    os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
+    try:
+        import optuna
+        import ray
+        from ray import tune
+    except ModuleNotFoundError as error:
+        raise ImportError(explain_import_error(error, "a study"), name=error.name) from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return ray, tune
 
 
-def _measure(
-    study: Study, jobs: Sequence[Job], steps: set[str], on: str, workers: int | None, report: Report
-) -> list[str]:
-    """Run jobs, then timings alone, then the searches that they decide; return what failed."""
-    study.out.mkdir(parents=True, exist_ok=True)
-    failed: list[str] = []
+@contextmanager
+def _connected(address: str | None, workers: int | None) -> Iterator[None]:
+    """Connect to a cluster, or start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study."""
+    loopback = address is None or address.startswith(("127.0.0.1:", "localhost:"))
+    if loopback:  # otherwise Ray replaces 127.0.0.1 by another address of the machine
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    ray, _ = _import_libraries()
+    if ray.is_initialized():
+        yield
+        return
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        settings |= {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    try:
+        if address is not None:  # Ray itself tries for minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=10.0).close()
+        ray.init(address=address or "local", **settings)
+    except (OSError, RuntimeError, ValueError) as error:
+        advice = "`ray start --head` starts one, and one that has a token needs RAY_AUTH_MODE=token"
+        raise ValueError(f"no Ray cluster at {address} ({_one_line(error)}); {advice}") from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
-    def run_all(jobs: Sequence[Job]) -> None:
-        with make_runner(on, study.out, workers) as runner:
-            began = time.monotonic()
-            report(f"{len(jobs)} jobs; Ctrl-C saves, and the same command goes on")
-            for number, (job, answer) in enumerate(runner.run(jobs), 1):
-                minutes = (time.monotonic() - began) / 60.0
-                where = f" on {answer.place}" if answer.place else ""
-                text = f"FAILED: {answer.error}" if answer.error else answer.value
-                report(f"[{number}/{len(jobs)}, {minutes:.1f} min] {job.label}{where}: {text}")
-                if answer.error:
-                    failed.append(f"{job.label}: {answer.error}")
 
-    if jobs:
-        run_all(jobs)
-    if "time" in steps:
-        for line in time_decisions(study):
-            report(line)
-    later = list(baseline_jobs(study, of_equal_time=True)) if "baselines" in steps else []
-    if later:
-        run_all(later)
-    return failed
+def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> list[str]:
+    """Run trials with Ray Tune, and return a line for each that failed."""
+    _, tune = _import_libraries()
+
+    def work(config: Values) -> None:
+        metrics = {"label": config["trial"].folder(Path()).as_posix()}
+        try:
+            first = run_trial(config["trial"], folder)["rows"][0]
+            rate = 100.0 * first["solved"].count("1") / len(first["solved"])
+            metrics["label"] += f": {rate:.1f} % of {first['set']}"
+        except Exception as error:  # worth no second try, unlike a worker that died
+            metrics["error"] = _one_line(error)
+        tune.report(metrics)
+
+    tuner = tune.Tuner(
+        tune.with_resources(work, lambda config: config["trial"].resources),
+        param_space={"trial": tune.grid_search(trials)},
+        tune_config=tune.TuneConfig(max_concurrent_trials=workers, reuse_actors=True),
+        run_config=_run_config(tune, "trials", folder, told),
+    )
+    return _fitted(tuner, len(trials))[1]
+
+
+def _search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
+    """Search for hyperparameters, write the best ones, and return a line for each trial that failed.
+
+    Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
+    """
+    _, tune = _import_libraries()
+    from ray.tune.schedulers import ASHAScheduler
+    from ray.tune.search.optuna import OptunaSearch
+
+    total = search.trial.config(folder).total_timesteps
+
+    def work(config: Values) -> None:
+        trial = search.with_parameters(config)
+        try:
+            settings = trial.config(folder)
+            run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
+            metrics = {"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions}
+        except Exception as error:
+            metrics = {"success": 0.0, "decisions": total, "error": _one_line(error)}
+        tune.report({**metrics, "label": f"{trial.row}: {100.0 * metrics['success']:.1f} %"})
+
+    trainable = tune.with_resources(work, dict(search.trial.resources))
+    config = _run_config(tune, f"search-{search.key}", folder, told)
+    path = Path(config.storage_path) / config.name
+    if tune.Tuner.can_restore(path):
+        tuner = tune.Tuner.restore(str(path), trainable, resume_unfinished=True, restart_errored=True)
+    else:
+        # Trainings end by themselves, before max_t.
+        scheduler = ASHAScheduler(time_attr="decisions", max_t=2 * total, grace_period=max(total // 4, 1))
+        tuner = tune.Tuner(
+            trainable,
+            param_space={path: _domain(tune, given) for path, given in search.parameters.items()},
+            tune_config=tune.TuneConfig(
+                metric="success",
+                mode="max",
+                num_samples=search.trials,
+                max_concurrent_trials=workers,
+                search_alg=OptunaSearch(
+                    points_to_evaluate=[dict(each) for each in search.first] or None, seed=0
+                ),
+                scheduler=scheduler,
+            ),
+            run_config=config,
+        )
+    results, failed = _fitted(tuner, search.trials)
+    if len(failed) == search.trials:
+        return failed
+    told(_write_search(search, results, folder))  # settings that cannot be trained do not end a search
+    return []
+
+
+def _run_config(tune: Any, name: str, folder: Path, told: Told) -> Any:
+    """Return the settings of Ray Tune that all trials share."""
+
+    class Lines(tune.Callback):  # type: ignore[misc]
+        """Callback that prints one line for each trial that ends."""
+
+        def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
+            label, error = trial.last_result.get("label"), trial.last_result.get("error")
+            if label is not None:  # of a training that was not stopped early
+                told(f"{label} failed: {error}" if error else label)
+
+    return tune.RunConfig(
+        name=name,
+        storage_path=str(folder / "tune"),
+        failure_config=tune.FailureConfig(max_failures=RETRIES),
+        callbacks=[Lines()],
+        verbose=0,
+    )
+
+
+def _fitted(tuner: Any, expected: int) -> tuple[Any, list[str]]:
+    """Run trials, and return their results and a line for each that failed."""
+    handler = signal.getsignal(signal.SIGINT)
+    results = tuner.fit()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
+    if sum(each.error is not None or each.metrics.get("done", False) for each in results) < expected:
+        raise KeyboardInterrupt  # after Ctrl-C, Ray Tune returns
+    failed = [_one_line(error) for error in results.errors]
+    for each in results:
+        if each.error is None and "error" in each.metrics:
+            failed.append(f"{each.metrics['label']}: {each.metrics['error']}")
+    return results, failed
+
+
+def _domain(tune: Any, given: Any) -> Any:
+    """Return the domain of a parameter: one of a list, or a range of whole numbers or of real ones."""
+    if isinstance(given, list):
+        return tune.choice(given)
+    low, high, log = given["low"], given["high"], given.get("log", False)
+    if isinstance(low, int) and isinstance(high, int):
+        return (tune.lograndint if log else tune.randint)(low, high + 1)
+    return (tune.loguniform if log else tune.uniform)(low, high)
+
+
+def _write_search(search: Search, results: Any, folder: Path) -> str:
+    """Write all trials of a search as CSV and the best one as JSON, and return a line about it."""
+    lines = [{**each.config, **each.metrics} for each in results if each.error is None]
+    table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
+    # A training that was stopped early had less success than others with as many decisions.
+    table = table.sort_values(["decisions", "success"], ascending=False)
+    write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
+    best = table.to_dict("records")[0]
+    chosen = search.with_parameters({path: best[path] for path in search.parameters})
+    config = dataclasses.replace(chosen.config(folder), out=None)
+    record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
+    write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
+    return f"best of {search.name}, {100.0 * best['success']:.1f} %: {config.command}"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

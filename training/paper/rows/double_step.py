@@ -23,10 +23,9 @@ import numpy as np
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
-from viapoint.training.paper.reference_movements import straight, target
-from viapoint.training.paper.simulated import SimulatedMovements, instants, track
+from viapoint.training.paper.movements import SimulatedMovements, instants, straight, target, track
 
-DURATION = 0.7
+STEP_DURATION = 0.7
 """Duration of the first movement and of the second one, [s]."""
 MOMENTS = (0.05, 0.1, 0.2, 0.3)
 """Moments of revision, [s]."""
@@ -80,7 +79,11 @@ class DoubleStep(NamedTuple):
 
 
 def double_step(
-    moment: float, *, goal: Float | None = None, duration: float = DURATION, remaining: float = DURATION
+    moment: float,
+    *,
+    goal: Float | None = None,
+    duration: float = STEP_DURATION,
+    remaining: float = STEP_DURATION,
 ) -> DoubleStep:
     """Return a movement from T1 towards T4 whose target jumps to T5.
 
@@ -135,7 +138,7 @@ def excess_cost(distance: float, moment: float, duration: float, remaining: floa
 def double_step_claims() -> list[Claim]:
     """Return the claims of row 13: sum and plan compared."""
     every = [double_step(moment) for moment in MOMENTS]
-    same = double_step(0.3, remaining=DURATION - 0.3)
+    same = double_step(0.3, remaining=STEP_DURATION - 0.3)
     alike = simulate_double(same)
     claims = [
         _claim("Both continue position, velocity and acceleration at the revision: greatest jump, relative to the "
@@ -155,7 +158,7 @@ def _claims_at(moment: float, movement: DoubleStep) -> list[Claim]:
     """Return the claims of one moment of revision; the second movement takes as long as the first."""
     when = f"Revised at {1e3 * moment:.0f} ms"
     amplitude = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    expected = 1.0 + excess_cost(amplitude, moment, DURATION, DURATION) / movement.cost("planned")
+    expected = 1.0 + excess_cost(amplitude, moment, STEP_DURATION, STEP_DURATION) / movement.cost("planned")
     distance = greatest_distance(movement)
     found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
     motion = simulate_double(movement)
@@ -208,7 +211,7 @@ def _spread() -> float:
     """Return the greatest relative deviation of the excess from its closed form over random second targets."""
     generator, moment = np.random.default_rng(0), 0.2
     distance = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    expected = excess_cost(distance, moment, DURATION, DURATION)
+    expected = excess_cost(distance, moment, STEP_DURATION, STEP_DURATION)
     goals = target(NAMES[1]) + generator.uniform(-0.4, 0.4, (100, 2))
     movements = [double_step(moment, goal=goal) for goal in goals]
     found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
@@ -229,7 +232,7 @@ def replanning_claims() -> list[Claim]:
     """Return the claims of row 11: the quintic of the primer, and replanning."""
     movement = double_step(SWITCH, duration=WHOLE_DURATION)
     state = movement.first.sample(np.array([SWITCH]))
-    fresh = _solved(state, target("T5"), DURATION)
+    fresh = _solved(state, target("T5"), STEP_DURATION)
     apart = np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
     begun = movement.replanned.sample(np.array([0.0]))
     jumps = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(state, begun, strict=True)]

@@ -17,10 +17,17 @@ from viapoint.primitives import speed_valleys
 from viapoint.training.algorithms.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
-from viapoint.training.paper.profiles import Profile, arm_profile, model_profile
-from viapoint.training.paper.reference_movements import construction, minimum_jerk_through, passage_share
-from viapoint.training.paper.rows.timing import FAST, SLOW
-from viapoint.training.paper.simulated import SimulatedMovements, simulate
+from viapoint.training.paper.movements import (
+    Profile,
+    SimulatedMovements,
+    arm_profile,
+    construction,
+    minimum_jerk_through,
+    model_profile,
+    passage_share,
+    simulate,
+)
+from viapoint.training.paper.rows.curved import FAST, SLOW
 from viapoint.training.planners.baselines import agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 
@@ -68,7 +75,9 @@ def agent_movements(agent: Path | None) -> ObstacleMovements:
     method = agent_method("agent", found, 0)
     simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
     check_scenes(scenes, simulation.task.collision_model)
-    action = method.decide(simulation.observe(_padded(scenes, simulation)), _padded(scenes, simulation))
+    missing = simulation.task.scenes.n_obstacles[1] - scenes.obstacles.shape[1]
+    padded = scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
+    action = method.decide(simulation.observe(padded), padded)
     success = simulation(scenes, action).success
     simulation.close()
     if not success.any():
@@ -96,13 +105,6 @@ def check_agent(agent: Path) -> None:
             f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
             f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
         )
-
-
-def _padded(scenes: Scenes, simulation: SceneSimulation) -> Scenes:
-    """Return scenes with as many obstacle rows as the observation; the added ones are absent."""
-    most = simulation.task.scenes.n_obstacles[1]
-    missing = most - scenes.obstacles.shape[1]
-    return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
 
 
 class Features(NamedTuple):

@@ -8,8 +8,15 @@ from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.reference_movements import minimum_jerk_through, straight, target
-from viapoint.training.paper.simulated import SimulatedMovements, joint_velocity, required_torque, simulate
+from viapoint.training.paper.movements import (
+    SimulatedMovements,
+    joint_velocity,
+    minimum_jerk_through,
+    required_torque,
+    simulate,
+    straight,
+    target,
+)
 
 DIAGONALS = (("T3", "T6"), ("T1", "T4"), ("T2", "T5"))
 """The straight movements of Figs. 3 and 4."""

@@ -1,0 +1,40 @@
+"""Imports of names on first use, for packages whose modules take long to import."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package that imports some names on first use.
+
+    The names are those that its `__init__.py` imports under `if TYPE_CHECKING:`, where type checkers see them, too. So
+    there is one list of them.
+
+    Example:
+        >>> from viapoint.primitives._lazy import lazy_imports
+        >>> get, names = lazy_imports("viapoint.envs")
+        >>> get("Sphere").__module__
+        'viapoint.envs.geometry.round_shapes'
+    """
+    module: Any = sys.modules[package]
+    places: dict[str, str] = {}
+    for node in ast.parse(module.__spec__.loader.get_source(package)).body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            for line in node.body:
+                if isinstance(line, ast.ImportFrom) and line.module is not None:
+                    places.update({alias.name: line.module for alias in line.names})
+
+    def get(name: str) -> Any:
+        if name not in places:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(places[name]), name)
+
+    def names() -> list[str]:
+        return sorted({*vars(module), *places})
+
+    return get, names

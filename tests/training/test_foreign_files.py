@@ -1,0 +1,212 @@
+"""Nothing that this package did not write is deleted or overwritten, and what it wrote is replaced."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.training import load_agent
+from viapoint.training.algorithms.agent import find_model
+from viapoint.training.algorithms.model_io import weights
+from viapoint.training.cli import demo
+from viapoint.training.cli import main as cli
+from viapoint.training.config.configs import DemoConfig, EvaluateConfig, PaperConfig, PlayConfig, TrainConfig
+from viapoint.training.io.files import BadFileError
+from viapoint.training.paper import run as paper
+from viapoint.training.paper.figures import save as save_figure
+from viapoint.training.plotting.video import record_video
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import train
+
+REACH = "viapoint/PlanarReach-v0"
+NOTES = b"years of work with viapoint \xff"
+FOREIGN_JSON = b'{"env": "viapoint/PlanarReach-v0", "layers": [8, 8]}'
+
+
+def content_of(folder):
+    """Every file below a folder, with its bytes, and every folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
+
+
+def put(folder, name, content=NOTES):
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+
+
+def tiny(folder, **changes):
+    values = {
+        "env": REACH,
+        "out": folder,
+        "n_timesteps": 64,
+        "n_envs": 16,
+        "eval_every": 0,
+        "checkpoint_every": 16,
+    }
+    values |= {"hyperparameters": {"learning_starts": 64}, "env_kwargs": {"threads": 1}, "progress": False}
+    return TrainConfig(**{**values, **changes})
+
+
+def evaluate(path):
+    words = ["evaluate", "--env", REACH, "--baselines", "straight", "--n-scenes", "2", "--json", str(path)]
+    cli.main(words)
+
+
+def film(path):
+    env = gym.make(REACH, render_mode="rgb_array_list", width=64, height=64)
+    scenes = env.unwrapped.task.sampler()([np.random.default_rng(0)])
+    record_video(path, env, scenes, lambda *_: np.zeros((1, 3)))
+    env.close()
+
+
+SAVES = {
+    "file beside a model": (True, "model", "model/notes.txt"),
+    "folder beside a model": (True, "model", "model/thesis/notes.txt"),
+    "folder in place of weights": (False, "model", "model/weights.safetensors/notes.txt"),
+    "file of another name": (False, "model", "model/notes.txt"),
+    "record of another program": (True, "model", "model/model.json", FOREIGN_JSON),
+    "weights of another program": (False, "model", "model/weights.safetensors"),
+    "file in place of the folder": (False, "model", "model"),
+    "file in place of the folder, named as SB3 names it": (False, "model.zip", "model"),
+}
+"""Whether there is a model, where an agent is saved, and what else is there."""
+
+
+@pytest.mark.parametrize("name", SAVES)
+def test_an_agent_is_saved_over_a_model_alone(name, tmp_path):
+    own, target, *foreign = SAVES[name]
+    agent = load_agent(REACH)
+    if own:
+        agent.save(tmp_path / "model")
+    put(tmp_path, *foreign)
+    before = content_of(tmp_path)
+    with pytest.raises(BadFileError):
+        agent.save(tmp_path / target)
+    assert content_of(tmp_path) == before
+
+
+def test_an_own_model_is_replaced_also_behind_a_link(tmp_path):
+    agent, other = load_agent(REACH), load_agent("viapoint/PlanarObstacles-v0")
+    (tmp_path / "empty").mkdir()
+    for folder in (tmp_path / "empty", tmp_path / "new"):
+        other.save(folder)
+        agent.save(folder)
+        for part, array in weights(load_agent(folder)).items():
+            np.testing.assert_array_equal(array, weights(agent)[part])
+    (tmp_path / "link").symlink_to(tmp_path / "new")
+    other.save(tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert load_agent(tmp_path / "new").env_id == "viapoint/PlanarObstacles-v0"
+
+
+@pytest.mark.parametrize("content", [NOTES, b"", FOREIGN_JSON])
+def test_an_evaluation_replaces_an_evaluation_alone(content, tmp_path):
+    evaluate(tmp_path / "own.json")
+    evaluate(tmp_path / "own.json")
+    assert json.loads((tmp_path / "own.json").read_text())["env"] == REACH
+    put(tmp_path, "foreign.json", content)
+    before = content_of(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        evaluate(tmp_path / "foreign.json")
+    assert end.value.code == 2
+    with pytest.raises(BadFileError):
+        EvaluateConfig(env=REACH, json=tmp_path / "foreign.json")
+    assert content_of(tmp_path) == before
+
+
+def test_a_film_replaces_a_film_alone(tmp_path):
+    film(tmp_path / "own.mp4")
+    film(tmp_path / "own.mp4")
+    put(tmp_path, "wedding.mp4")
+    before = content_of(tmp_path)
+    with pytest.raises(BadFileError):
+        film(tmp_path / "wedding.mp4")
+    with pytest.raises(BadFileError):
+        PlayConfig(agent=REACH, video=tmp_path / "wedding.mp4")
+    assert content_of(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "begun"), [*((each, True) for each in demo.FILES), ("table.md", False), ("notes.txt", False)]
+)
+def test_a_demo_writes_over_no_file_of_something_else(name, begun, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "train", pytest.fail if begun else train)
+    if begun:
+        Run.create(tiny(tmp_path))
+    put(tmp_path, name)
+    before = content_of(tmp_path)
+    with pytest.raises(BadFileError):
+        demo.run(DemoConfig(out=tmp_path, env=REACH))
+    assert content_of(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", [*paper.PAGES, "fig01_model.svg", "limits.png"])
+def test_the_paper_is_written_over_no_file_of_something_else(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(paper, "reproduce", lambda *_: pytest.fail("began to work"))
+    put(tmp_path, name)
+    before = content_of(tmp_path)
+    with pytest.raises(BadFileError):
+        paper.run(PaperConfig(out=tmp_path))
+    assert content_of(tmp_path) == before
+
+
+def test_what_the_paper_and_the_demo_wrote_can_be_written_again(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    claims = [paper.Claim(row=1, claim="one", model=1.0, expected=paper.straight.near(1.0, 0.1))]
+    pictures = []
+    for drawing in paper.DRAWINGS:
+        picture, _ = save_figure(Figure(), tmp_path, drawing.name)
+        pictures.append((picture, "caption"))
+    monkeypatch.setattr(paper, "reproduce", lambda *_: paper.Reproduction(claims, pictures))
+    for _ in range(2):
+        paper.run(PaperConfig(out=tmp_path))
+
+
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "thesis/a.tex", "versions.json", "config.json", "best/model.json"]
+)
+def test_a_training_begins_in_no_folder_of_something_else(name, tmp_path):
+    put(tmp_path, name)
+    before = content_of(tmp_path)
+    with pytest.raises(BadFileError):
+        train(tiny(tmp_path))
+    assert content_of(tmp_path) == before
+
+
+def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
+    folder = tmp_path / "run"
+    train(tiny(folder, n_timesteps=32))
+    foreign = [
+        "notes.txt",
+        "checkpoints/2024-notes/a.txt",
+        "checkpoints/12345/a.txt",
+        "checkpoints/0000000016/notes.txt",  # beside a checkpoint
+        "checkpoints/0000000001/a.txt",
+        "checkpoints/1700000000/a.txt",
+        "evaluations/notes.md",
+        ".backup.part",
+        ".cache/a.old",
+        "tensorboard/mine.txt",
+    ]
+    for name in foreign:
+        put(folder, name)
+    run = train(TrainConfig(out=folder, resume=True, n_timesteps=128, progress=False))
+    assert [int(path.name) for path in run.checkpoints()] == [112, 128]
+    assert all((folder / name).read_bytes() == NOTES for name in foreign)
+
+
+@pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex"])
+def test_a_model_of_a_run_with_foreign_files_is_not_replaced(name, tmp_path):
+    folder = tmp_path / "run"
+    train(tiny(folder, n_timesteps=32))
+    put(folder, name)
+    with pytest.raises(BadFileError):
+        train(TrainConfig(out=folder, resume=True, n_timesteps=64, progress=False))
+    assert (folder / name).read_bytes() == NOTES
+    assert Run(folder).decisions == 64
+    assert find_model(folder).name == "final"

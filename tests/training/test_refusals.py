@@ -1,0 +1,424 @@
+"""Bad input raises one error where it enters: the input, and the type of the error."""
+
+import functools
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import VecNormalize
+
+from viapoint.envs import Sphere
+from viapoint.envs.arms import ARMS
+from viapoint.envs.mdp.task import Task
+from viapoint.training import ObserveCandidates, evaluate, load_agent
+from viapoint.training.algorithms.agent import SAC, find_model
+from viapoint.training.algorithms.model_io import ALGORITHMS
+from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.cli import main as cli
+from viapoint.training.config.checks import ELSEWHERE
+from viapoint.training.config.configs import (
+    DemoConfig,
+    EvaluateConfig,
+    LiveConfig,
+    PaperConfig,
+    PlayConfig,
+    StudyConfig,
+    TrainConfig,
+    _from_words,
+)
+from viapoint.training.evaluation import statistics
+from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.io.files import BadFileError
+from viapoint.training.live.scene_file import from_json
+from viapoint.training.paper.claim import Claim
+from viapoint.training.planners.baselines import agent_method, make_method
+from viapoint.training.plotting import plots
+from viapoint.training.plotting.gallery import gallery
+from viapoint.training.plotting.video import record_video
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs.run_dir import Run
+from viapoint.training.runs.trainer import train
+from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
+from viapoint.training.search.geometry_search import GeometrySearch
+
+ENV, REACH, STEP = (
+    f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
+)
+MOVING, OWN_ARM = "viapoint/PlanarMovingObstacles-v0", "viapoint/Reach-v0"
+STALLING = {"stop_when_stalled": 0.3}
+
+CONFIGURATIONS = [
+    (TrainConfig, {"env": "viapoint/Nothing-v0"}),
+    (TrainConfig, {"env": "CartPole-v1"}),
+    (TrainConfig, {"env": STEP}),  # viaq decides on whole movements
+    (TrainConfig, {"algo": "dqn"}),
+    *((TrainConfig, {"seed": seed}) for seed in (-1, 1.5, 2**32)),
+    *((TrainConfig, {"n_envs": number}) for number in (0, True, 10**9)),
+    *((TrainConfig, {name: 0}) for name in ("n_timesteps", "checkpoint_every", "eval_scenes")),
+    (TrainConfig, {"env_kwargs": ("n_via",)}),
+    *((TrainConfig, {"env_kwargs": {name: 1}}) for name in ELSEWHERE),
+    (TrainConfig, {"hyperparameters": 5}),
+    *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, -0.3, True, "0.3", math.nan)),
+    (TrainConfig, STALLING),  # the preset has no more decisions than it must make
+    (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
+    (TrainConfig, {"min_timesteps": 5}),
+    (TrainConfig, {"observe_candidates": 16}),
+    (TrainConfig, {"observe_candidates": 16, "algo": "sac", "env": STEP}),
+    (TrainConfig, {"observe_candidates": -1}),
+    (EvaluateConfig, {}),
+    (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
+    (EvaluateConfig, {"env": ENV, "checks": (8,)}),
+    (EvaluateConfig, {"env": ENV, "checks": ()}),
+    (EvaluateConfig, {"agent": ENV, "checks": (-1,)}),
+    (EvaluateConfig, {"agent": ENV, "n_scenes": 0}),
+    (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
+    (EvaluateConfig, {"pretrained": "nobody"}),
+    (EvaluateConfig, {"env": "nothing"}),
+    (PlayConfig, {}),
+    (PlayConfig, {"agent": "a", "n_scenes": 0}),
+    (PlayConfig, {"agent": "a", "checks": -1}),
+    (PlayConfig, {"agent": "a", "video": "film.gif"}),
+    (LiveConfig, {"port": 70_000}),
+    (LiveConfig, {"env": "nothing"}),
+    (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
+    (DemoConfig, {"env": OWN_ARM}),
+    (DemoConfig, {"checks": 0}),
+    (StudyConfig, {"file": "study.yaml", "workers": 0}),
+]
+
+
+@pytest.mark.parametrize(("kind", "values"), CONFIGURATIONS)
+def test_configurations(kind, values):
+    with pytest.raises(ValueError):
+        kind(**values)
+
+
+@pytest.mark.parametrize(
+    "words", [["n_via"], ["=3"], ["n_via=2", "n_via=3"], ["x=[1,8"], ['x={"a":'], ["x={a: 1, a: 2}"]]
+)
+def test_words(words):
+    with pytest.raises(ValueError):
+        _from_words(words)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "needed"),
+    [
+        (EvaluateConfig, "json", {"agent": "a"}),
+        (PlayConfig, "video", {"agent": "a"}),
+        (PaperConfig, "out", {}),
+        (DemoConfig, "out", {}),
+        (StudyConfig, "out", {"file": "study.yaml"}),
+    ],
+)
+def test_places_that_cannot_be_written_to(kind, name, needed, tmp_path):
+    (tmp_path / "file").write_text("")
+    kind(**needed, **{name: tmp_path / "deeper/new.mp4"})
+    for bad in ("file", "file/new.mp4", "file/deeper/new.mp4"):
+        with pytest.raises(ValueError):
+            kind(**needed, **{name: tmp_path / bad})
+
+
+NUMBERS = (math.nan, -math.inf, "abc", [], {"kind": "eval"})
+HYPERPARAMETERS = [
+    *(
+        ("sac", {name: value})
+        for name in ("learning_rate", "gamma", "batch_size", "tau")
+        for value in NUMBERS
+    ),
+    *((algo, {"learning_rate": value}) for algo in ALGORITHMS for value in (0.0, -1e-3, True, None)),
+    *((algo, {"speed": 1}) for algo in ALGORITHMS),
+    *(("sac", {"learning_rate": {"kind": "linear", "start": start}}) for start in (1.0, -1.0)),
+    *(("sac", {name: 7}) for name in ("gamma", "tau", "policy_kwargs")),
+    *(("sac", {"ent_coef": value}) for value in (-0.1, "auto_0", "much")),
+    *(("sac", {name: 0}) for name in ("buffer_size", "batch_size", "train_freq", "target_update_interval")),
+    *((algo, {"batch_size": True}) for algo in ALGORITHMS),
+    *(("sac", {"train_freq": pair}) for pair in ([0, "step"], [1, "episode"], [1, "day"])),
+    ("td3", {"policy_delay": 0}),
+    ("td3", {"target_policy_noise": -0.1}),
+    *(("td3", {"action_noise": {"kind": "normal", "sigma": sigma}}) for sigma in (-0.1, math.nan, "x")),
+    ("td3", {"action_noise": {"kind": "pink"}}),
+    ("tqc", {"top_quantiles_to_drop_per_net": -1}),
+    *(("ppo", {name: 0}) for name in ("n_steps", "n_epochs", "clip_range")),
+    *(("ppo", {name: 1.5}) for name in ("n_epochs", "gae_lambda")),
+    ("ppo", {"batch_size": 1}),
+    ("ppo", {"ent_coef": "auto"}),
+    *(
+        ("viaq", {name: 0})
+        for name in ("buffer_size", "temperature", "explore_candidates", "next_candidates")
+    ),
+    *(("viaq", {name: 1.5}) for name in ("explore_uniformly", "batch_size", "policy_kwargs")),
+    ("viaq", {"gradient_steps": -9}),
+    *(("viaq", {name: 1}) for name in ("action_noise", "n_steps", "use_sde", "optimize_memory_usage")),
+]
+
+
+POLICIES = [
+    ("sac", {"speed": 1}),
+    ("sac", {"net_arch": [-3]}),
+    *(("viaq", {"width": value}) for value in (0, 128.0, "wide")),
+    *(("viaq", {"candidates": value}) for value in (0, 2.5)),
+    *(("viaq", {name: 0}) for name in ("instants", "per_refinement")),
+    *(("viaq", {name: -1}) for name in ("refinements", "checks")),
+    *(("viaq", {name: 3}) for name in ("optimizer_kwargs", "net_arch", "task", "form", "pooling", "heads")),
+]
+UNTRAINABLE = [
+    *({"algo": algo, "hyperparameters": values} for algo, values in HYPERPARAMETERS),
+    *({"algo": algo, "hyperparameters": {"policy_kwargs": values}} for algo, values in POLICIES),
+    {"env_kwargs": {"colour": 1}},
+    {"env_kwargs": {"n_via": -1}},
+]
+
+
+@pytest.mark.parametrize("changes", UNTRAINABLE)
+def test_what_cannot_be_trained_leaves_no_folder(changes, tmp_path):
+    with pytest.raises(ValueError):
+        train(TrainConfig(out=tmp_path / "runs" / "run", n_timesteps=1, n_envs=2, **changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
+    yield env
+    env.close()
+
+
+@functools.cache
+def agent():
+    return load_agent(ENV)
+
+
+def plan(**changes):
+    return GeometrySearch(ENV, 8).plan(**{"start": (-0.2, 0.3), "goal": (0.1, 0.4), **changes})
+
+
+def predicted(**changes):
+    observation, _ = gym.make(ENV).reset(seed=0)
+    return agent().predict({**observation, **changes})
+
+
+def scene_file(**changes):
+    record = {"format": "viapoint-scene", "start": [0.1, 0.2], "goal": [0.2, 0.3], "obstacles": []}
+    return from_json(json.dumps({**record, **changes}), dimension=2)
+
+
+def sphere_file(**changes):
+    return scene_file(obstacles=[{"shape": "sphere", "radius": 0.1, **changes}])
+
+
+def scenes(number):
+    return SceneSimulation(ENV, 1).task.sampler()([np.random.default_rng(0)] * number)
+
+
+def draws(*scores, samples=10):
+    generator = np.random.default_rng(0)
+    statistics.across_seeds([scores], np.zeros(len(scores)), generator, samples=samples)
+
+
+def film(path="film.mp4", number=1, mode="rgb_array_list"):
+    record_video(path, gym.make(ENV, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
+
+
+CALLS = [
+    *(lambda name=name: make_method(name, ENV)
+      for name in ("magic", "search", "search3", "sobol0", "random_order0", "search512x", "unrevised", "")),
+    *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
+    lambda: evaluate_methods([], load("test", ENV), ENV),
+    lambda: evaluate(ENV, env=REACH),
+    lambda: evaluate(ENV, baselines=["unrevised"]),
+    lambda: evaluate(baselines=["straight"]),
+    lambda: evaluate(env=ENV, baselines=["untrained"]),
+    lambda: evaluate("nowhere"),
+    lambda: evaluate(ENV, checks=-1),
+    lambda: evaluate(ENV, checks=[0, 1.5]),
+    lambda: evaluate(ENV, n_scenes=0),
+    lambda: evaluate(ENV, scenes="nowhere.npz"),
+    lambda: GeometrySearch("viapoint/Nothing-v0"),
+    *(lambda name=name, value=value: GeometrySearch(ENV, **{name: value})
+      for name, value in (("n_checks", 0), ("n_checks", 1.5), ("refinements", -1), ("per_round", True))),
+    lambda: plan(start=(0.1, 0.2, 0.3)),
+    lambda: plan(goal=(np.nan, 0.4)),
+    lambda: plan(goal="there"),
+    lambda: plan(goal=(0.9, 0.4)),
+    lambda: plan(goal=(-0.2, 0.3)),  # where it starts
+    lambda: plan(obstacles=[(0.0, 0.3, 0.1)]),
+    lambda: plan(obstacles=[(0.0, np.inf, 0.0, 0.0, 0.1)]),
+    lambda: plan(obstacles=[(0.0, 0.3, 0.0, 0.0, 0.5)]),
+    lambda: plan(obstacles=[(-0.2, 0.3, 0.0, 0.0, 0.02)]),  # touches the arm
+    lambda: plan(obstacles=[Sphere(0.02, position=(-0.2, 0.3, 0.0), name="can")]),
+    lambda: agent().plan((-0.2, 0.3), (0.1, 0.4), [(0.5, 0.1 * i, 0.0, 0.0, 0.01) for i in range(9)]),
+    lambda: load_agent(MOVING).plan((-0.2, 0.3), (0.1, 0.4)),
+    lambda: agent().learn(8),  # loaded for decisions
+    lambda: agent().predict(np.zeros(2)),
+    lambda: predicted(wind=np.zeros(2)),
+    lambda: predicted(goal=np.array([np.nan, 0.3])),
+    lambda: predicted(goal=gym.make(ENV).reset(seed=0)[0]["hand"]),
+    lambda: ViaVecEnv("viapoint/Nothing-v0", 2),
+    lambda: ViaVecEnv("CartPole-v1", 2),
+    lambda: SceneSimulation("Nothing-v3"),
+    lambda: load_agent("viapoint/Reach-v0"),
+    lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}, ARMS),
+    *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
+    lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    *(lambda number=number: ObserveCandidates(gym.make(ENV), number) for number in (0, -1, 1.5, True, 4097)),
+    *(lambda env_id=env_id: ObserveCandidates(gym.make(env_id)) for env_id in (STEP, "CartPole-v1")),
+    lambda: ObserveCandidates(ObserveCandidates(gym.make(ENV))),
+    *(lambda change=change: scene_file(**change) for change in (
+        {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"goal": None}, {"jumps": [[1.0]]},
+        {"obstacles": 3}, {"obstacles": [3]}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},
+        {"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 1]]}]},
+    )),
+    *(lambda change=change: sphere_file(**change) for change in (
+        {"radius": "x"}, {"radius": -1.0}, {"position": [0, 0, 1]}, {"course": [1]}, {"course": 1},
+    )),
+    *(lambda text=text: from_json(text, dimension=2) for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20))),
+    lambda: load("tests", ENV),
+    lambda: load(shipped_path("test", ENV), REACH),
+    lambda: scenes_for("hard", ENV, {"n_obstacles": 3}),
+    lambda: scenes_for(str(shipped_path("test", ENV)), ENV, {"n_obstacles": 3}),
+    lambda: scenes_for(str(shipped_path("test", ENV)), ENV, {"arm": "panda"}),
+    lambda: film("film.gif"),
+    lambda: film("film"),
+    lambda: film(mode=None),
+    lambda: film(number=0),
+    lambda: gallery("gallery.png", []),
+    lambda: plots.learning_curve("none.png", []),
+    lambda: statistics.wilson(5, 4),
+    lambda: statistics.wilson(-1, 4),
+    lambda: statistics.mcnemar([True], [True, False]),
+    lambda: statistics.mcnemar([], []),
+    lambda: statistics.mcnemar([0.5, 1.0], [0.0, 1.0]),
+    lambda: statistics.mcnemar([0.0, 1.0], [math.nan, 1.0]),
+    lambda: statistics.interquartile_mean([]),
+    lambda: statistics.interquartile_mean([math.nan]),
+    lambda: statistics.across_seeds([1.0], [0], np.random.default_rng(0)),
+    lambda: statistics.across_seeds([[1.0, 0.0]], [0], np.random.default_rng(0)),
+    lambda: statistics.success_weighted_path_length([1], [0.0], [1.0]),
+    lambda: statistics.success_weighted_path_length([1], [1.0, 2.0], [1.0]),
+    lambda: statistics.success_weighted_path_length([1.0], [math.inf], [1.0]),
+    lambda: draws(0.5, math.nan),
+    *(lambda samples=samples: draws(0.5, 1.0, samples=samples) for samples in (0, -1, 1.5)),
+    lambda: Claim(row=1, claim="x", model=1.0).holds,
+    lambda: Claim(row=1, claim="x", model=None).holds,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_calls(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError):
+        call()
+    assert list(tmp_path.iterdir()) == []
+
+
+COPIES = [
+    (lambda env: env.set_options([{"start": 0.0}, *[{}] * 5]), ValueError),
+    (lambda env: env.set_options([*[{}] * 5, {"goal": 0.0}]), ValueError),
+    (lambda env: env.set_options([{}] * 5), ValueError),
+    (lambda env: env.set_options([5] * 6), ValueError),
+    (lambda env: env.set_options(5), ValueError),
+    (lambda env: env.set_options([{"obstacles": np.zeros((k % 2, 5))} for k in range(6)]), ValueError),
+    (lambda env: env.get_attr("num_envs", 6), IndexError),
+    (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
+    (lambda env: env.env_is_wrapped(gym.Wrapper, indices=[9]), IndexError),
+    (lambda env: env.get_attr("nothing"), AttributeError),
+    (lambda env: env.set_attr("mark", 2, indices=[0]), ValueError),
+]
+
+
+@pytest.mark.parametrize(("call", "error"), COPIES)
+def test_what_copies_of_an_environment_cannot_share(call, error, env):
+    with pytest.raises(error):
+        call(env)
+    env.reset()
+
+
+def test_folders_that_are_no_runs(tmp_path):
+    run = Run.create(TrainConfig(out=tmp_path / "run"))
+    (tmp_path / "file").write_text("")
+    for call in (
+        lambda: Run(tmp_path / "nothing"),
+        lambda: Run(tmp_path / "file"),
+        lambda: Run(tmp_path),
+        lambda: Run.create(TrainConfig(out=tmp_path)),
+        lambda: Run.create(TrainConfig(out=tmp_path / "file")),
+        lambda: find_model(run.folder),
+        lambda: find_model(tmp_path),
+        lambda: train(TrainConfig(out=tmp_path / "nothing", resume=True)),
+        lambda: train(TrainConfig(out=run.folder, resume=True, seed=7)),
+        lambda: train(TrainConfig(out=run.folder, resume=True, n_envs=8)),
+        lambda: train(TrainConfig(out=run.folder, resume=True, env_kwargs={"n_via": 2})),
+    ):
+        with pytest.raises(ValueError):
+            call()
+    with pytest.raises(BadFileError, match="--resume"):
+        Run.create(TrainConfig(out=run.folder))
+    for content in ('{"env": "viapoint/Nothing-v0"}', '{"colour": "red"}', "{"):
+        (run.folder / "config.json").write_text(content)
+        with pytest.raises(BadFileError):
+            Run(run.folder)
+
+
+COMMANDS = [
+    ("", "train"),
+    ("fly", "fly"),
+    ("bench", "bench"),
+    ("train --algo dqn", "dqn"),
+    ("train --seed x", "--seed"),
+    ("train --seed -1", "seed"),
+    ("train --speed 3", "--speed"),
+    ("train --env viapoint/PlanarObstacle-v0", f"did you mean '{ENV}'"),
+    ("train --env CartPole-v1", "CartPole-v1"),
+    ("train --env-kwargs n_via", "n_via"),
+    ("train --env-kwargs n_via=2 n_via=3", "n_via"),
+    ("train --env-kwargs num_envs=4", "--n-envs"),
+    ("train --env-kwargs n_vi=2 --out new", "n_vi"),
+    ("train --hyperparameters gamma=7 --out new", "gamma"),
+    ("train --hyperparameters foo=2 --out new", "foo"),
+    ('train --hyperparameters policy_kwargs={"width":0} --out new', "width"),
+    ("train --n-timesteps 1 --out full", "full"),
+    ("train --resume --out full", "full"),
+    ("evaluate", "--env"),
+    ("evaluate nowhere", "nowhere"),
+    ("evaluate full/notes.txt", "notes.txt"),
+    ("evaluate viapoint/Nothing-v0", "viapoint/Nothing-v0"),
+    (f"evaluate --env {ENV} --baselines magic", "magic"),
+    (f"evaluate --env {ENV} --baselines straight random straight", "straight"),
+    (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
+    (f"evaluate --env {ENV} --baselines straight --json full", "full"),
+    (f"evaluate --env {ENV} --baselines straight --checks 8", "checks"),
+    (f"evaluate --env {ENV} --failures there", "--failures"),
+    (f"evaluate {REACH} --env {ENV}", REACH),
+    (f"evaluate {REACH} --baselines unrevised", "unrevised"),
+    ("play nowhere", "nowhere"),
+    ("play viapoint/Reach-v0", "viapoint/Reach-v0"),
+    (f"play {REACH} --video film.gif", "film.gif"),
+    (f"play {REACH} --scenes nowhere", "nowhere"),
+    ("paper --out full/notes.txt", "notes.txt"),
+    ("paper --agent nowhere", "nowhere"),
+    *((f"paper --agent {find_model(f'viapoint/{name}-v0')}", name)
+      for name in ("PlanarReach", "PandaReach", "PlanarMovingObstacles")),
+    ("demo --out full", "full"),
+    ("demo --env viapoint/PlanarObstaclesStep-v0", STEP),
+    ("study nowhere.yaml", "nowhere.yaml"),
+    ("doctor --out", "--out"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "named"), COMMANDS)
+def test_commands_end_with_one_line_that_names_the_offender(words, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    with pytest.raises(SystemExit) as end:
+        cli.main(words.split())
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("viapoint: ")
+    assert named in line
+    assert [path.name for path in tmp_path.rglob("*")] == ["full", "notes.txt"]

@@ -1,1 +1,0 @@
-"""Figures of the paper, one module for each group."""

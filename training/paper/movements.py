@@ -1,0 +1,273 @@
+"""Movements of the paper between its targets, their profiles, and their simulation on the arm of an adult."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from viapoint.envs.arms.base import CollisionModel
+from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.scene import TARGETS
+from viapoint.envs.sim.outcome import SETTLING
+from viapoint.envs.sim.simulator import Simulator
+from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
+
+
+def target(name: str) -> Float:
+    """Return the position of one of the paper's targets T1 to T6, shape (2,), [m]."""
+    return np.asarray(TARGETS[name], dtype=np.float64)
+
+
+def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
+    """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
+    return point_to_point(target(first), target(last), duration, order=order)
+
+
+def via_waypoints(start: ArrayLike, goal: ArrayLike, along: ArrayLike, height: ArrayLike) -> Float:
+    """Return start, via-point and goal by the construction of Fig. 1B.
+
+    Args:
+        start: Shape (2,), [m].
+        goal: Shape (2,), [m].
+        along: d1 / (d1 + d2), shape (...,): where the perpendicular through the via-point meets the line.
+        height: d3 / (d1 + d2), shape (...,); positive is to the left of the movement.
+
+    Returns:
+        Shape (..., 3, 2), [m].
+    """
+    x0, xf = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+    along, height = np.broadcast_arrays(np.asarray(along, dtype=np.float64), height)
+    line = xf - x0
+    left = np.array([-line[1], line[0]])
+    via = x0 + along[..., None] * line + height[..., None] * left
+    ends = np.broadcast_to(x0, via.shape), np.broadcast_to(xf, via.shape)
+    return np.stack((ends[0], via, ends[1]), axis=-2)
+
+
+def construction(waypoints: Float) -> tuple[Float, Float]:
+    """Return d1 / (d1 + d2) and unsigned d3 / (d1 + d2) of waypoints (..., 3, 2), the inverse of `via_waypoints`."""
+    line = waypoints[..., 2, :] - waypoints[..., 0, :]
+    offset = waypoints[..., 1, :] - waypoints[..., 0, :]
+    square = (line * line).sum(axis=-1)
+    turn = line[..., 0] * offset[..., 1] - line[..., 1] * offset[..., 0]
+    return (line * offset).sum(axis=-1) / square, np.abs(turn) / square
+
+
+def minimum_jerk_through(waypoints: ArrayLike, duration: Any = 1.0) -> Trajectory:
+    """Return the movement through (..., K + 2, 2) waypoints [m] with free passage times (Eqs. 4, 5 and C16)."""
+    return through(waypoints, passage_durations(waypoints, duration))
+
+
+def curved(first: str, last: str, along: ArrayLike, height: ArrayLike, duration: Any = 1.0) -> Trajectory:
+    """Return the movement between two targets through a via-point, see :func:`via_waypoints`."""
+    return minimum_jerk_through(via_waypoints(target(first), target(last), along, height), duration)
+
+
+def passage_share(movement: Trajectory) -> Float:
+    """Return t1 / (t1 + t2) of movements through one via-point, shape (...,)."""
+    return np.asarray(movement.knots[..., 1] / movement.knots[..., 2])
+
+
+TIMESTEP = 0.002
+"""Time step of the physics in the arm's model file, [s]."""
+
+
+class SimulatedMovements(NamedTuple):
+    """Simulated movements at T instants; after its end a movement settles."""
+
+    time: Float
+    """Shape (T,), [s]; every physics step from the start on."""
+    duration: Float
+    """Planned durations, shape (N,), [s]."""
+    planned: Float
+    """Hand position of the plan, shape (N, T, 2), [m]."""
+    hand: Float
+    """Shape (N, T, 2), [m]."""
+    joints: Float
+    """Shoulder and elbow angles, shape (N, T, 2), [rad]."""
+    torque: Float
+    """Torque of the actuators in the step that begins at each instant, shape (N, T - 1, 2), [N m]."""
+
+    @property
+    def deviation(self) -> Float:
+        """Greatest distance of the hand from the plan, shape (N,), [mm]."""
+        return np.asarray(1e3 * np.linalg.norm(self.hand - self.planned, axis=-1).max(axis=-1))
+
+    @property
+    def worst(self) -> float:
+        """Greatest deviation of all movements, [mm]."""
+        return float(self.deviation.max())
+
+    def velocity(self) -> Float:
+        """Return the velocity of the hand by central differences, shape (N, T, 2), [m/s]."""
+        return np.asarray(np.gradient(self.hand, self.time, axis=1))
+
+    def acceleration(self) -> Float:
+        """Return the acceleration of the hand by central differences, shape (N, T, 2), [m/s^2]."""
+        return np.asarray(np.gradient(self.velocity(), self.time, axis=1))
+
+    def peak_speed(self) -> Float:
+        """Return the greatest speed of each movement, shape (N,), [m/s]."""
+        return np.asarray(np.linalg.norm(self.velocity(), axis=-1).max(axis=-1))
+
+    def at(self, row: int, fractions: Float) -> Float:
+        """Return the hand position of one movement at fractions of its duration, shape (len(fractions), 2), [m]."""
+        time = np.asarray(fractions) * self.duration[row]
+        return np.stack([np.interp(time, self.time, self.hand[row, :, i]) for i in (0, 1)], axis=-1)
+
+
+def simulate(movement: Trajectory) -> SimulatedMovements:
+    """Simulate planar movements of batch shape () or (N,), each from rest at its start."""
+    number = int(np.prod(movement.batch_shape)) if movement.batch_shape else 1
+    duration = np.broadcast_to(np.asarray(movement.duration), (number,))
+    time = instants(float(duration.max()))
+    references = [part.reshape(number, len(time), 2) for part in movement.sample(time)]
+    return track(duration, *references)
+
+
+def instants(duration: float) -> Float:
+    """Return the instants of the physics steps of a movement and of its settling, from 0 on, [s]."""
+    return np.asarray(TIMESTEP * np.arange(int(np.ceil((duration + SETTLING) / TIMESTEP)) + 1))
+
+
+def track(duration: Float, position: Float, velocity: Float, acceleration: Float) -> SimulatedMovements:
+    """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
+    number, count = position.shape[:2]
+    simulator = Simulator(CollisionModel(ADULT, whole_arm=False), n_obstacles=0, num_envs=number, threads=1)
+    sims, start = np.arange(number), np.asarray(ADULT.inverse_kinematics(position[:, 0]))
+    simulator.place(sims, start, np.zeros((number, 0, 5)), np.zeros((number, 0), dtype=bool))
+    controls = ADULT.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])
+    ran = simulator.batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
+    joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
+    time, torque = TIMESTEP * np.arange(count), _torque(ran["qvel"], ran["actuator_force"])
+    return SimulatedMovements(
+        np.asarray(time), duration, position, np.asarray(ADULT.hand_position(joints)), joints, torque
+    )
+
+
+def _torque(rates: Float, force: Float) -> Float:
+    """Return the torque that moved the arm in each step.
+
+    The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning. A
+    force at its limit does not depend on the rates.
+    """
+    change = np.diff(rates, axis=1, prepend=0.0)
+    return np.where(
+        np.abs(force) < np.array(ADULT.torque_limit), force - np.array(ADULT.damping) * change, force
+    )
+
+
+def joint_velocity(joints: Float, hand_velocity: Float) -> Float:
+    """Return joint rates (..., 2), [rad/s], from hand velocities (..., 2), [m/s], by the inverse Jacobian."""
+    both = joints[..., 0] + joints[..., 1]
+    hand, fore = np.asarray(ADULT.hand_position(joints)), ADULT.lengths[1]
+    first = np.stack((-hand[..., 1], hand[..., 0]), axis=-1)
+    second = fore * np.stack((-np.sin(both), np.cos(both)), axis=-1)
+    jacobian = np.stack((first, second), axis=-1)
+    return np.asarray(np.linalg.solve(jacobian, hand_velocity[..., None])[..., 0])
+
+
+def required_torque(movement: Trajectory, count: int = 401) -> Float:
+    """Return the torque of shoulder and elbow that a plan requires, shape (..., count, 2), [N m].
+
+    The inverse dynamics with viscosity are the arm's controls less those of its servo:
+
+        torque = controls - stiffness angle - damping rate
+    """
+    position, velocity, acceleration = movement.sample(count)
+    joints = np.asarray(ADULT.inverse_kinematics(position))
+    rates = joint_velocity(joints, velocity)
+    servo = np.array(ADULT.stiffness) * joints + np.array(ADULT.damping) * rates
+    return np.asarray(ADULT.controls(position, velocity, acceleration) - servo)
+
+
+EDGE = 0.08
+"""Fraction of the duration left out at both ends, where the curvature of a movement from rest has no bound.
+
+It grows as t^-2, so the curvature peak is the greatest local maximum inside.
+"""
+SAMPLES = 2001
+
+
+class Profile(NamedTuple):
+    """Speed and curvature of one movement at T instants."""
+
+    time: Float
+    """Instants as fractions of the duration, shape (T,)."""
+    speed: Float
+    """[m/s]"""
+    curvature: Float
+    """Unsigned, [1/m]."""
+    position: Float
+    """Shape (T, 2), [m]."""
+
+    @classmethod
+    def of(cls, time: Float, position: Float, velocity: Float, acceleration: Float) -> Profile:
+        """Return the profile of hand position, velocity and acceleration, shape (T, 2), at fractions of the duration.
+
+        kappa = |x' y'' - y' x''| / |v|^3
+        """
+        speed = np.linalg.norm(velocity, axis=-1)
+        turn = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
+        safe = np.maximum(speed, 1e-9)
+        return cls(time, speed, np.abs(turn) / (safe * safe * safe), position)
+
+    @property
+    def valley(self) -> float:
+        """Time of the least speed between two peaks, as a fraction of the duration; NaN without a valley."""
+        places = _peaks(self.time, -self.speed)
+        return places[0][0] if places else np.nan
+
+    @property
+    def valley_depth(self) -> float:
+        """Speed in the valley relative to the mean of the two highest peaks; 1 without a valley."""
+        valleys, peaks = _peaks(self.time, -self.speed), self.peaks
+        return -valleys[0][1] / float(np.mean(peaks[:2, 1])) if valleys and len(peaks) > 1 else 1.0
+
+    @property
+    def peaks(self) -> Float:
+        """Time and height of the local maxima of the speed, the highest first, shape (n, 2)."""
+        return np.array(_peaks(self.time, self.speed)).reshape(-1, 2)
+
+    @property
+    def bend(self) -> tuple[float, float]:
+        """Time and height [1/m] of the greatest local maximum of the curvature; NaN without one."""
+        places = _peaks(self.time, self.curvature)
+        return places[0] if places else (np.nan, np.nan)
+
+    def place(self, time: float) -> Float:
+        """Return the hand position at a fraction of the duration, shape (2,), [m]."""
+        return np.array([np.interp(time, self.time, self.position[:, i]) for i in (0, 1)])
+
+
+def model_profile(movement: Trajectory) -> Profile:
+    """Return the profile of a single movement of the model."""
+    position, velocity, acceleration = movement.sample(SAMPLES)
+    return Profile.of(np.linspace(0.0, 1.0, SAMPLES), position, velocity, acceleration)
+
+
+def arm_profile(motion: SimulatedMovements, row: int = 0) -> Profile:
+    """Return the profile of one movement of the simulated arm."""
+    within = motion.time <= motion.duration[row] + 1e-9
+    fields = (part[row, within] for part in (motion.hand, motion.velocity(), motion.acceleration()))
+    return Profile.of(motion.time[within] / motion.duration[row], *fields)
+
+
+def vertex(before: float, here: float, after: float) -> tuple[float, float]:
+    """Return the vertex of the parabola through three equidistant samples: offset from the middle one, and height."""
+    shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+    return shift, here - 0.25 * (before - after) * shift
+
+
+def _peaks(time: Float, value: Float) -> list[tuple[float, float]]:
+    """Return time and height of local maxima away from the ends, the highest first, by parabolas through samples."""
+    inner = (time > EDGE) & (time < 1.0 - EDGE)
+    index = np.flatnonzero(inner[1:-1] & (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])) + 1
+    found = []
+    for i in index:
+        shift, height = vertex(*value[i - 1 : i + 2])
+        found.append((float(time[i] + shift * (time[i + 1] - time[i])), float(height)))
+    return sorted(found, key=lambda each: -each[1])
