@@ -214,7 +214,7 @@ def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
         orders = ()
     if not orders or not all(map(is_whole, orders)):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
-    return tuple(map(int, orders))  # type: ignore[arg-type]
+    return tuple(map(int, orders))
 
 
 def as_number(value: Any) -> float:
