@@ -8,10 +8,23 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import ORDERS
-from .array_api import FREE, Array, Boundary, Namespace, as_floats, is_given, leading_shape
+from .array_api import (
+    FREE,
+    Array,
+    Boundary,
+    Namespace,
+    as_floats,
+    is_given,
+    leading_shape,
+    require,
+    to_numpy,
+)
 
 Ends = dict[str, Boundary]
 """The four boundary values by name, in the order of END_NAMES."""
+
+_EQUAL = 64.0
+"""Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate."""
 
 END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
 
@@ -52,6 +65,26 @@ def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
     if waypoints.shape[-2] < 2:
         raise ValueError("waypoints must hold start and goal, got one point")
     return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
+
+
+def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -> None:
+    """Raise ValueError for durations (..., S) below 0, and for 0 between waypoints (..., S + 1, D) that differ.
+
+    All durations of a movement may be 0 only if its ends are at rest.
+    """
+    if (durations > 0).all():
+        return
+    require(durations >= 0, name, durations, "must not be negative")
+    points, numbers = to_numpy(waypoints), to_numpy(durations)
+    positive = np.broadcast_to(numbers > 0, (*points.shape[:-2], numbers.shape[-1]))
+    rounding = _EQUAL * np.finfo(points.dtype).eps * np.abs(points).max(axis=(-2, -1), initial=0.0)
+    equal = np.abs(np.diff(points, axis=-2)).max(axis=-1) <= rounding[..., None]
+    require(positive | equal, name, 1.0 * positive, "may be 0 only between equal waypoints")
+    moves = np.zeros(positive.shape[:-1], dtype=bool)
+    for value in ends.values():
+        if is_given(value):
+            moves = moves | (to_numpy(value) != 0).any(axis=-1)
+    require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
 
 
 def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:

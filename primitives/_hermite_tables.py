@@ -29,47 +29,54 @@ def coefficient_table(order: int) -> Table:
 
 
 @cache
-def stiffness_table(order: int) -> Table:
-    """Return the matrix W of the cost 1/2 s^T W s / h^(2m-1) of a segment, without row and column of x0.
+def mode_table(order: int) -> Table:
+    """Return the matrix P that maps s of Eq. 1, without x0, to the Legendre modes of the m-th derivative.
 
-    Rows and columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). For m = 3 the entries are 720, 360, 192, 168,
-    60, ... W = U^T G U, with the upper half U of the coefficients and the Gram matrix G of Eq. 2 for nu = m.
+    Columns: D, V0_1, ..., V0_(m-1), V1_1, ..., V1_(m-1). The modes q_i = integral over [0, 1] of x^(m) P_i(2 u - 1)
+    are whole multiples of the data, so that modes that vanish do so without rounding.
+    """
+    return _floats(_modes(order))
+
+
+@cache
+def series_table(order: int) -> Table:
+    """Return the matrix that maps the modes q to the coefficients of u^m, ..., u^(2m-1).
+
+    It follows from x^(m) = sum_i (2 i + 1) q_i P_i(2 u - 1), P_i(2 u - 1) = sum_k (-1)^(i+k) C(i, k) C(i + k, k) u^k.
     """
     m = order
-    columns = [m, *range(1, m), *range(m + 1, 2 * m)]
-    upper = np.array(_coefficients(m)[m:])[:, columns]
-    size = range(m, 2 * m)
-    gram = np.array([[Fraction(perm(k, m) * perm(j, m), k + j - 2 * m + 1) for j in size] for k in size])
-    return _floats(upper.T @ gram @ upper)
+    table = [[Fraction(0)] * m for _ in range(m)]
+    for i in range(m):
+        for k in range(i + 1):
+            legendre = (-1) ** (i + k) * comb(i, k) * comb(i + k, k)
+            table[k][i] = Fraction((2 * i + 1) * legendre * factorial(k), factorial(m + k))
+    return _floats(table)
+
+
+@cache
+def stiffness_table(order: int) -> Table:
+    """Return the matrix W = P^T diag(2 i + 1) P of the cost 1/2 s^T W s / h^(2m-1) of a segment.
+
+    Its rows and columns are the columns of `mode_table`. For m = 3 the entries are 720, 360, 192, 168, 60, ...
+    """
+    modes = np.array(_modes(order))
+    weights = np.diag([Fraction(2 * i + 1) for i in range(order)])
+    return _floats(modes.T @ weights @ modes)
 
 
 @cache
 def energy_table(order: int, nu: int) -> Table:
-    """Return L with |L c|^2 = integral over [0, 1] of the squared nu-th derivative.
+    """Return L with |L c|^2 = integral over [0, 1] of the squared nu-th derivative, c the coefficients of u^nu, ...
 
-    L is the transposed Cholesky factor of the Gram matrix of the derivatives of u^nu, ..., u^(2m-1),
-
-        G_kj = k! / (k - nu)!  j! / (j - nu)! / (k + j - 2 nu + 1).                                 (2)
-
-    Its rows are expansions in orthonormal shifted Legendre polynomials P_i,
-
-        u^j = sum_i (2 i + 1) j!^2 / ((j - i)! (j + i + 1)!) P_i(2 u - 1),                          (3)
-
-    so that a cost is a sum of squares, without cancellation.
+    Its rows are the components along the orthonormal shifted Legendre polynomials, so that a cost is a sum of
+    squares, without cancellation.
     """
-    size = range(2 * order - nu)
-    # Eq. 3 divided by 2 i + 1: P_i has the squared norm 1 / (2 i + 1).
-    modes = [
-        [
-            perm(j + nu, nu) * Fraction(factorial(j) ** 2, factorial(j - i) * factorial(j + i + 1))
-            if j >= i
-            else 0
-            for j in size
-        ]
-        for i in size
-    ]
-    norms = [sqrt((2 * i + 1) * modes[i][i] ** 2) for i in size]
-    return tuple(tuple(norms[i] * float(modes[i][j] / modes[i][i]) for j in size) for i in size)
+    moments = _moments(order, nu)
+    norms = [sqrt((2 * i + 1) * row[i] ** 2) for i, row in enumerate(moments)]
+    return tuple(
+        tuple(norm * float(value / row[i]) for value in row)
+        for i, (norm, row) in enumerate(zip(norms, moments, strict=True))
+    )
 
 
 @cache
@@ -99,6 +106,27 @@ def _coefficients(order: int) -> Exact:
         row[0] = Fraction(0)
     table[0][0] = Fraction(1)
     return table
+
+
+def _moments(order: int, nu: int) -> Exact:
+    """Return the integrals over [0, 1] of the nu-th derivative of u^(nu+j) times P_i(2 u - 1), by rows i.
+
+    The integral of u^j P_i(2 u - 1) is j!^2 / ((j - i)! (j + i + 1)!), and 0 for j < i.
+    """
+    size = 2 * order - nu
+    table = [[Fraction(0)] * size for _ in range(size)]
+    for i in range(size):
+        for j in range(i, size):
+            integral = Fraction(factorial(j) ** 2, factorial(j - i) * factorial(j + i + 1))
+            table[i][j] = perm(j + nu, nu) * integral
+    return table
+
+
+def _modes(order: int) -> Any:
+    """Return the table of `mode_table`, exactly."""
+    columns = [order, *range(1, order), *range(order + 1, 2 * order)]
+    upper = np.array(_coefficients(order)[order:])[:, columns]
+    return np.array(_moments(order, order)) @ upper
 
 
 def _floats(table: Any) -> Table:

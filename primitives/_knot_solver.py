@@ -16,14 +16,14 @@ durations. So an item of a batch gives the same bits as alone, which LAPACK does
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate, product, repeat
 from operator import mul
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._hermite_tables import coefficient_table, stiffness_table
+from ._hermite_tables import coefficient_table, energy_table, stiffness_table
+from ._weighted_solver import rounding_slack, weighted_coefficients
 from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
 
 Entry: TypeAlias = Any
@@ -35,76 +35,55 @@ States: TypeAlias = list[list[Any]]
 Nodes: TypeAlias = dict[tuple[int, int], int]
 """Row of each unknown states[k][i] in Eq. 1, by (k, i)."""
 
+_DIGITS = 0.2
+"""Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations.
+
+Their relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
+"""
+
+_MISS = 1e-9
+"""Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent."""
+
+_GAIN = 1e-8
+"""Least relative change of the cost for which the tolerance of waypoints counts."""
+
 _SHORT, _LONG = 1e-3, 1e3
 """Durations [s] between which no power of them over- or underflows, even in single precision."""
 
 
-@dataclass(frozen=True)
-class BandedFactor:
-    """L D L^T factorisation of a symmetric positive definite matrix, stored as sparse rows."""
-
-    pivots: list[Entry]
-    upper: list[dict[int, Entry]]
-    multipliers: list[dict[int, Entry]]
-
-    def solve(self, right: Sequence[Array]) -> list[Array]:
-        """Solve for one array per row; the entries broadcast against them."""
-        work = list(right)
-        for p, multipliers in enumerate(self.multipliers):
-            for q, multiplier in multipliers.items():
-                work[q] = work[q] - multiplier * work[p]
-        for p in reversed(range(len(work))):
-            for q, entry in self.upper[p].items():
-                work[p] = work[p] - entry * work[q]
-            work[p] = work[p] / self.pivots[p]
-        return work
-
-
-def _factorise(upper: list[dict[int, Entry]]) -> BandedFactor:
-    """Eliminate without pivoting (stable for positive definite A); upper[p][q], q >= p, is consumed."""
-    multipliers: list[dict[int, Entry]] = []
-    pivots: list[Entry] = []
-    for p, row in enumerate(upper):
-        pivot = row.pop(p)
-        pivots.append(pivot)
-        factors = {}
-        for q, divided in row.items():
-            factors[q] = factor = divided / pivot
-            for r, entry in row.items():
-                if r >= q:
-                    below = upper[q].get(r)
-                    upper[q][r] = -(factor * entry) if below is None else below - factor * entry
-        multipliers.append(factors)
-    return BandedFactor(pivots, upper, multipliers)
-
-
-def solve_states(
-    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States
-) -> tuple[States, Nodes, BandedFactor]:
-    """Compute the FREE derivatives at the knots.
+def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
+    """Return the states with every FREE derivative computed.
 
     Args:
         order: m.
         durations: per segment, shapes that broadcast against the steps [s].
         steps: per segment, the difference of its two points [m].
         states: per knot, its m - 1 derivatives (see States).
-
-    Returns:
-        The states with every FREE replaced, the rows of the unknowns, and the factorisation of A.
     """
     nodes: Nodes = {}
     for k, state in enumerate(states):
         for i, value in enumerate(state):
             if value is FREE:
                 nodes[k, i] = len(nodes)
-    if not nodes:
-        return states, {}, BandedFactor([], [], [])
-    upper, right = _assemble(order, durations, steps, states, nodes)
-    factor = _factorise(upper)
+    upper, values = _assemble(order, durations, steps, states, nodes)
+    # Elimination without pivoting is stable, as A is positive definite.
+    for p, row in enumerate(upper):
+        pivot = row[p]
+        for q in [q for q in row if q > p]:
+            factor = row[q] / pivot
+            values[q] = values[q] - factor * values[p]
+            for r in [r for r in row if r >= q]:
+                entry = factor * row[r]
+                upper[q][r] = upper[q][r] - entry if r in upper[q] else -entry
+    for p in reversed(range(len(values))):
+        for q, entry in upper[p].items():
+            if q > p:
+                values[p] = values[p] - entry * values[q]
+        values[p] = values[p] / upper[p][p]
     solved = list(map(list, states))
-    for (k, i), value in zip(nodes, factor.solve(right), strict=True):
+    for (k, i), value in zip(nodes, values, strict=True):
         solved[k][i] = value
-    return solved, nodes, factor
+    return solved
 
 
 def _assemble(
@@ -146,14 +125,55 @@ def least_cost_coefficients(
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
 
-    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
-
     Args:
         xp: namespace.
         order: m.
         waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S), positive; may be shared by the batch [s].
+        durations: (..., S); may be shared by the batch. 0 is allowed between waypoints that are equal within
+            rounding; the via-points after such segments are dropped [s].
         states: per knot, its derivatives (see States).
+    """
+    segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
+    if not _is_extreme(to_numpy(durations), eps).any():
+        return _banded_coefficients(xp, order, waypoints, durations, states)
+    *batch, knots, dimension = waypoints.shape
+    count = int(np.prod(batch, dtype=int))
+    if not count:
+        return like(xp, np.zeros((*batch, 2 * order, segments, dimension)), waypoints)
+    flat_points = xp.reshape(waypoints, (count, knots, dimension))
+    flat_durations = xp.reshape(broadcast_to(xp, durations, (*batch, segments)), (count, segments))
+    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
+    numbers = to_numpy(flat_durations)
+    empty = numbers <= 0
+    positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
+    kinds = np.column_stack([empty, _is_extreme(positive, eps)])
+
+    def index(rows: Any) -> Any:
+        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
+
+    parts, members = [], []
+    for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
+        where = np.flatnonzero((kinds == kind).all(axis=1))
+        rows = index(where)
+        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
+        group = (flat_points[rows], flat_durations[rows], chosen)
+        parts.append(_connect_kind(xp, order, *group, empty=kind[:-1], extreme=bool(kind[-1])))
+        members.append(where)
+    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
+    return xp.reshape(joined, (*batch, *joined.shape[1:]))
+
+
+def _is_extreme(durations: Any, eps: float) -> Any:
+    """Return (...,) True where the normal equations lose digits at durations (..., S), or a segment is empty."""
+    return durations.min(axis=-1) <= eps**_DIGITS * durations.max(axis=-1)
+
+
+def _banded_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (..., 2m, S, D) by the normal equations.
+
+    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
     """
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
         scale = unit_factors(xp, durations)
@@ -168,6 +188,43 @@ def least_cost_coefficients(
     return _coefficients(xp, order, waypoints, durations, states)
 
 
+def _weighted_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
+    dtype = waypoints.dtype
+    given = [[waypoints, durations], *states]
+    double = [[xp.astype(value, xp.float64) if is_given(value) else value for value in row] for row in given]
+    (waypoints, durations), *states = double
+    total = xp.sum(durations, axis=-1)
+    points, pace = to_numpy(waypoints), to_numpy(total)[:, None]
+    ends = []
+    for state in (states[0], states[-1]):
+        scaled = [to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)]
+        ends.append(scaled)
+    slack = like(xp, rounding_slack(points, ends), durations)
+    for _ in range(2 * order - 1):
+        slack = slack * total
+    soft = weighted_coefficients(xp, order, waypoints, durations, states, slack)
+    exact = weighted_coefficients(xp, order, waypoints, durations, states, 0.0 * slack)
+    # The tolerance is for rounding alone: it must lower the cost, and no waypoint may be missed by more.
+    lengths = to_numpy(durations / total[:, None])
+    costs = _costs(order, exact, lengths), _costs(order, soft, lengths)
+    steps = to_numpy(soft)[:, 1:].sum(axis=1)
+    missed = np.abs(steps - np.diff(points, axis=1)).max(axis=(1, 2))
+    far = missed > _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
+    better = far | (costs[0] <= (1.0 + _GAIN) * costs[1])
+    chosen = like(xp, 1.0 * better, slack)[:, None, None, None]
+    return xp.astype(xp.where(chosen > 0, exact, soft), dtype)
+
+
+def _costs(order: int, coefficients: Array, lengths: Any) -> Any:
+    """Return (N,) the costs of movements with durations (N, S)."""
+    table = np.array(energy_table(order, order))
+    modes = np.einsum("ik,nksd->nisd", table, to_numpy(coefficients)[:, order:])
+    return ((modes * modes).sum(axis=(1, 3)) / lengths ** (2 * order - 1)).sum(axis=-1)
+
+
 def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
     """Return the coefficients (..., 2m, S, D) in unit time, by the table of `_hermite_tables`."""
     segments = waypoints.shape[-2] - 1
@@ -177,7 +234,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
         lengths = durations.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
     else:
         lengths = [durations[..., s : s + 1] for s in range(segments)]
-    states = solve_states(order, lengths, pieces, states)[0]
+    states = _solve_states(order, lengths, pieces, states)
     rest = 0.0 * pieces[0]
     # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
     first, last = [waypoints[..., :-1, :]], [steps]
@@ -198,36 +255,6 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def coefficients_with_empty(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
-) -> Array:
-    """Return least-cost coefficients where durations, with the full batch shape, may be 0 between equal waypoints.
-
-    The via-points after empty segments are dropped, movement by movement.
-    """
-    *batch, knots, dimension = waypoints.shape
-    count = int(np.prod(batch, dtype=int))
-    if not count:
-        return like(xp, np.zeros((*batch, 2 * order, knots - 1, dimension)), waypoints)
-    flat_points = xp.reshape(waypoints, (count, knots, dimension))
-    flat_durations = xp.reshape(durations, (count, knots - 1))
-    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
-    empty = to_numpy(flat_durations) <= 0
-
-    def index(rows: Any) -> Any:
-        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
-
-    parts, members = [], []
-    for pattern in np.unique(empty, axis=0):  # movements with the same empty segments are solved together
-        where = np.flatnonzero((empty == pattern).all(axis=1))
-        rows = index(where)
-        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
-        parts.append(_connect_pattern(xp, order, flat_points[rows], flat_durations[rows], chosen, pattern))
-        members.append(where)
-    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
-    return xp.reshape(joined, (*batch, *joined.shape[1:]))
-
-
 def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
     """Return a derivative with the batch in one axis, (N, D); None and FREE stay."""
     if not is_given(value):
@@ -235,17 +262,31 @@ def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
     return xp.reshape(broadcast_to(xp, value, (*batch, value.shape[-1])), (-1, value.shape[-1]))
 
 
-def _connect_pattern(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, empty: Any
+def _connect_kind(
+    xp: Namespace,
+    order: int,
+    waypoints: Array,
+    durations: Array,
+    states: States,
+    *,
+    empty: Any,
+    extreme: bool,
 ) -> Array:
     """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
     full = np.flatnonzero(~empty).tolist()
     # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
     kept = [0, *(s + 1 for s in full)]
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
+    if not full:
+        return xp.concat(
+            [waypoints[..., None, :-1, :], *[0.0 * waypoints[..., None, :-1, :]] * (2 * order - 1)], axis=-3
+        )
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
-    solved = least_cost_coefficients(xp, order, points, lengths, chosen)
+    solve = _weighted_coefficients if extreme else _banded_coefficients
+    solved = solve(xp, order, points, lengths, chosen)
+    if len(full) == len(empty):
+        return solved
     zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
     columns = []
     for s, is_empty in enumerate(empty):

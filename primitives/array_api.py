@@ -207,13 +207,14 @@ def whole_order(nu: int) -> int:
 
 def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
     """Return one order of derivative, or a sequence of them, as a tuple, or raise ValueError."""
+    given: Any = nu
     try:
-        orders = (nu,) if is_whole(nu) else tuple(nu)  # type: ignore[arg-type]
+        orders = (given,) if is_whole(given) else tuple(given)
     except TypeError:
         orders = ()
     if not orders or not all(map(is_whole, orders)):
         raise ValueError(f"nu must be whole numbers of at least 0, got {nu!r}")
-    return tuple(map(int, orders))  # type: ignore[arg-type]
+    return tuple(map(int, orders))
 
 
 def as_number(value: Any) -> float:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-from ._boundary import check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
+from ._boundary import check_durations, check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
 from .array_api import (
     Array,
     Boundary,
-    Namespace,
     as_floats,
     broadcast_batch,
     broadcast_to,
@@ -49,7 +48,8 @@ def point_to_point(
         A trajectory of one segment with the broadcast leading shape.
 
     Raises:
-        ValueError: an argument is not finite, has a wrong shape, or duration <= 0.
+        ValueError: an argument is not finite, has a wrong shape, or duration <= 0 (0 is allowed for a movement
+            from rest to rest that stays where it is).
 
     Example:
         >>> from viapoint.primitives import point_to_point
@@ -67,9 +67,9 @@ def point_to_point(
     shapes = {"start": leading_shape("start", start, None), "duration": tuple(duration.shape)}
     dimension = start.shape[-1]
     goal_shape = leading_shape("goal", goal, dimension)
-    require(duration > 0, "duration", duration, "must be positive")
     shape = (*broadcast_batch(**shapes, goal=goal_shape, **end_shapes(ends, dimension)), dimension)
     waypoints = xp.stack([broadcast_to(xp, start, shape), broadcast_to(xp, goal, shape)], axis=-2)
+    check_durations("duration", duration[..., None], waypoints, ends)
     return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends))
 
 
@@ -92,8 +92,8 @@ def through(
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].
-        durations: (..., K + 1) [s]. 0 is allowed between equal waypoints and drops the via-point. Durations
-            (K + 1,) for a batch of waypoints are shared, which is faster.
+        durations: (..., K + 1) [s]. 0 is allowed between waypoints that are equal up to rounding and drops the
+            via-point. Durations (K + 1,) for a batch of waypoints are shared, which is faster.
         start_velocity: (..., D) [m/s]; None = zero.
         start_acceleration: (..., D) [m/s^2]; None = zero.
         goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost (natural boundary).
@@ -106,7 +106,7 @@ def through(
 
     Raises:
         ValueError: an argument is not finite or has a wrong shape; a duration is negative, or 0 between
-            different waypoints, or all are 0.
+            different waypoints, or all are 0 while an end moves.
 
     Example:
         >>> from viapoint.primitives import through
@@ -128,25 +128,12 @@ def through(
         shapes["via_velocities"] = leading_shape("via_velocities", via_velocities, knots - 2, dimension)
     batch = broadcast_batch(**shapes)
     waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
-    _check_durations(xp, waypoints, durations)
+    check_durations("durations", durations, waypoints, ends)
     states = knot_states(order, ends, knots - 2)
     if via_velocities is not None:
         for k in range(knots - 2):
             states[k + 1][0] = via_velocities[..., k, :]
     return connect(xp, order, waypoints, durations, states)
-
-
-def _check_durations(xp: Namespace, waypoints: Array, durations: Array) -> None:
-    """Raise ValueError for negative durations, and for zeros other than between equal waypoints."""
-    positive = durations > 0
-    if positive.all():
-        return
-    require(durations >= 0, "durations", durations, "must not be negative")
-    total = xp.sum(durations, axis=-1)
-    require(xp.any(positive, axis=-1), "durations", total, "must not all be 0; their sum")
-    still = (waypoints[..., 1:, :] == waypoints[..., :-1, :]).all(axis=-1)
-    full = broadcast_to(xp, durations, tuple(still.shape))
-    require((full > 0) | still, "durations", full, "may be 0 only between equal waypoints")
 
 
 def minimum_jerk_coefficients(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import warnings
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ._boundary import chosen_items, read_arguments, unit_time_ends, waypoint_shapes
+from ._boundary import check_durations, chosen_items, read_arguments, unit_time_ends, waypoint_shapes
 from ._passage.cost import PassageCost
 from ._passage.moving_ends import fractions_moving
 from ._passage.newton import attach_gradient, fractions_by_newton
 from ._passage.rest_to_rest import fractions_at_rest
+from ._polynomial import differentiate, evaluate
+from ._weighted_solver import rounding_slack
 from .array_api import (
     FREE,
     Array,
@@ -21,9 +24,21 @@ from .array_api import (
     follows_gradient,
     is_given,
     like,
-    require,
+    ordered_sum,
     to_numpy,
 )
+from .trajectory import connect
+
+_LEAST_FRACTION = 1e-7
+"""Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow."""
+
+_NEAR = 1e-2
+"""Distance of a via-point from the one before, relative to the longest, below which it is left out at first."""
+
+_LEVEL_STEPS = 5
+
+_ENTRIES = 50_000
+"""Entries of the Hessians of the movements that are solved at a time."""
 
 
 def passage_durations(
@@ -57,11 +72,11 @@ def passage_durations(
         `through` then drops it.
 
     Raises:
-        ValueError: an argument is not finite or has a wrong shape, or duration <= 0.
+        ValueError: an argument is not finite or has a wrong shape, or duration <= 0 (0 is allowed for a movement
+            from rest to rest through equal waypoints).
 
     Warns:
-        RuntimeWarning: the iteration did not converge for some movements (K >= 2, knots about to merge);
-            their durations are the best found.
+        RuntimeWarning: the iteration did not converge for some movements; their durations are the best found.
 
     Example:
         >>> from viapoint.primitives import passage_durations
@@ -74,18 +89,30 @@ def passage_durations(
         duration=duration,
     )
     batch = broadcast_batch(**waypoint_shapes(waypoints, ends), duration=tuple(duration.shape))
-    require(duration > 0, "duration", duration, "must be positive")
+    waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
+    check_durations("duration", duration[..., None], waypoints, ends)
     flat_ends = dict(ends)
     for name, value in ends.items():
         if is_given(value):
             flat_ends[name] = _flat(value, batch, 1)
     unit_ends = unit_time_ends(flat_ends, _flat(duration, batch, 0))
-    numbers = _fractions(_flat(waypoints, batch, 2), unit_ends)
-    fractions = like(xp, numbers.reshape(*batch, waypoints.shape[-2] - 1), waypoints)
-    if xp is not np and follows_gradient(waypoints, duration, *ends.values()):
-        waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
-        fractions = attach_gradient(fractions, waypoints, unit_time_ends(ends, duration), xp)
-    return fractions * duration[..., None]
+    points, dtype = _flat(waypoints, batch, 2), waypoints.dtype
+    eps = float(xp.finfo(dtype).eps)
+    numbers = _fractions(points, unit_ends, eps)
+    if eps > _LEAST_FRACTION:
+        numbers[numbers < _LEAST_FRACTION] = 0.0
+    numbers = numbers.reshape(*batch, waypoints.shape[-2] - 1)
+    if xp is np or not follows_gradient(waypoints, duration, *ends.values()):
+        return like(xp, numbers, waypoints) * duration[..., None]
+    cost = PassageCost.from_points(points, unit_ends, rounding_slack(points, (unit_ends[:2], unit_ends[2:])))
+    given = [
+        value if value is None or value is FREE else xp.astype(value, xp.float64) for value in ends.values()
+    ]
+    waypoints = xp.astype(waypoints, xp.float64)
+    time = xp.astype(duration, xp.float64)
+    moving = unit_time_ends(dict(zip(ends, given, strict=True)), time)
+    fractions = attach_gradient(like(xp, numbers, waypoints), waypoints, moving, cost, xp)
+    return xp.astype(fractions * time[..., None], dtype)
 
 
 def _flat(array: Array, batch: tuple[int, ...], own: int) -> Any:
@@ -96,7 +123,7 @@ def _flat(array: Array, batch: tuple[int, ...], own: int) -> Any:
     return np.broadcast_to(numbers, (*batch, *shape)).reshape(-1, *shape)
 
 
-def _fractions(points: Any, ends: list[Any]) -> Any:
+def _fractions(points: Any, ends: list[Any], eps: float) -> Any:
     """Return fractions of the duration (N, S).
 
     Movements with the same distinct waypoints, and with or without motion at the ends, are solved together.
@@ -104,7 +131,10 @@ def _fractions(points: Any, ends: list[Any]) -> Any:
     count, knots, _ = points.shape
     if knots == 2 or not count:
         return np.ones((count, knots - 1))
-    distinct = (points[:, 1:] != points[:, :-1]).any(axis=-1)
+    gaps = np.abs(np.diff(points, axis=1)).max(axis=-1)
+    # The closed forms for one via-point hold at any distance.
+    rounding = eps * np.abs(points).max(axis=(1, 2)) if knots > 3 else np.zeros(count)
+    distinct = gaps > rounding[:, None]
     moving = np.zeros(count, dtype=bool)
     for value in ends:
         if value is not None:
@@ -138,19 +168,72 @@ def _scaled(points: Any, ends: list[Any]) -> tuple[Any, list[Any]]:
 
 def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     """Return fractions (N, S) where neighbouring waypoints differ."""
-    if points.shape[1] == 2:
-        return np.ones((len(points), 1))
+    count, knots, _ = points.shape
+    if knots == 2:
+        return np.ones((count, 1))
     points, ends = _scaled(points, ends)
-    if points.shape[1] == 3:
-        return fractions_moving(points, ends) if moving else fractions_at_rest(points)
-    cost = PassageCost.from_points(points, ends if moving else [None] * 4)
-    fractions, converged = fractions_by_newton(cost, several=moving)
+    slack = rounding_slack(points, (ends[:2], ends[2:]))
+    if knots == 3:
+        return fractions_moving(points, ends, slack) if moving else fractions_at_rest(points)
+    ends = ends if moving else [None] * 4
+    cost = PassageCost.from_points(points, ends, slack)
+    guess, bound = _from_fewer_points(points, ends, moving)
+    fractions, converged = np.empty((count, knots - 1)), np.empty(count, dtype=bool)
+    size = max(1, _ENTRIES // knots**2)
+    for first in range(0, count, size):
+        rows = slice(first, first + size)
+        found = fractions_by_newton(cost.chosen(rows), guess[rows].T, bound[rows], several=moving)
+        fractions[rows], converged[rows] = found
     if not converged.all():
-        lost = np.flatnonzero(~converged)
         warnings.warn(
-            f"passage times of {lost.size} of {len(points)} movements did not converge (first: waypoints "
-            f"{points[lost[0]].tolist()}); the best found are returned",
+            f"the passage times of {np.sum(~converged)} of {count} movements did not converge; the best found are "
+            "returned",
             RuntimeWarning,
             stacklevel=4,
         )
     return fractions
+
+
+def _from_fewer_points(points: Any, ends: list[Any], moving: bool) -> tuple[Any, Any]:
+    """Return fractions (N, S) of the best movement without via-points very close to the one before, and its cost (N,).
+
+    The via-points left out get the time when the movement comes level with them. No movement through all points
+    costs less, and this one is the best of all if it passes them anyway. Both are NaN where there is none.
+    """
+    count, knots, _ = points.shape
+    chord = np.linalg.norm(np.diff(points, axis=1), axis=-1)
+    left_out = np.zeros((count, knots), dtype=bool)
+    left_out[:, 1:-1] = chord[:, :-1] < _NEAR * chord.max(axis=1, keepdims=True)
+    if not moving:
+        left_out[:, 1] = False  # where a movement from rest begins, it is not level with anything
+    result, cost = np.full((count, knots - 1), np.nan), np.full(count, np.nan)
+    for pattern in np.unique(left_out[left_out.any(axis=1)], axis=0):
+        where = np.flatnonzero((left_out == pattern).all(axis=1))
+        kept = np.flatnonzero(~pattern)
+        chosen = [chosen_items(value, where) for value in ends]
+        fewer = points[where][:, kept]
+        fractions = _solve(fewer, chosen, moving)
+        states = [chosen[:2], *([FREE, FREE] for _ in kept[1:-1]), chosen[2:]]
+        movement = connect(np, 3, fewer, fractions, states)
+        coefficients, cost[where] = movement.coefficients, movement.cost()
+        for i, (first, last) in enumerate(pairwise(kept)):
+            times = [np.zeros(len(where))]
+            for k in range(first + 1, last):
+                step = points[where, k] - points[where, first]
+                times.append(_level_time(coefficients[:, :, i], step) * fractions[:, i])
+            durations = np.diff([*times, fractions[:, i]], axis=0).T
+            result[where, first:last] = durations
+    result[~(result > 0).all(axis=1)] = np.nan
+    return result, cost
+
+
+def _level_time(coefficients: Any, step: Any) -> Any:
+    """Return the unit time u (N,) at which (x(u) - x(0)) . d = d . d, for segments (N, 6, D) and steps d (N, D)."""
+    along = ordered_sum(coefficients * step[:, None], -1)
+    along[:, 0] = -ordered_sum(step * step, -1)
+    with np.errstate(all="ignore"):
+        target, slope, curve = -along[:, 0], along[:, 1], along[:, 2]
+        u = 2.0 * target / (slope + np.sqrt(slope * slope + 4.0 * curve * target))
+        for _ in range(_LEVEL_STEPS):
+            u = u - evaluate(along, u) / evaluate(differentiate(along), u)
+    return u

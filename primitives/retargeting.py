@@ -80,7 +80,9 @@ def retarget(
     time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
     end = broadcast_to(xp, trajectory.duration, batch)
     require(time >= 0, "time", time, "must not be negative")
-    require(time < end, "time", time, "must lie before the end of the movement")
+    require(
+        (time < end) | ((time <= 0) & (end <= 0)), "time", time, "must lie before the end of the movement"
+    )
     if freeze > 0:
         frozen = end - time < freeze
         arrival = xp.where(frozen, end, arrival)

@@ -230,10 +230,10 @@ def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding
         spectrum = spectrum / spectrum[..., :1]
     numbers = to_numpy(spectrum)
     index = np.arange(numbers.shape[-1])
-    step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
-    last = np.max(
-        np.where((numbers >= threshold) & (index * step <= cutoff), index, 0), axis=-1, keepdims=True
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time
+        step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
+        counts = (numbers >= threshold) & (index * step <= cutoff)
+    last = np.max(np.where(counts, index, 0), axis=-1, keepdims=True)
     used = like(xp, (index[:-1] < last).astype(float), spectrum)
     width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
     rise = spectrum[..., 1:] - spectrum[..., :-1]

@@ -12,7 +12,7 @@ import numpy as np
 from ._evaluate import derivative_coefficients, evaluate
 from ._extrema import Extrema, Pieces, axis_extrema, largest_norm
 from ._hermite_tables import energy_table
-from ._knot_solver import States, coefficients_with_empty, least_cost_coefficients
+from ._knot_solver import States, least_cost_coefficients
 from .array_api import (
     Array,
     Namespace,
@@ -82,7 +82,7 @@ class Trajectory:
     ) -> Trajectory:
         """Return a trajectory of joined segments; with `some_empty`, durations may be 0 between equal points."""
         order = coefficients.shape[-3] // 2
-        if durations.shape[-1] == 1:
+        if durations.shape[-1] == 1 and not some_empty:
             return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
         ends = xp.cumulative_sum(durations, axis=-1)
         end = ends[..., -1:]
@@ -289,16 +289,21 @@ class Trajectory:
         """Return the movement along the same path with time scaled to a new total duration (...,) [s].
 
         Raises:
-            ValueError: duration is not finite, not positive, or does not broadcast.
+            ValueError: duration is not finite, does not broadcast, or is not positive (0 is allowed where nothing
+                moves).
         """
         xp = self.namespace
         (duration,) = self.floats(duration=duration)
-        require(duration > 0, "duration", duration, "must be positive")
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
+        if not (duration > 0).all():
+            moves = (self.coefficients[..., 1:, :, :] != 0).any(-1).any(-1).any(-1)
+            allowed = (duration > 0) | ((duration == 0) & ~moves)
+            require(allowed, "duration", broadcast_to(xp, duration, batch), "must be positive")
         end = own(duration)[..., None]
-        factor = end / self.end
+        factor = end / xp.where(self.end > 0, self.end, 1.0)
         with error_state(xp):
-            rates = xp.where(self.rates <= 0, 0.0 * factor, self.rates / factor)
+            runs = (self.rates > 0) & (factor > 0)
+            rates = xp.where(runs, self.rates / xp.where(factor > 0, factor, 1.0), 0.0 * factor)
         coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
         return Trajectory(coefficients, self.durations * factor, self.order, self.starts * factor, rates, end)
 
@@ -349,6 +354,5 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     some_empty = bool((durations <= 0).any())
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
-    solve = coefficients_with_empty if some_empty else least_cost_coefficients
-    coefficients = solve(xp, order, waypoints, durations, states)
+    coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
     return Trajectory.from_segments(coefficients, durations, xp, some_empty=some_empty)

@@ -1,5 +1,6 @@
 """Pages and code agree: links lead somewhere, examples run, and commands are understood."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -63,7 +64,9 @@ def test_examples_run(name):
         assert module in PUBLIC, module
     if not script or name in OWN_TESTS:
         return
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # threads of several pages wait for one another
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

@@ -18,6 +18,9 @@ from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 
+CORRECTION_JERK = 10.0
+"""Jerk of the correction by which a plan follows a target that moves a little, [m/s^3]: 60 distance / time^3."""
+
 
 class MovingPlan(NamedTuple):
     """N movements that may begin in motion."""
@@ -61,6 +64,8 @@ class NominalPlan(NamedTuple):
     """True if a movement is under way; otherwise the nominal plan is the straight movement."""
     changed: Bool
     """True if the goal differs from that of the plan under way."""
+    jumped: Bool
+    """True if it differs so much that the default is the smoothest movement to it."""
     state: Motion
     """Present command."""
     start: Float
@@ -87,7 +92,8 @@ class ReplanningDecoder:
         The other arguments are parts of the result, see :class:`NominalPlan`.
         """
         trajectory, end, number = plan.trajectory(), plan.duration, self.layout.n_via
-        changed = (plan.waypoints[:, -1] != goal).any(axis=-1)
+        distance = norm(goal - plan.waypoints[:, -1])
+        jumped = distance >= MIN_GOAL_DISTANCE
         state = Motion(*(part[:, 0] for part in trajectory.sample(time[:, None])))
         at_rest = Motion.at_rest(start)
         state = Motion(*(np.where(begun[:, None], a, b) for a, b in zip(state, at_rest, strict=True)))
@@ -98,12 +104,14 @@ class ReplanningDecoder:
         anew = primitives.point_to_point(
             state.position, goal, centre, start_velocity=state.velocity, start_acceleration=state.acceleration
         )(centre[:, None] * shares)
-        vias = np.where(changed[:, None, None], anew, rest)
-        remaining = np.where(changed | ~begun, centre, np.maximum(end - time, 0.0))
-        begin = begun[:, None, None]
-        return NominalPlan(
-            begun, changed & begun, state, start, goal, np.where(begin, vias, straight), remaining
-        )
+        # A target that moves a little changes the rest of the plan a little.
+        share, left = distance / MIN_GOAL_DISTANCE, np.maximum(end - time, 0.0)
+        nearby = rest + share[:, None, None] * (anew - rest)
+        vias = np.where(jumped[:, None, None], anew, nearby)
+        left = np.maximum(left + share * (centre - left), np.cbrt(60.0 * distance / CORRECTION_JERK))
+        remaining = np.where(jumped | ~begun, centre, left)
+        changed, vias = (distance > 0.0) & begun, np.where(begun[:, None, None], vias, straight)
+        return NominalPlan(begun, changed, jumped & begun, state, start, goal, vias, remaining)
 
     def _passages(self, plan: MovingPlan, time: Float) -> Float:
         """Return passage times of the remaining via-points, and times on the last segment for those passed.
@@ -138,11 +146,12 @@ class ReplanningDecoder:
         layout, state = self.layout, default.state
         nominal = default.vias, default.goal, default.remaining
         points, duration = revised_waypoints(layout, self._line(default), state.position, *nominal, actions)
-        plan = timed(points, duration, state)
-        # The default itself: its via-points are evenly spaced in time.
-        zero = (actions == 0.0).all(axis=-1)[:, None]
+        zero = (actions == 0.0).all(axis=-1)
+        slightly = default.changed & ~default.jumped
+        plan = timed(points, np.where(zero & slightly, default.remaining, duration), state)
+        # The smoothest movement itself: its via-points are evenly spaced in time.
         even = np.broadcast_to(duration[:, None] / (layout.n_via + 1), plan.durations.shape)
-        return plan._replace(durations=np.where(zero, even, plan.durations))
+        return plan._replace(durations=np.where((zero & ~slightly)[:, None], even, plan.durations))
 
     @staticmethod
     def _line(default: NominalPlan) -> Float:

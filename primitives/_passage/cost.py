@@ -1,17 +1,9 @@
 """Reduced jerk cost of movements through given points, as a function of the segment durations h alone.
 
-phi_s is the cost of segment s with the data s = (D, V0, A0, V1, A1) in unit time. The jerk has three Legendre
-modes q = P s, so
+With the states at the via-points eliminated, J(h) is the least sum of the segments' costs phi (Eq. 1 of
+`_weighted_solver`). By the envelope theorem dJ/dh is the derivative of phi at fixed states: with r = q / h^2,
 
-    phi_s = 1/2 h^-5 sum_i w_i |q_i|^2,   w = (1, 3, 5).                                            (1)
-
-With the states y at the via-points eliminated, J(h) = min_y sum_s phi_s(y, h_s) has the derivatives
-
-    dJ/dh = phi_h                            (envelope theorem),                                    (2)
-    d2J/dh2 = phi_hh - phi_hy phi_yy^-1 phi_yh   (Schur complement),                                (3)
-
-where phi_yy is the banded matrix A of `_knot_solver`. Since V = v h and A = a h^2, h d/dh acts on s as the
-diagonal matrix E of the degrees (0, 1, 2, 1, 2): h dq/dh = P E s.
+    h phi_h = sum_i w_i (r_i . p_i + 1/2 e_i |r_i|^2),   p = h dr/dh,   e = h w'(h) / w.             (1)
 """
 
 from __future__ import annotations
@@ -23,21 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from .._knot_solver import Nodes, States, solve_states
+from .._hermite_tables import mode_table
+from .._weighted_solver import fit_modes, mode_weights
 from ..array_api import FREE, Array, Floats, ordered_sum
-
-_MODES: tuple[dict[int, float], ...] = (
-    {2: -1.0, 4: 1.0},
-    {1: 2.0, 2: 1.0, 3: -2.0, 4: 1.0},
-    {0: 12.0, 1: -6.0, 2: -1.0, 3: -6.0, 4: 1.0},
-)
-"""P, by rows of the nonzero entries: Legendre modes of the jerk in unit time."""
-
-_WEIGHTS = (1.0, 3.0, 5.0)
-"""w of Eq. 1. P has whole numbers as entries, so that modes that vanish do so without rounding."""
-
-_DEGREES = (0, 1, 2, 1, 2)
-"""E: the power of h in each entry of s."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +27,28 @@ class PassageCost:
     Attributes:
         steps: (S, D, N) differences of the waypoints.
         start, goal: velocity and acceleration in unit time: (D, N), None for zero, FREE (goal only).
+        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
     """
 
     steps: Floats
     start: list[Any]
     goal: list[Any]
+    slack: Floats
 
     @classmethod
-    def from_points(cls, points: Floats, ends: Sequence[Any]) -> PassageCost:
+    def from_points(cls, points: Floats, ends: Sequence[Any], slack: Floats) -> PassageCost:
         """Return the cost of movements through points (N, S + 1, D) with four boundary values (N, D)."""
         rows = [np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v for v in ends]
         steps = np.ascontiguousarray(np.diff(points, axis=1).transpose(1, 2, 0))
-        return cls(steps, rows[:2], rows[2:])
+        return cls(steps, rows[:2], rows[2:], slack)
 
-    def chosen(self, items: Any, dtype: Any = None) -> PassageCost:
-        """Return the movements `items`, in that order, optionally in another precision."""
-
-        def pick(value: Any) -> Any:
-            if not isinstance(value, np.ndarray):
-                return value
-            return value[..., items].astype(dtype or value.dtype, copy=False)
-
-        return PassageCost(pick(self.steps), *([pick(v) for v in end] for end in (self.start, self.goal)))
+    def chosen(self, items: Any) -> PassageCost:
+        """Return the movements `items`, in that order."""
+        start, goal = (
+            [value[:, items] if isinstance(value, np.ndarray) else value for value in end]
+            for end in (self.start, self.goal)
+        )
+        return PassageCost(self.steps[..., items], start, goal, self.slack[items])
 
     def reference(self) -> Floats:
         """Return (N,) a cost far below that of any real movement of this size, to keep logarithms finite."""
@@ -78,107 +58,24 @@ class PassageCost:
                 total = total + ordered_sum(value * value)
         return 1e-3 * np.where(total > 0, total, 1.0)
 
-    def derivatives(self, h: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return J (N,), dJ/dh (S, N) and d2J/dh2 (S, S, N) at durations h (S, N)."""
-        segments = len(h)
-        states: States = [self.start, *([FREE, FREE] for _ in range(segments - 1)), self.goal]
-        states, nodes, factor = solve_states(3, list(h), list(self.steps), states)
-        modes = [_modes(self._data(h, states), degree) for degree in range(3)]
-        j, first, second = _segment_derivatives(h, *modes)
-        hessian = np.zeros((segments, *h.shape), dtype=h.dtype)
-        if nodes:
-            rows = _mixed_derivatives(h, modes[0], modes[1])
-            for node, column in zip(nodes, factor.solve(self._mixed_columns(rows, nodes)), strict=True):
-                for s, place in _neighbours(node, segments):
-                    hessian[s] -= ordered_sum(rows[place][s] * column, -2)  # Eq. 3
-        for s in range(segments):
-            hessian[s, s] += second[s]
-        return j, first, hessian
-
-    def _data(self, h: Floats, states: States) -> list[Floats]:
-        """Return s = (D, V0, A0, V1, A1), each (S, D, N)."""
-        zero = np.zeros(self.steps.shape[1:], dtype=h.dtype)
-        velocity, acceleration = (
-            np.stack([zero if state[i] is None else state[i] for state in states]) for i in range(2)
-        )
-        h = h[:, None]
-        square = h * h
-        ends = [
-            v * f
-            for k in (slice(-1), slice(1, None))
-            for v, f in ((velocity[k], h), (acceleration[k], square))
-        ]
-        return [self.steps, *ends]
-
-    def _mixed_columns(self, rows: dict[int, Floats], nodes: Nodes) -> list[Floats]:
-        """Return phi_yh, (S, D, N) for every unknown: nonzero for the two segments at its knot."""
-        columns = []
-        for node in nodes:
-            column = np.zeros_like(self.steps)
-            for s, place in _neighbours(node, len(column)):
-                column[s] = rows[place][s]
-            columns.append(column)
-        return columns
-
-
-def _neighbours(node: tuple[int, int], segments: int) -> list[tuple[int, int]]:
-    """Return the segments at knot k and the place of derivative i in their data s, for node (k, i)."""
-    k, i = node
-    return [(s, place) for s, place in ((k - 1, 3 + i), (k, 1 + i)) if 0 <= s < segments]
-
-
-def _modes(data: list[Floats], degree: int) -> list[Floats]:
-    """Return P E^degree s, the modes after `degree` applications of h d/dh."""
-    modes = []
-    for row in _MODES:
-        terms = [(w * _DEGREES[n] ** degree) * data[n] for n, w in row.items() if _DEGREES[n] or not degree]
-        modes.append(ordered_sum(terms))
-    return modes
-
-
-def _segment_derivatives(
-    h: Floats, q0: list[Floats], q1: list[Floats], q2: list[Floats]
-) -> tuple[Floats, Floats, Floats]:
-    """Return J (N,) and the first two derivatives (S, N) of phi_s with respect to h_s at fixed states.
-
-    From Eq. 1 with q1 = h dq/dh and q2 = (h d/dh)^2 q,
-
-        h phi_h = h^-5 (q.q1 - 5/2 q.q),   h^2 phi_hh = h^-5 (q1.q1 + q.q2 - 11 q.q1 + 15 q.q).
-    """
-    zero, one = _product(q0, q0), _product(q0, q1)
-    curve = _product(q1, q1) + _product(q0, q2)
-    inverse = 1.0 / h
-    fifth = math.prod([inverse] * 4, start=inverse)
-    phi = 0.5 * fifth * zero
-    first = fifth * inverse * (one - 2.5 * zero)
-    second = fifth * inverse * inverse * (curve - 11.0 * one + 15.0 * zero)
-    return ordered_sum(phi), first, second
-
-
-def _mixed_derivatives(h: Floats, q0: list[Floats], q1: list[Floats]) -> dict[int, Floats]:
-    """Return d2 phi_s / dh dy (S, D, N) for the places 1 to 4 of s.
-
-    For an entry of degree e, dq/dy = h^e P column, so it is h^(e - 6) sum_i w_i P_i (q1_i + (e - 5) q_i).
-    """
-    inverse = (1.0 / h)[:, None]
-    fourth = math.prod([inverse] * 3, start=inverse)
-    rows: dict[int, Floats] = {}
-    for place in (1, 2, 3, 4):
-        degree = _DEGREES[place]
-        terms = [
-            (weight * row[place]) * (one + (degree - 5.0) * zero)
-            for weight, row, zero, one in zip(_WEIGHTS, _MODES, q0, q1, strict=True)
-            if place in row
-        ]
-        rows[place] = (fourth * inverse if degree == 1 else fourth) * ordered_sum(terms)
-    return rows
-
-
-def _product(p: list[Floats], q: list[Floats]) -> Floats:
-    """Return the weighted scalar product sum_i w_i p_i . q_i over modes and dimensions, (S, N)."""
-    terms = [w * ordered_sum(x * y, -2) for w, x, y in zip(_WEIGHTS, p, q, strict=True)]
-    total: Floats = ordered_sum(terms)
-    return total
+    def derivatives(self, h: Floats) -> tuple[Floats, Floats]:
+        """Return J (N,) and h dJ/dh (S, N) at durations h (S, N)."""
+        states = [self.start, *([FREE, FREE] for _ in range(len(h) - 1)), self.goal]
+        solved, fitted = fit_modes(np, 3, h, self.steps, states, self.slack)
+        weights = mode_weights(3, h, self.slack)
+        # The weights are inverse durations, but that of the step, which the slack bounds.
+        rates = [-1.0, -1.0, 4.0 - weights[2] * h]
+        mean = self.steps / h[:, None]
+        velocity = np.stack([0.0 * mean[0] if state[0] is None else state[0] for state in solved])
+        total, slope = np.zeros_like(h), np.zeros_like(h)
+        for i, (row, weight, rate) in enumerate(zip(mode_table(3), weights, rates, strict=True)):
+            mode = np.stack([modes[i] for modes in fitted])
+            square = ordered_sum(mode * mode, 1)
+            # p of Eq. 1: r depends on h by its step and its velocities.
+            change = -(2.0 * row[0] * mean + row[1] * velocity[:-1] + row[3] * velocity[1:]) / h[:, None]
+            slope += weight * (ordered_sum(mode * change, 1) + 0.5 * rate * square)
+            total += 0.5 * weight * square
+        return ordered_sum(total), slope
 
 
 def duration_gradient(coefficients: Array, rates: Array) -> Array:

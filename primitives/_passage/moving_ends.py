@@ -66,11 +66,13 @@ class _Expansion:
         miss: (N, D, 6) coefficients of r in u.
         powers: p and q.
         factor: coefficients of g in u.
+        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
     """
 
     miss: Floats
     powers: tuple[int, int]
     factor: Floats
+    slack: Floats
 
     def weights(self) -> tuple[Floats, Floats]:
         """Return the coefficients of p (1 - u) g - q u g + u (1 - u) g' and of 2 u (1 - u) g, as in Eq. 2."""
@@ -89,14 +91,18 @@ class _Expansion:
         return add(multiply(square, weight), -multiply(change, both))
 
     def excess(self, u: Floats) -> Floats:
-        """Return J - J0 (Eq. 1) at the candidates (N, n), infinite at the ends."""
+        """Return J - J0 (Eq. 1) at the candidates (N, n), infinite at the ends.
+
+        The tolerance of the waypoint counts only very close to an end.
+        """
         p, q = self.powers
         miss = evaluate(self.miss[:, :, None], u[:, None])
         green = u
         for factor in (*[u] * (p - 1), evaluate(self.factor, u), *[1.0 - u] * q):
             green = green * factor
         inside = (u > 0) & (u < 1) & (green > 0)
-        return np.where(inside, 10.0 * ordered_sum(miss * miss, 1) / np.where(inside, green, 1.0), np.inf)
+        green = np.where(inside, green + 20.0 * self.slack[:, None], 1.0)
+        return np.where(inside, 10.0 * ordered_sum(miss * miss, 1) / green, np.inf)
 
     def polished(self, u: Floats) -> tuple[Floats, Any]:
         """Return candidates (N, n) after Newton steps on Eq. 2, and True for those that converged to roots."""
@@ -123,25 +129,27 @@ class _Expansion:
         return np.take_along_axis(u, order, axis=-1), np.take_along_axis(excess, order, axis=-1)
 
 
-def fractions_moving(points: Floats, ends: list[Any]) -> Floats:
+def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
     """Return the fractions of the duration before and after the via-point.
 
     Args:
         points: (N, 3, D) start, via-point, goal [m], each different from its neighbour.
         ends: start velocity and acceleration, goal velocity and acceleration in unit time: (N, D), None or
             FREE.
+        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
 
     Returns:
         (N, 2), each pair adds up to 1; the smaller one has full relative accuracy.
     """
-    expansion, cost = _expand(points, ends, from_goal=False)
+    expansion, cost = _expand(points, ends, slack, from_goal=False)
     stationary = expansion.stationary()
     u = root_candidates(stationary)
     best = _earliest(u, expansion.excess(u), cost)
     fractions = np.stack([best, 1.0 - best], axis=-1)
     hard = np.flatnonzero(_inaccurate(stationary, best))
     if hard.size:
-        found = _from_both_ends(points[hard], [chosen_items(value, hard) for value in ends], cost[hard])
+        chosen = [chosen_items(value, hard) for value in ends]
+        found = _from_both_ends(points[hard], chosen, slack[hard], cost[hard])
         wrong = (np.abs(found - fractions[hard]) > _TOLERANCE * found).any(axis=-1)
         fractions[hard[wrong]] = found[wrong]
     return fractions
@@ -169,10 +177,10 @@ def _candidates_on_every_scale(polynomial: Floats) -> Floats:
     return candidates
 
 
-def _from_both_ends(points: Floats, ends: list[Any], cost: Floats) -> Floats:
+def _from_both_ends(points: Floats, ends: list[Any], slack: Floats, cost: Floats) -> Floats:
     """Return the fractions (N, 2) from the roots in expansions around both ends."""
     (before, early), (after, late) = (
-        _expand(points, ends, from_goal=from_goal)[0].near_roots() for from_goal in (False, True)
+        _expand(points, ends, slack, from_goal=from_goal)[0].near_roots() for from_goal in (False, True)
     )
     after, late = after[:, ::-1], late[:, ::-1]  # in the order of time
     fractions = np.concatenate(
@@ -181,7 +189,7 @@ def _from_both_ends(points: Floats, ends: list[Any], cost: Floats) -> Floats:
     return _earliest(fractions, np.concatenate([early, late], axis=1), cost)
 
 
-def _expand(points: Floats, ends: list[Any], *, from_goal: bool) -> tuple[_Expansion, Floats]:
+def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) -> tuple[_Expansion, Floats]:
     """Return the problem in the time from one end, and (N,) the cost without the via-point.
 
     Seen from the goal, time runs backwards: velocities change sign, accelerations do not.
@@ -197,7 +205,7 @@ def _expand(points: Floats, ends: list[Any], *, from_goal: bool) -> tuple[_Expan
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)
     miss = -np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
     miss[..., 0] = via - first
-    return _Expansion(miss, powers, g), free.cost()
+    return _Expansion(miss, powers, g, slack), free.cost()
 
 
 def _earliest(choices: Floats, excess: Floats, cost: Floats) -> Floats:

@@ -17,35 +17,41 @@ has the value z* and the derivative dz/dp = -H^-1 dg/dp. So no iteration is unro
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-from ..array_api import FREE, Array, Floats, Namespace, is_given, like, ordered_sum, to_numpy
+from ..array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
 from ..trajectory import connect
 from .cost import PassageCost, duration_gradient
-from .rest_to_rest import attach_root_gradient
-
-Evaluate: TypeAlias = Callable[[Floats, Any], tuple[Floats, Floats, Floats]]
-"""(z (n, M), items (M,)) -> value (M,), gradient (n, M), Hessian (n, n, M) of the problems `items` at z."""
+from .rest_to_rest import attach_root_gradient, nearer_fraction
 
 _STARTS = 10
 """Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution."""
 
-_SHORT = 0.03
-"""Fraction of the duration below which a segment's cost loses digits, like 1e-16 / h^2.
-
-Movements with such a segment are finished in extended precision.
-"""
+_MOST_SEGMENTS = 16
+"""Number of segments up to which several starts are tried."""
 
 _LARGEST = 1e3
 """Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient."""
 
+_DIFFERENCE, _WIDE_DIFFERENCE = 1e-8, 1e-6
+"""Steps of the log-durations for one-sided and for central difference quotients of the gradient."""
+
 _LONGEST_STEP = 1.5
 _NOISE = 1e-13
+"""Relative error of a cost."""
+
 _CONVERGED_STEP = 1e-8
+"""Newton step that is the last: by quadratic convergence its successor would be of the order of its square."""
+
+_SMALL_GAIN, _LARGE_STEP = 1e-8, 1e-2
+"""Gain of the logarithm of the cost that counts as none, if rounding forbids it or only a large step would make it."""
+
+_REACHED = 1e-6
+"""Distance from a lower bound of the logarithm of the cost that is close enough."""
+
 _ITERATIONS = 80
 _HALVINGS = 12
 
@@ -59,76 +65,95 @@ class Minima:
     converged: Any
 
 
-def fractions_by_newton(cost: PassageCost, *, several: bool) -> tuple[Floats, Any]:
-    """Return fractions of the duration (N, S), from several starts if asked, and True where it converged (N,)."""
-    first, *others = _starts(cost.steps, several)
-    best = _minimise_cost(cost, first)
+def fractions_by_newton(
+    cost: PassageCost, guess: Floats, bound: Floats, *, several: bool
+) -> tuple[Floats, Any]:
+    """Return fractions of the duration (N, S), from several starts if asked, and True where it converged (N,).
+
+    Args:
+        cost: of N movements.
+        guess: (S, N) durations to start from, NaN for none.
+        bound: (N,) lower bound of the cost, NaN for none.
+        several: True for several starts.
+    """
+    first, *others = _starts(cost, guess, several)
+    best = _minimise(cost, first)
     for start in others:
-        found = _minimise_cost(cost, start)
+        found = _minimise(cost, start)
         # A later start must be better by more than rounding, or noise would decide ties.
         better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
         pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
         best = Minima(*(np.where(better, new, old) for new, old in pairs))
-    lost = ~np.isfinite(best.z).all(axis=0)
-    h = np.where(lost, 1.0 / len(best.z), _softmax(np.where(lost, 0.0, best.z)))
-    hard = np.flatnonzero(~best.converged | (h.min(axis=0) < _SHORT))
-    if hard.size:
-        refined = _minimise_cost(cost.chosen(hard, np.longdouble), h[:, hard].astype(np.longdouble))
-        good = np.isfinite(refined.z).all(axis=0)
-        h[:, hard[good]] = _softmax(refined.z[:, good])
-        best.converged[hard] = refined.converged & good
-    return np.ascontiguousarray(h.T), best.converged
+    reached = best.value < np.log(bound + cost.reference()) + _REACHED
+    return np.ascontiguousarray(_softmax(best.z).T), best.converged | reached
 
 
-def _starts(steps: Floats, several: bool) -> list[Floats]:
-    """Return durations to start from, each (S, N): proportional to the cube root of the chord, and others."""
-    chord = np.cbrt(np.sqrt(ordered_sum(steps * steps, 1)))
-    starts = [np.maximum(chord / chord.max(axis=0), 1e-3)]
-    if several:
-        segments, count = chord.shape
+def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
+    """Return durations to start from, each (S, N): the best of some guesses, and others."""
+    segments, _, count = cost.steps.shape
+    chord = np.sqrt(ordered_sum(cost.steps * cost.steps, 1))
+    # A movement from rest covers the cube of the time; a smooth path is followed like a straight one.
+    guesses = [np.cbrt(chord), _straight_durations(chord)]
+    if not np.isnan(guess).all():
+        guesses.append(guess)
+    starts = [_lowest(cost, guesses)]
+    if several and segments <= _MOST_SEGMENTS:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
         starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
     return [start / start.sum(axis=0) for start in starts]
 
 
-def _minimise_cost(cost: PassageCost, start: Floats) -> Minima:
-    """Minimise log(J + reference) from durations (S, N)."""
-    reference = cost.reference()
+def _straight_durations(chord: Floats) -> Floats:
+    """Return the durations (S, N) in which a straight movement from rest to rest covers the lengths of the chords."""
+    total = ordered_sum(chord)
+    covered = np.cumsum(chord, axis=0)[:-1] / total
+    left = np.cumsum(chord[::-1], axis=0)[-2::-1] / total
+    nearer = np.minimum(covered, left)
+    time = nearer_fraction(nearer, np.ones_like(nearer), nearer * nearer)
+    times = np.where(covered <= left, time, 1.0 - time)
+    durations = np.diff(times, axis=0, prepend=0.0, append=1.0)
+    # No segment is passed faster than at the peak speed 15/8: a very short one keeps a positive duration.
+    positive: Floats = np.maximum(durations, chord / (1.875 * total))
+    return positive
 
-    def evaluate(z: Floats, items: Any) -> tuple[Floats, Floats, Floats]:
-        return log_cost(cost.chosen(items), z, reference[items])
 
-    return _minimise(evaluate, np.log(start))
+def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
+    """Return, for each movement, those candidates of the durations (S, N) that cost least."""
+    shares = np.stack([each / each.sum(axis=0) for each in candidates])
+    costs = np.stack([cost.derivatives(each)[0] for each in shares])
+    best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
+    chosen: Floats = np.take_along_axis(shares, best[None, None], axis=0)[0]
+    return chosen
 
 
 def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
     """Return log(J + reference), its gradient and its Hessian with respect to z.
 
-    With c = 1 / (J + reference) and M = dh/dz = diag(h) - h h^T,
-
-        gradient = c M J_h,   Hessian = c (M J_hh M + sum_i J_i d2h_i/dz2) - gradient gradient^T.
-
-    The cost does not change if all z shift, so 1 1^T makes the Hessian regular and changes no step.
+    The Hessian consists of difference quotients of the gradient, all computed at once, central ones for many
+    segments, which make it ill conditioned. The cost does not change if all z shift: that gives the last row, and
+    1 1^T, which makes the Hessian regular, changes no step.
     """
-    h = _softmax(z)
-    j, first, second = cost.derivatives(h)
-    scale = 1.0 / (j + reference)
-    first = first * h * scale
-    mean = ordered_sum(first)
-    gradient = first - h * mean
-    curved = scale * second * h * h[:, None]
-    along = ordered_sum(curved)
-    hessian = curved - _outer(h, along) - _outer(along, h) + ordered_sum(along) * _outer(h, h)
-    hessian = hessian - _outer(h, first) - _outer(first, h) + 2.0 * mean * _outer(h, h)
-    for i in range(len(h)):
-        hessian[i, i] += first[i] - h[i] * mean
-    return np.log(j + reference), gradient, hessian - _outer(gradient, gradient) + 1.0
-
-
-def _outer(p: Floats, q: Floats) -> Floats:
-    """Return the outer products (n, n, N) of vectors (n, N)."""
-    return p[:, None] * q[None, :]
+    size, count = z.shape
+    upper, lower = (_DIFFERENCE, 0.0) if size <= _MOST_SEGMENTS else (_WIDE_DIFFERENCE, -_WIDE_DIFFERENCE)
+    columns = [z]
+    for shift in (upper, lower):
+        for i in range(size - 1 if shift else 0):
+            moved = z.copy()
+            moved[i] += shift
+            columns.append(moved)
+    h = _softmax(np.concatenate(columns, axis=1))
+    items = np.tile(np.arange(count), len(columns))
+    j, first = cost.chosen(items).derivatives(h)
+    scale = 1.0 / (j + reference[items])
+    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, len(columns), count)
+    gradient, above = gradients[:, 0], gradients[:, 1:size]
+    below = gradients[:, size:] if lower else gradient[:, None]
+    hessian = np.empty((size, size, count))
+    hessian[:-1] = ((above - below) / (upper - lower)).swapaxes(0, 1)
+    hessian[-1] = -ordered_sum(hessian[:-1])
+    value: Floats = np.log(j[:count] + reference)
+    return value, gradient, 0.5 * (hessian + hessian.swapaxes(0, 1)) + 1.0
 
 
 def _softmax(z: Floats) -> Floats:
@@ -138,35 +163,44 @@ def _softmax(z: Floats) -> Floats:
     return shares
 
 
-def _minimise(evaluate: Evaluate, z: Floats) -> Minima:
-    """Return local minima from the starts z (n, N).
-
-    A Newton step shorter than 1e-8 is the last one: by quadratic convergence its successor would be of the
-    order of its square.
-    """
-    z = z.copy()
+def _minimise(cost: PassageCost, start: Floats) -> Minima:
+    """Return local minima of log(J + reference) from durations (S, N)."""
+    z, reference = np.log(start), cost.reference()
     active = np.arange(z.shape[1])
-    value, gradient, hessian = evaluate(z, active)
+    value, gradient, hessian = log_cost(cost, z, reference)
     converged = np.zeros(z.shape[1], dtype=bool)
     result = value.copy()
     for _ in range(_ITERATIONS):
         step = _descent_step(gradient, hessian)
-        last = np.abs(step).max(axis=0) < _CONVERGED_STEP
+        size, gain = np.abs(step).max(axis=0), -ordered_sum(gradient * step)
+        last = size < _CONVERGED_STEP
         z[:, active[last]] += step[:, last]
-        converged[active[last]] = True
-        keep = ~last
-        active, step = active[keep], step[:, keep]
+        # Where waypoints are equal within their tolerance the cost is flat: no step counts.
+        done = last | ((gain < _SMALL_GAIN) & (size > _LARGE_STEP))
+        converged[active[done]] = True
+        active, step, gain = active[~done], step[:, ~done], gain[~done]
         if not active.size:
             break
-        state = value[keep], gradient[:, keep], hessian[:, :, keep]
-        moved, value, gradient, hessian = _search(evaluate, z[:, active], active, step, *state)
-        z[:, active] = moved
-        result[active] = value
+        state = value[~done], gradient[:, ~done], hessian[..., ~done]
+        moved, value, gradient, hessian = _search(
+            cost.chosen(active), reference[active], z[:, active], step, *state
+        )
+        stays = (moved == z[:, active]).all(axis=0)
+        z[:, active], result[active] = moved, value
+        converged[active[stays & (gain < _SMALL_GAIN)]] = True
+        active, value = active[~stays], value[~stays]
+        gradient, hessian = gradient[:, ~stays], hessian[..., ~stays]
     return Minima(z, result, converged)
 
 
 def _search(
-    evaluate: Evaluate, z: Floats, items: Any, step: Floats, value: Floats, gradient: Floats, hessian: Floats
+    cost: PassageCost,
+    reference: Floats,
+    z: Floats,
+    step: Floats,
+    value: Floats,
+    gradient: Floats,
+    hessian: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return z after a backtracking line search, with value, gradient and Hessian there.
 
@@ -174,17 +208,18 @@ def _search(
     whose value cannot fall any more stays where it is.
     """
     slope = ordered_sum(gradient * step)
+    origin, first = z, value
     z, value, gradient, hessian = z.copy(), value.copy(), gradient.copy(), hessian.copy()
-    waiting = np.arange(len(items))
+    waiting = np.arange(z.shape[1])
     length = 1.0
-    origin, first = z.copy(), value.copy()
     for _ in range(_HALVINGS):
         trial = origin[:, waiting] + length * step[:, waiting]
-        new_value, new_gradient, new_hessian = evaluate(trial, items[waiting])
-        falls = new_value <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
+        found = log_cost(cost.chosen(waiting), trial, reference[waiting])
+        falls = found[0] <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
         accepted = waiting[falls]
-        z[:, accepted], value[accepted] = trial[:, falls], new_value[falls]
-        gradient[:, accepted], hessian[:, :, accepted] = new_gradient[:, falls], new_hessian[:, :, falls]
+        z[:, accepted] = trial[:, falls]
+        for kept, new in zip((value, gradient, hessian), found, strict=True):
+            kept[..., accepted] = new[..., falls]
         waiting = waiting[~falls]
         if not waiting.size:
             break
@@ -194,48 +229,57 @@ def _search(
 
 def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
     """Return the modified Newton step -H^-1 g, shortened so that no component is longer than 1.5."""
-    step = -solve_positive(hessian, gradient)
+    step = -solve_positive(hessian, gradient[:, None])[:, 0]
     longest = np.abs(step).max(axis=0)
     shortened: Floats = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
     return shortened
 
 
 def solve_positive(matrix: Floats, right: Floats) -> Floats:
-    """Solve L |D| L^T x = right, where the matrix is L D L^T.
+    """Solve H x = b for symmetric matrices (n, n, N) and right sides (n, m, N).
 
-    The absolute pivots give a descent direction where the cost is not convex (modified factorisation, Nocedal
-    & Wright 2006, section 3.4).
+    Where H is not positive definite its eigenvalues are replaced by their absolute values (Nocedal & Wright 2006,
+    section 3.4), which gives a descent direction.
     """
     size = len(matrix)
     work, solution = matrix.copy(), right.copy()
-    scale = np.abs(np.stack([matrix[i, i] for i in range(size)])).max(axis=0)
-    pivots = []
-    for j in range(size):
-        pivot = np.maximum(np.abs(work[j, j]), 1e-10 * scale + 1e-300)
-        pivots.append(pivot)
-        for i in range(j + 1, size):
-            factor = work[i, j] / pivot
-            work[i, j + 1 :] -= factor * work[j, j + 1 :]
-            solution[i] -= factor * solution[j]
-    for j in reversed(range(size)):
-        for i in range(j + 1, size):
-            solution[j] -= work[j, i] * solution[i]
-        solution[j] /= pivots[j]
+    with np.errstate(all="ignore"):
+        for j in range(size):
+            factor = work[j + 1 :, j] / work[j, j]
+            work[j + 1 :, j:] -= factor[:, None] * work[j, j:]
+            solution[j + 1 :] -= factor[:, None] * solution[j]
+        for j in reversed(range(size)):
+            solution[j] /= work[j, j]
+            solution[:j] -= work[:j, j, None] * solution[j]
+    pivots = work[range(size), range(size)]
+    other = np.flatnonzero(~((pivots > 0).all(axis=0) & np.isfinite(solution).all(axis=(0, 1))))
+    for item in other:
+        values, vectors = np.linalg.eigh(np.nan_to_num(matrix[..., item]))
+        size_of = np.abs(values)
+        inverse = 1.0 / np.maximum(size_of, 1e-10 * size_of.max())
+        solution[..., item] = vectors @ (inverse[:, None] * (vectors.T @ right[..., item]))
     return solution
 
 
-def attach_gradient(fractions: Array, waypoints: Array, ends: list[Any], xp: Namespace) -> Array:
+def attach_gradient(
+    fractions: Array, waypoints: Array, ends: list[Any], cost: PassageCost, xp: Namespace
+) -> Array:
     """Return the fractions (..., S), differentiable with respect to waypoints and boundary values.
 
-    Movements with a dropped via-point get the gradient zero. `ends` are the four boundary values in unit time,
-    (..., D) each, None or FREE.
+    Movements with a dropped via-point get the gradient zero.
+
+    Args:
+        fractions: in double precision.
+        waypoints: (..., S + 1, D), likewise.
+        ends: the four boundary values in unit time, (..., D) each, None or FREE.
+        cost: of the same movements.
+        xp: namespace.
     """
     segments = fractions.shape[-1]
     if segments == 1:
         return fractions
     if segments == 2 and all(value is None for value in ends):
         return attach_root_gradient(fractions, waypoints, xp)
-    fractions = fractions.detach()
     whole = xp.all(fractions > 0, axis=-1)[..., None]
     safe = xp.where(whole, fractions, xp.ones_like(fractions) / segments)
     states: list[list[Any]] = [ends[:2], *([FREE, FREE] for _ in range(segments - 1)), ends[2:]]
@@ -243,26 +287,17 @@ def attach_gradient(fractions: Array, waypoints: Array, ends: list[Any], xp: Nam
     # Chain rule of h_i = exp(z_i) / sum_j exp(z_j): dJ/dz_i = h_i (dJ/dh_i - sum_j h_j dJ/dh_j).
     first = safe * duration_gradient(movement.coefficients, movement.rates)
     gradient = first - safe * first.sum(-1)[..., None]
-    inverse = like(xp, _inverse_hessian(waypoints, ends, safe), fractions)
-    step = -xp.matmul(inverse, gradient[..., None])[..., 0]  # Eq. 1
+    h = np.ascontiguousarray(to_numpy(safe).reshape(-1, segments).T)
+    inverse = np.moveaxis(_inverse_hessian(cost, h), -1, 0).reshape(*safe.shape, segments)
+    step = -xp.matmul(like(xp, inverse, fractions), gradient[..., None])[..., 0]  # Eq. 1
     step = step - (safe * step).sum(-1)[..., None]
     step = xp.where(whole, fractions * step, xp.zeros_like(step))
     return fractions + (step - step.detach())
 
 
-def _inverse_hessian(waypoints: Array, ends: list[Any], fractions: Array) -> Any:
-    """Return (..., S, S) inverse Hessian of the log-cost with respect to log-durations, divided by the cost."""
-    batch, segments = tuple(fractions.shape[:-1]), fractions.shape[-1]
-    points = to_numpy(waypoints).astype(np.float64).reshape(-1, *waypoints.shape[-2:])
-    rows = []
-    for value in ends:
-        if is_given(value):
-            full = np.broadcast_to(to_numpy(value).astype(np.float64), (*batch, value.shape[-1]))
-            value = full.reshape(-1, value.shape[-1])
-        rows.append(value)
-    cost = PassageCost.from_points(points, rows)
-    h = np.ascontiguousarray(to_numpy(fractions).astype(np.float64).reshape(-1, segments).T)
+def _inverse_hessian(cost: PassageCost, h: Floats) -> Floats:
+    """Return (S, S, N) inverse Hessian of the log-cost with respect to log-durations, divided by the cost."""
     value, _, hessian = log_cost(cost, np.log(h), cost.reference())
-    identity = np.repeat(np.eye(segments)[:, :, None], h.shape[1], axis=2)
-    inverse = np.clip(solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
-    return np.moveaxis(inverse, -1, 0).reshape(*batch, segments, segments)
+    identity = np.repeat(np.eye(len(h))[:, :, None], h.shape[1], axis=2)
+    inverse: Floats = np.clip(solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
+    return inverse

@@ -28,7 +28,7 @@ from ..array_api import Array, Namespace, like, to_numpy
 Number: TypeAlias = Any
 """A float, or an array with one entry per movement; both give the same bits."""
 
-SHORTEST = 1e-50
+SHORTEST = 1e-40
 """Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
 STEPS = 5

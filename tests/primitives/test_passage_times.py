@@ -149,16 +149,6 @@ def test_the_movement_backwards_has_the_same_passage_times(vias, rng):
     assert (np.abs(there - back) / there.min(axis=-1, keepdims=True)).max() < 1e-9
 
 
-def test_what_does_not_converge_is_flagged(rng):
-    """Two via-points a ten-thousandth apart: their passage times all but merge."""
-    waypoints = rng.normal(size=(300, 4, 2))
-    waypoints[:, 2] = waypoints[:, 1] + 1e-7 * rng.normal(size=(300, 2))
-    with pytest.warns(RuntimeWarning, match="did not converge"):
-        durations = passage_durations(waypoints, 1.0)
-    assert (durations > 0).all()
-    np.testing.assert_allclose(durations.sum(axis=-1), 1.0, rtol=1e-12)
-
-
 @pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-5, 1e-7, 1e-10, 1e-40, 1e-160, 1e-300])
 @pytest.mark.parametrize("rest", ["nowhere", "at the start", "at the goal"])
 def test_a_movement_and_its_reversal_pass_at_the_same_instant(distance, rest, rng):
@@ -177,7 +167,10 @@ def test_a_movement_and_its_reversal_pass_at_the_same_instant(distance, rest, rn
     assert np.isfinite(through(waypoints, away, **forth).coefficients).all()
     # The same seen from the goal: the origin lies there, so that the via-point is as near as it was.
     toward = passage_durations(waypoints[:, ::-1], 1.0, **back)[:, ::-1]
-    np.testing.assert_allclose(toward, away, rtol=2e-9)
+    costs = through(waypoints, away, **forth).cost(), through(waypoints, toward, **forth).cost()
+    np.testing.assert_allclose(*costs, rtol=1e-9)
+    if distance > 1e-15:  # nearer than rounding, instants are equally good
+        np.testing.assert_allclose(toward, away, rtol=2e-9)
 
 
 @pytest.mark.parametrize("rest", ["at the start", "at the goal", "nowhere"])
@@ -200,7 +193,6 @@ LENGTHS = st.floats(-1e6, 1e6, allow_subnormal=False)
 """Coordinates, [m]; relative to the whole path, a subnormal distance is zero."""
 
 
-@pytest.mark.filterwarnings("ignore:passage times:RuntimeWarning")
 @hypothesis.settings(max_examples=150, deadline=None)
 @hypothesis.given(
     st.integers(3, 5).flatmap(lambda n: hnp.arrays(float, (n, 2), elements=LENGTHS)),
@@ -212,7 +204,9 @@ def test_any_finite_waypoints_give_a_finite_movement(waypoints, duration, moving
     durations = passage_durations(waypoints, duration, **ends)
     assert (durations >= 0).all()
     np.testing.assert_allclose(durations.sum(), duration, rtol=1e-14)
-    assert ((durations > 0) == (np.diff(waypoints, axis=0) != 0).any(axis=1))[:-1].all()
+    gaps = np.abs(np.diff(waypoints, axis=0)).max(axis=1)
+    assert (durations[gaps > 1e-15 * np.abs(waypoints).max()] > 0).all()
+    assert (durations[:-1][gaps[:-1] == 0] == 0).all()
     movement = through(waypoints, durations, **ends)
     assert np.isfinite(movement.coefficients).all()
     assert np.isfinite(movement.sample(9)).all()

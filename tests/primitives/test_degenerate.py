@@ -1,0 +1,113 @@
+"""Near degenerate input: nearly equal points, very many points, and movements that stand still."""
+
+import numpy as np
+import pytest
+import torch
+
+import viapoint.primitives as vp
+from viapoint.primitives import passage_durations, retarget, through
+
+GAPS = [1e-3, 1e-6, 1e-9, 1e-13]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("more", [1, 3])
+@pytest.mark.parametrize("moving", [False, True])
+def test_nearly_equal_via_points_along_the_way_cost_nothing(gap, more, moving, rng):
+    for dimension in (1, 3):
+        waypoints = rng.normal(size=(4, dimension))
+        ends = {"start_velocity": rng.normal(size=dimension)} if moving else {}
+        plain = through(waypoints, passage_durations(waypoints, 1.0, **ends), **ends)
+        times = np.insert(plain.knots, 2, plain.knots[1] + gap * np.arange(1, more + 1))
+        points = plain(times)
+        movement = through(points, passage_durations(points, 1.0, **ends), **ends)
+        assert movement.cost() <= plain.cost() * (1 + 1e-6)
+        np.testing.assert_allclose(movement(movement.knots), points, atol=1e-10)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("gap", GAPS[:3])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_no_passage_time_is_better_for_nearly_equal_points_in_any_direction(gap, place, rng):
+    waypoints = rng.normal(size=(20, 5, 2))
+    waypoints[:, place + 1] = waypoints[:, place] + gap * rng.normal(size=(20, 2))
+    durations = passage_durations(waypoints, 1.0)
+    best = through(waypoints, durations).cost()
+    for factor in (0.3, 0.9, 1.1, 3.0):
+        moved = durations.copy()
+        moved[:, place] *= factor
+        moved[:, 3] += durations.sum(axis=1) - moved.sum(axis=1)
+        assert (through(waypoints, moved).cost() >= best * (1 - 1e-6)).all()
+
+
+def test_points_that_differ_by_rounding_are_one():
+    plain = through([[0.0, 0.0], [0.3, 0.2], [1.0, 0.0]], [0.4, 0.6])
+    for dtype, step in ((np.float64, 1e-16), (np.float32, 3e-8)):
+        points = np.array([[0.0, 0.0], [0.3, 0.2], [0.3, 0.2 + step], [1.0, 0.0]], dtype)
+        np.testing.assert_allclose(through(points, [0.4, 0.0, 0.6]).cost(), plain.cost(), rtol=1e-5)
+        merged = through(points, passage_durations(points, 1.0)).cost()
+        assert merged < 1.01 * plain.cost()
+
+
+@pytest.mark.parametrize("number", [50, 200])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_passage_times_of_many_points_are_stationary(number, noise, rng):
+    x = np.linspace(0, 1, number)
+    points = np.stack([x, 0.2 * np.sin(6 * x)], axis=-1) + noise * rng.normal(size=(number, 2))
+    movement = through(points, passage_durations(points, 2.0))
+    slopes = vp.cost_gradient(movement).durations  # equal at the optimum (Eq. C10)
+    np.testing.assert_allclose(slopes, -5 * movement.cost() / 2.0, rtol=1e-4)
+
+
+def test_a_via_point_reached_within_rounding_changes_no_movement_under_way(rng):
+    for _ in range(5):
+        waypoints = rng.normal(size=(3, 2))
+        old = through(waypoints, passage_durations(waypoints, 1.0))
+        for early in (1e-7, 1e-9, 1e-12, 1e-15):
+            now = float(old.knots[1]) - early
+            new = retarget(old, now, waypoints[2], 1.0, via=waypoints[1])
+            rest = retarget(old, now, waypoints[2], 1.0)
+            assert new.cost() <= rest.cost() * (1 + 1e-6)
+
+
+def test_degenerate_items_leave_a_batch_bit_for_bit_as_it_was(rng):
+    points = rng.normal(size=(8, 4, 2))
+    points[1, 2] = points[1, 1] + 1e-9
+    points[2] = points[2, 0]
+    points[3, 1] = points[3, 0]
+    points[4, 1:3] = points[4, 0] + [[1e-30, 0], [0, 1e-7]]
+    durations = passage_durations(points, 1.0)
+    movements = through(points, durations)
+    for i in range(8):
+        alone = passage_durations(points[i], 1.0)
+        np.testing.assert_array_equal(alone, durations[i])
+        np.testing.assert_array_equal(through(points[i], alone).coefficients, movements.coefficients[i])
+
+
+STILL = {
+    "sample": lambda m: m.sample(5)[1],
+    "peak": lambda m: m.peak(1),
+    "extrema": lambda m: m.extrema(1).maximum,
+    "cost": lambda m: m.cost(),
+    "jerk": vp.dimensionless_jerk,
+    "arc length": vp.spectral_arc_length,
+    "valleys": lambda m: vp.speed_valleys(m).time,
+    "gradient": lambda m: vp.cost_gradient(m).durations,
+    "limited": lambda m: m.stretched(vp.minimum_duration(m, velocity=1.5)).peak(1),
+    "again": lambda m: m.stretched(vp.minimum_duration(m, velocity=1.5)).stretched(2.0)(0.3),
+    "new goal": lambda m: retarget(m, 0.0, [3.0, 4.0], 2.0, via=[1.0, 2.0])(0.5),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", [np, torch])
+@pytest.mark.parametrize("vias", [0, 1, 2])
+@pytest.mark.parametrize("name", STILL)
+def test_a_movement_that_stands_still_may_last_no_time_and_leaves_others_alone(name, vias, kind, rng):
+    points = kind.asarray(np.stack([rng.normal(size=(vias + 2, 2)), np.ones((vias + 2, 2))]))
+    durations = passage_durations(points, kind.asarray([1.0, 0.0]))
+    together, alone = through(points, durations), through(points[0], durations[0])
+    assert (together.duration == kind.asarray([1.0, 0.0])).all()
+    asked, expected = np.asarray(STILL[name](together))[0], np.asarray(STILL[name](alone))
+    np.testing.assert_allclose(asked, expected, rtol=1e-14)
