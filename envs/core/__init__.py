@@ -1,0 +1,1 @@
+"""Core of version 2: arms as chains with spheres, compiled geometry, one environment."""

@@ -1,0 +1,1 @@
+"""Arms: chains of joints with spheres on their links."""

@@ -1,0 +1,57 @@
+"""Records of an arm that compiled functions read: a chain of joints, and the spheres on its links."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from viapoint.envs.common.types import Bool, Float, Int
+
+
+class Chain(NamedTuple):
+    """Serial chain of J joints with one link each.
+
+    Link 0 is the base, which does not move; link j moves with joints 1 to j. The frame of a link is that of its joint;
+    its z axis is the axis of the joint.
+    """
+
+    origin: Float
+    """Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]."""
+    rotation: Float
+    """Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)."""
+    sliding: Bool
+    """True for joints that slide along their z axis, False for hinges about it, shape (J,)."""
+    tool_origin: Float
+    """Origin of the tool's frame in that of the last link, shape (3,), [m]."""
+    tool_rotation: Float
+    """Axes of the tool's frame as columns, shape (3, 3)."""
+    mass: Float
+    """Mass of each moving link with all that is fixed to it, shape (J,), [kg]."""
+    centre: Float
+    """Centre of mass in the link's frame, shape (J, 3), [m]."""
+    inertia: Float
+    """Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]."""
+    armature: Float
+    """Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]."""
+    damping: Float
+    """Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]."""
+    gravity: Float
+    """Gravitational acceleration, shape (3,), [m/s^2]."""
+
+
+class Spheres(NamedTuple):
+    """Spheres that cover an arm, in G groups; a group is rigid and belongs to one body of the model."""
+
+    centre: Float
+    """Centres in the frame of the link, shape (S, 3), [m]."""
+    radius: Float
+    """Radii, shape (S,), [m]."""
+    first: Int
+    """Index of the first sphere of each group, and the number of spheres, shape (G + 1,)."""
+    link: Int
+    """Link that each group moves with, shape (G,); 0 for the base."""
+    ball_centre: Float
+    """Centre of a bounding sphere of each group, in the frame of the link, shape (G, 3), [m]."""
+    ball_radius: Float
+    """Radius of this sphere, shape (G,), [m]."""
+    pairs: Int
+    """Pairs of groups that must not touch one another, shape (P, 2)."""

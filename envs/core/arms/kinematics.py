@@ -1,0 +1,358 @@
+"""Forward kinematics, Jacobians and inverse dynamics of a chain of joints.
+
+Compiled functions work on one configuration and fill arrays of the caller. The functions at the end of the module are
+batched over leading axes; they check their arguments and return new arrays.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+from viapoint.envs.core.arms.chain import Chain, Spheres
+from viapoint.envs.core.geometry.compiled import compiled
+from viapoint.envs.core.geometry.kernels import inlined, kernel
+
+Vector = tuple[float, float, float]
+"""Three components."""
+
+
+@kernel
+def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
+    """Fill the world frames of links 0 to J.
+
+    Args:
+        chain: Chain of J joints.
+        joints: Configuration, shape (J,), [rad] or [m].
+        rotation: Axes of the frames as columns, shape (J + 1, 3, 3).
+        origin: Origins of the frames, shape (J + 1, 3), [m].
+    """
+    for row in range(3):
+        for column in range(3):
+            rotation[0, row, column] = 0.0
+        rotation[0, row, row] = 1.0
+        origin[0, row] = 0.0
+    fixed, place = chain.rotation, chain.origin
+    for j in range(joints.shape[0]):
+        slides = chain.sliding[j]
+        cosine, sine, shift = 1.0, 0.0, 0.0
+        if slides:
+            shift = joints[j]
+        else:
+            cosine, sine = math.cos(joints[j]), math.sin(joints[j])
+        for row in range(3):
+            a, b, c = rotation[j, row, 0], rotation[j, row, 1], rotation[j, row, 2]
+            # A row of the frame of the joint at 0, and then turned about its z axis.
+            x = a * fixed[j, 0, 0] + b * fixed[j, 1, 0] + c * fixed[j, 2, 0]
+            y = a * fixed[j, 0, 1] + b * fixed[j, 1, 1] + c * fixed[j, 2, 1]
+            z = a * fixed[j, 0, 2] + b * fixed[j, 1, 2] + c * fixed[j, 2, 2]
+            rotation[j + 1, row, 0] = cosine * x + sine * y
+            rotation[j + 1, row, 1] = cosine * y - sine * x
+            rotation[j + 1, row, 2] = z
+            along = a * place[j, 0] + b * place[j, 1] + c * place[j, 2]
+            origin[j + 1, row] = origin[j, row] + along + shift * z
+
+
+@inlined
+def transform(rotation: Float, origin: Float, link: int, point: Float) -> Vector:
+    """Return the world position of a point of a link, [m]; the frames are those of :func:`link_frames`."""
+    x, y, z = point[0], point[1], point[2]
+    return (
+        origin[link, 0] + rotation[link, 0, 0] * x + rotation[link, 0, 1] * y + rotation[link, 0, 2] * z,
+        origin[link, 1] + rotation[link, 1, 0] * x + rotation[link, 1, 1] * y + rotation[link, 1, 2] * z,
+        origin[link, 2] + rotation[link, 2, 0] * x + rotation[link, 2, 1] * y + rotation[link, 2, 2] * z,
+    )
+
+
+@kernel
+def tool_frame(
+    chain: Chain, rotation: Float, origin: Float, tool_rotation: Float, tool_origin: Float
+) -> None:
+    """Fill the world frame of the tool, shapes (3, 3) and (3,), from the frames of the links."""
+    last = chain.origin.shape[0]
+    tool_origin[0], tool_origin[1], tool_origin[2] = transform(rotation, origin, last, chain.tool_origin)
+    for row in range(3):
+        for column in range(3):
+            tool_rotation[row, column] = (
+                rotation[last, row, 0] * chain.tool_rotation[0, column]
+                + rotation[last, row, 1] * chain.tool_rotation[1, column]
+                + rotation[last, row, 2] * chain.tool_rotation[2, column]
+            )
+
+
+@kernel
+def tool_position(chain: Chain, joints: Float, rotation: Float, origin: Float) -> Vector:
+    """Return the world position of the tool, [m], and fill the frames of the links."""
+    link_frames(chain, joints, rotation, origin)
+    return transform(rotation, origin, chain.origin.shape[0], chain.tool_origin)
+
+
+@kernel
+def point_jacobian(
+    chain: Chain, rotation: Float, origin: Float, link: int, x: float, y: float, z: float, jacobian: Float
+) -> None:
+    """Fill the derivative of the world position of a point (x, y, z) of a link by the joints, shape (3, J) or more."""
+    for j in range(chain.origin.shape[0]):
+        jacobian[0, j] = 0.0
+        jacobian[1, j] = 0.0
+        jacobian[2, j] = 0.0
+    for j in range(link):
+        u, v, w = rotation[j + 1, 0, 2], rotation[j + 1, 1, 2], rotation[j + 1, 2, 2]
+        if not chain.sliding[j]:
+            arm = (x - origin[j + 1, 0], y - origin[j + 1, 1], z - origin[j + 1, 2])
+            u, v, w = _cross((u, v, w), arm)
+        jacobian[0, j] = u
+        jacobian[1, j] = v
+        jacobian[2, j] = w
+
+
+@kernel
+def tool_jacobian(
+    chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float
+) -> None:
+    """Fill the derivative of the tool's position and of its rotation vector by the joints, in world axes, shape (6, J)."""
+    n_joints = chain.origin.shape[0]
+    x, y, z = tool_origin[0], tool_origin[1], tool_origin[2]
+    point_jacobian(chain, rotation, origin, n_joints, x, y, z, jacobian)
+    for j in range(n_joints):
+        turns = 0.0 if chain.sliding[j] else 1.0
+        for row in range(3):
+            jacobian[3 + row, j] = turns * rotation[j + 1, row, 2]
+
+
+@kernel
+def _cross(first: Vector, second: Vector) -> Vector:
+    a, b, c = first
+    x, y, z = second
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@kernel
+def _add(first: Vector, second: Vector) -> Vector:
+    return first[0] + second[0], first[1] + second[1], first[2] + second[2]
+
+
+@kernel
+def _row(array: Float, index: int) -> Vector:
+    return array[index, 0], array[index, 1], array[index, 2]
+
+
+@kernel
+def _to_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
+    """Return a vector of the frame of link j in the frame of link j + 1."""
+    a, b, c = vector
+    x = fixed[j, 0, 0] * a + fixed[j, 1, 0] * b + fixed[j, 2, 0] * c
+    y = fixed[j, 0, 1] * a + fixed[j, 1, 1] * b + fixed[j, 2, 1] * c
+    z = fixed[j, 0, 2] * a + fixed[j, 1, 2] * b + fixed[j, 2, 2] * c
+    return cosine * x + sine * y, cosine * y - sine * x, z
+
+
+@kernel
+def _from_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
+    """Return a vector of the frame of link j + 1 in the frame of link j."""
+    x = cosine * vector[0] - sine * vector[1]
+    y = sine * vector[0] + cosine * vector[1]
+    z = vector[2]
+    return (
+        fixed[j, 0, 0] * x + fixed[j, 0, 1] * y + fixed[j, 0, 2] * z,
+        fixed[j, 1, 0] * x + fixed[j, 1, 1] * y + fixed[j, 1, 2] * z,
+        fixed[j, 2, 0] * x + fixed[j, 2, 1] * y + fixed[j, 2, 2] * z,
+    )
+
+
+@kernel
+def _rigid_acceleration(linear: Vector, spin: Vector, turn: Vector, point: Vector) -> Vector:
+    """Return the acceleration of a point of a body with the acceleration `linear` of its origin.
+
+    The angular velocity is `spin`, and its derivative `turn`.
+    """
+    centripetal = _cross(spin, _cross(spin, point))
+    return _add(linear, _add(_cross(turn, point), centripetal))
+
+
+@compiled
+def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+    """Fill the torques or forces that move the joints as given, shape (J,), [N m] or [N].
+
+    Recursive Newton-Euler algorithm in the frames of the links (J. Y. S. Luh, M. W. Walker and R. P. C. Paul, On-line
+    computational scheme for mechanical manipulators, 1980), with gravity as an acceleration of the base, and with the
+    inertia of the motors and viscous friction.
+
+    Args:
+        chain: Chain of J joints.
+        q: Configuration, shape (J,), [rad] or [m].
+        v: Velocities, shape (J,).
+        a: Accelerations, shape (J,).
+        torque: Result, shape (J,).
+    """
+    n_joints = q.shape[0]
+    fixed = chain.rotation
+    # For each link: force, moment about the frame's origin, origin in the frame of the link before, cosine and sine.
+    work = np.empty((n_joints, 11))
+    spin = (0.0, 0.0, 0.0)
+    turn = (0.0, 0.0, 0.0)
+    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])
+    for j in range(n_joints):
+        slides = chain.sliding[j]
+        cosine, sine = 1.0, 0.0
+        origin = _row(chain.origin, j)
+        if slides:
+            shift = (q[j] * fixed[j, 0, 2], q[j] * fixed[j, 1, 2], q[j] * fixed[j, 2, 2])
+            origin = _add(origin, shift)
+        else:
+            cosine, sine = math.cos(q[j]), math.sin(q[j])
+        linear = _rigid_acceleration(linear, spin, turn, origin)
+        linear = _to_link(fixed, j, cosine, sine, linear)
+        spin = _to_link(fixed, j, cosine, sine, spin)
+        turn = _to_link(fixed, j, cosine, sine, turn)
+        if slides:
+            # A sliding joint adds its acceleration and that of Coriolis, 2 spin x v z.
+            linear = (linear[0] + 2.0 * v[j] * spin[1], linear[1] - 2.0 * v[j] * spin[0], linear[2] + a[j])
+        else:
+            # The axis z turns with the body: the derivative of v z is a z + v spin x z.
+            turn = (turn[0] + v[j] * spin[1], turn[1] - v[j] * spin[0], turn[2] + a[j])
+            spin = (spin[0], spin[1], spin[2] + v[j])
+        centre = _row(chain.centre, j)
+        x, y, z = _rigid_acceleration(linear, spin, turn, centre)
+        force = (chain.mass[j] * x, chain.mass[j] * y, chain.mass[j] * z)
+        inertia = chain.inertia[j]
+        momentum = _product(inertia, spin)
+        moment = _add(_product(inertia, turn), _cross(spin, momentum))
+        moment = _add(moment, _cross(centre, force))
+        work[j, 0], work[j, 1], work[j, 2] = force
+        work[j, 3], work[j, 4], work[j, 5] = moment
+        work[j, 6], work[j, 7], work[j, 8] = origin
+        work[j, 9], work[j, 10] = cosine, sine
+    force = (0.0, 0.0, 0.0)
+    moment = (0.0, 0.0, 0.0)
+    for j in range(n_joints - 1, -1, -1):
+        force = _add(force, (work[j, 0], work[j, 1], work[j, 2]))
+        moment = _add(moment, (work[j, 3], work[j, 4], work[j, 5]))
+        effort = force[2] if chain.sliding[j] else moment[2]
+        torque[j] = effort + chain.armature[j] * a[j] + chain.damping[j] * v[j]
+        # Force and moment that the link before must bear.
+        force = _from_link(fixed, j, work[j, 9], work[j, 10], force)
+        moment = _from_link(fixed, j, work[j, 9], work[j, 10], moment)
+        moment = _add(moment, _cross((work[j, 6], work[j, 7], work[j, 8]), force))
+
+
+@kernel
+def _product(matrix: Float, vector: Vector) -> Vector:
+    x, y, z = vector
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
+
+
+@compiled
+def _all_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation[n], origin[n])
+
+
+@compiled
+def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        tool_frame(chain, rotation, origin, tool_rotation[n], tool_origin[n])
+
+
+@compiled
+def _all_jacobians(chain: Chain, joints: Float, jacobian: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    tool_rotation, tool_origin = np.empty((3, 3)), np.empty(3)
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        tool_frame(chain, rotation, origin, tool_rotation, tool_origin)
+        tool_jacobian(chain, rotation, origin, tool_origin, jacobian[n])
+
+
+@compiled
+def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+    for n in range(q.shape[0]):
+        inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
+
+
+@compiled
+def _all_centres(chain: Chain, spheres: Spheres, joints: Float, centre: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        for group in range(spheres.link.shape[0]):
+            link = spheres.link[group]
+            for s in range(spheres.first[group], spheres.first[group + 1]):
+                x, y, z = transform(rotation, origin, link, spheres.centre[s])
+                centre[n, s, 0], centre[n, s, 1], centre[n, s, 2] = x, y, z
+
+
+def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...]]:
+    """Return checked configurations as (N, J), contiguous, and the leading axes."""
+    array = finite_array(name, joints, (..., len(chain.mass)))
+    return np.ascontiguousarray(array.reshape(-1, len(chain.mass))), array.shape[:-1]
+
+
+def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the pose of the tool.
+
+    Args:
+        chain: Chain of J joints.
+        joints: Configurations, shape (..., J), [rad] or [m].
+
+    Returns:
+        Position of the tool, shape (..., 3), [m], and its axes as the columns of a matrix, shape (..., 3, 3).
+    """
+    flat, batch = _flat("joints", chain, joints)
+    position, rotation = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
+    _all_tools(chain, flat, rotation, position)
+    return position.reshape(*batch, 3), rotation.reshape(*batch, 3, 3)
+
+
+def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the world frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins, (..., J + 1, 3), [m]."""
+    flat, batch = _flat("joints", chain, joints)
+    links = len(chain.mass) + 1
+    rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
+    _all_frames(chain, flat, rotation, origin)
+    return rotation.reshape(*batch, links, 3, 3), origin.reshape(*batch, links, 3)
+
+
+def jacobians(chain: Chain, joints: Float) -> Float:
+    """Return the derivatives of the tool's position and rotation vector by the joints, shape (..., 6, J), world axes."""
+    flat, batch = _flat("joints", chain, joints)
+    jacobian = np.empty((len(flat), 6, flat.shape[1]))
+    _all_jacobians(chain, flat, jacobian)
+    return jacobian.reshape(*batch, 6, flat.shape[1])
+
+
+def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
+    """Return the torques or forces of a motion by inverse dynamics, shape (..., J), [N m] or [N].
+
+    Args:
+        chain: Chain of J joints.
+        q: Configurations, shape (..., J), [rad] or [m].
+        v: Velocities of the same shape.
+        a: Accelerations of the same shape.
+    """
+    flat, batch = _flat("q", chain, q)
+    rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
+    accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))
+    torque = np.empty_like(flat)
+    _all_torques(chain, flat, rates, accelerations, torque)
+    return torque.reshape(*batch, flat.shape[1])
+
+
+def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:
+    """Return the world positions of all S spheres, shape (..., S, 3), [m]."""
+    flat, batch = _flat("joints", chain, joints)
+    centre = np.empty((len(flat), len(spheres.radius), 3))
+    _all_centres(chain, spheres, flat, centre)
+    return centre.reshape(*batch, len(spheres.radius), 3)

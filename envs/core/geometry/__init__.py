@@ -1,0 +1,1 @@
+"""Obstacles: shapes, packed arrays, signed distances and clearance."""

@@ -1,0 +1,86 @@
+"""Signed distance of a point from packed obstacles, and its gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+from viapoint.envs.core.geometry.kernels import inlined
+from viapoint.envs.core.geometry.obstacles import Obstacles
+from viapoint.envs.core.geometry.shapes import Distance, Shape, as_obstacles, local_distance
+
+
+@inlined
+def point_distance(
+    obstacles: Obstacles, scene: int, row: int, x: float, y: float, z: float, time: float, limit: float
+) -> float:
+    """Return the signed distance of a point from an obstacle, [m]; see :func:`point_distance_and_normal`."""
+    # The compiler leaves out the gradient, because nothing uses it.
+    return point_distance_and_normal(obstacles, scene, row, x, y, z, time, limit)[0]
+
+
+@inlined
+def point_distance_and_normal(
+    obstacles: Obstacles, scene: int, row: int, x: float, y: float, z: float, time: float, limit: float
+) -> Distance:
+    """Return the signed distance of a point from an obstacle, [m], and its gradient, the outward normal.
+
+    Args:
+        obstacles: Obstacles of N scenes.
+        scene: Index of the scene.
+        row: Index of the obstacle; absent ones are far away.
+        x: First coordinate of the point, [m].
+        y: Second coordinate, [m].
+        z: Third coordinate, [m].
+        time: Time since the obstacle was at its centre, [s].
+        limit: Distance beyond which any number between `limit` and the distance may be returned, [m].
+    """
+    centre, velocity, size = obstacles.centre, obstacles.velocity, obstacles.size
+    dx = x - centre[scene, row, 0] - time * velocity[scene, row, 0]
+    dy = y - centre[scene, row, 1] - time * velocity[scene, row, 1]
+    dz = z - centre[scene, row, 2] - time * velocity[scene, row, 2]
+    axes = obstacles.rotation
+    distance, nx, ny, nz = local_distance(
+        obstacles.kind[scene, row],
+        size[scene, row, 0],
+        size[scene, row, 1],
+        size[scene, row, 2],
+        obstacles.meshes,
+        obstacles.clouds,
+        axes[scene, row, 0, 0] * dx + axes[scene, row, 1, 0] * dy + axes[scene, row, 2, 0] * dz,
+        axes[scene, row, 0, 1] * dx + axes[scene, row, 1, 1] * dy + axes[scene, row, 2, 1] * dz,
+        axes[scene, row, 0, 2] * dx + axes[scene, row, 1, 2] * dy + axes[scene, row, 2, 2] * dz,
+        limit,
+    )
+    return (
+        distance,
+        axes[scene, row, 0, 0] * nx + axes[scene, row, 0, 1] * ny + axes[scene, row, 0, 2] * nz,
+        axes[scene, row, 1, 0] * nx + axes[scene, row, 1, 1] * ny + axes[scene, row, 1, 2] * nz,
+        axes[scene, row, 2, 0] * nx + axes[scene, row, 2, 1] * ny + axes[scene, row, 2, 2] * nz,
+    )
+
+
+def signed_distances(obstacles: Iterable[Shape | Mapping[str, Any]], points: Any, radius: Any = 0.0) -> Float:
+    """Return the signed distances of points, or spheres, from n obstacles at time 0, shape (..., n), [m].
+
+    Args:
+        obstacles: n shapes or dictionaries.
+        points: Shape (..., 3), [m].
+        radius: Radius of the spheres, which broadcasts with the leading axes, [m].
+
+    Example:
+        >>> from viapoint.envs.core.geometry.distance import signed_distances
+        >>> from viapoint.envs.core.geometry.shapes import Box, Sphere
+        >>> scene = [Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2)), Sphere(0.05, position=(0.5, 0.2, 0.27))]
+        >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
+        [0.02, 0.12]
+    """
+    points = finite_array("points", points, (..., 3))
+    shapes = as_obstacles(obstacles)
+    if not shapes:
+        return np.zeros((*points.shape[:-1], 0))
+    return np.stack([shape.distance(points, radius) for shape in shapes], axis=-1)

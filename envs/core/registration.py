@@ -1,0 +1,80 @@
+"""Ids of the environments and their keyword arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+
+EVENTS = ("horizon", "target", "course", "clearance")
+"""Events that end a decision in the tasks with replanning."""
+STEPWISE: dict[str, Any] = {"decide_at": "steps", "reward_weights": {"progress": 1.0}}
+"""Keyword arguments that turn a task of whole movements into one of control steps."""
+PANDA_OBSTACLES: dict[str, Any] = {"arm": "panda", "n_obstacles": (1, 16)}
+
+TASKS: dict[str, dict[str, Any]] = {
+    "viapoint/PlanarReach-v0": {"n_obstacles": 0},
+    "viapoint/PlanarObstacles-v0": {},
+    "viapoint/PlanarWholeArm-v0": {"whole_arm": True},
+    "viapoint/PandaReach-v0": {"arm": "panda", "n_obstacles": 0},
+    "viapoint/PandaObstacles-v0": PANDA_OBSTACLES,
+    "viapoint/Reach-v0": {"arm": "panda", "n_obstacles": 0},
+    "viapoint/Obstacles-v0": PANDA_OBSTACLES,
+    "viapoint/PlanarObstaclesStep-v0": STEPWISE,
+    "viapoint/PlanarWholeArmStep-v0": {"whole_arm": True, **STEPWISE},
+    "viapoint/PandaObstaclesStep-v0": {**PANDA_OBSTACLES, **STEPWISE},
+    "viapoint/PlanarTargetJump-v0": {"n_obstacles": 0, "n_jumps": (1, 2), "decide_at": EVENTS},
+    "viapoint/PlanarMovingObstacles-v0": {
+        "n_obstacles": (1, 4),
+        "moving_obstacles": True,
+        "decide_at": EVENTS,
+    },
+    "viapoint/PandaMovingObstacles-v0": {
+        "arm": "panda",
+        "n_obstacles": (1, 4),
+        "families": "clutter",
+        "moving_obstacles": True,
+        "decide_at": EVENTS,
+        "horizon": 0.5,
+    },
+}
+"""Ids and the keyword arguments in which they differ from the defaults; `Reach` and `Obstacles` are for other arms."""
+
+ENV_IDS = tuple(TASKS)
+"""All ids."""
+
+
+def register_all() -> None:
+    """Register every id with Gymnasium; a second call changes nothing."""
+    for env_id, kwargs in TASKS.items():
+        if env_id not in gym.registry:
+            gym.register(
+                env_id,
+                entry_point="viapoint.envs.core.env:ReachEnv",
+                vector_entry_point="viapoint.envs.core.vector_env:ReachVectorEnv",
+                kwargs=kwargs,
+            )
+
+
+def check_registered(env_id: str) -> None:
+    """Check that Gymnasium knows an id.
+
+    Raises:
+        ValueError: No such environment is registered; the message lists the ids of this package.
+    """
+    try:
+        gym.spec(env_id)
+    except gym.error.UnregisteredEnv as error:
+        raise ValueError(
+            f"there is no environment {env_id!r} ({error}); `import viapoint.envs` registers {', '.join(ENV_IDS)}"
+        ) from None
+
+
+def twin_of(env_id: str) -> str:
+    """Return the id of the same task with one decision for a movement; for most ids, the id itself.
+
+    Example:
+        >>> twin_of("viapoint/PlanarObstaclesStep-v0")
+        'viapoint/PlanarObstacles-v0'
+    """
+    return env_id.replace("Step-v", "-v") if env_id in TASKS else env_id

@@ -1,0 +1,1 @@
+"""Scenes: starts, goals and obstacles, and how they are drawn."""

@@ -1,0 +1,458 @@
+"""The environment: reaching around obstacles, N times and once."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import EzPickle, seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from viapoint.envs.common.types import Bool, Float, Int, Observation
+from viapoint.envs.common.validation import (
+    as_given,
+    checked_actions,
+    finite_array,
+    masked_rows,
+    reset_options,
+    seeds_of,
+    whole_number,
+)
+from viapoint.envs.core.arms.arm import Arm
+from viapoint.envs.core.episodes import Decision, Episodes, History
+from viapoint.envs.core.events import Trigger
+from viapoint.envs.core.outcome import Rollout
+from viapoint.envs.core.plans import Plan, SpaceName, Timing
+from viapoint.envs.core.rendering.renderer import RENDER_MODES, EpisodeRenderer
+from viapoint.envs.core.rewards import RewardWeights
+from viapoint.envs.core.scenes.options import draw_given
+from viapoint.envs.core.scenes.scene import Scenes, check_jumps
+from viapoint.envs.core.task import END, Task
+
+SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+LEAST_SHARE = 4
+"""Fewest environments for which a thread is worth its while."""
+
+
+class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
+    """Reaching around obstacles by via-points, `num_envs` times.
+
+    When an episode ends, the next one begins as `autoreset_mode` says. With same-step autoreset, the default, the
+    returned observation is the first one of the new episode; the last one of the old is in `info["final_obs"]`, and its
+    info in `info["final_info"]` and, as that of the other environments, at the top level of `info`.
+
+    Args:
+        num_envs: Number of environments N.
+        arm: Arm that moves, a record or its name.
+        space: Space in which movements are planned: `hand` or `joints`; by default that of the arm.
+        n_via: Number of via-points of an action.
+        timing: `optimal` passage times, or `learned` ones as part of the action.
+        duration_range: Shortest and longest movement: in hand space [s], in joint space multiples of the shortest
+            movement that the velocity limits allow.
+        n_obstacles: Number of obstacles, or the fewest and the most.
+        shapes: Shapes that obstacles may have; by default those of the families.
+        families: Names of scene families that are drawn; a repeated name is drawn more often.
+        whole_arm: True if obstacles in the plane are so tall that the links must clear them, too.
+        moving_obstacles: True if the obstacles move.
+        n_jumps: Number of jumps of the target, or the fewest and the most.
+        decide_at: `end`, one decision for a movement; `steps`, a velocity in every control step; or events that end a
+            decision before the goal, some of `horizon`, `target`, `course`, `clearance`.
+        horizon: Time after which a decision ends, [s].
+        margin: Predicted clearance below which a decision ends, [m].
+        control_step: Time for which an action holds with `decide_at="steps"`, [s].
+        reward_weights: Some or all of the weights of :class:`~viapoint.envs.core.rewards.RewardWeights`.
+        autoreset_mode: `SameStep`, `NextStep` or `Disabled`.
+        render_mode: `human`, `rgb_array` or `rgb_array_list`.
+        width: Width of a rendered frame, [pixels].
+        height: Height of a rendered frame, [pixels].
+        threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=16)
+        >>> observation, _ = envs.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = envs.step(0.1 * envs.action_space.sample())
+        >>> reward.shape
+        (16,)
+    """
+
+    metadata = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        arm: Arm | str = "planar",
+        space: SpaceName | None = None,
+        n_via: int = 1,
+        timing: Timing = "optimal",
+        duration_range: tuple[float, float] | None = None,
+        n_obstacles: int | tuple[int, int] = (1, 5),
+        shapes: str | Sequence[str] | None = None,
+        families: str | Sequence[str] | None = None,
+        whole_arm: bool = False,
+        moving_obstacles: bool = False,
+        n_jumps: int | tuple[int, int] = 0,
+        decide_at: str | Sequence[Trigger] = END,
+        horizon: float = 0.3,
+        margin: float = 0.02,
+        control_step: float = 0.04,
+        reward_weights: RewardWeights | Mapping[str, float] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        threads: int = 0,
+    ) -> None:
+        given = as_given({name: value for name, value in locals().items() if name not in ("self", "__class__")})
+        EzPickle.__init__(self, **given)
+        own = ("num_envs", "autoreset_mode", "render_mode", "width", "height", "threads")
+        self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
+        """Task of an episode: what an agent may compute with before it moves."""
+        self.num_envs = whole_number("num_envs", num_envs, 1)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**SINGLE_METADATA, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = render_mode
+        number = whole_number("threads", threads, 0) or os.cpu_count() or 1
+        number = max(min(number, self.num_envs // LEAST_SHARE), 1)
+        self._shares = np.array_split(np.arange(self.num_envs), number)
+        self._episodes = [Episodes(self.task, len(share)) for share in self._shares]
+        self._renderers = [
+            EpisodeRenderer(episodes, row, render_mode, width, height, SINGLE_METADATA["render_fps"])
+            for episodes in self._episodes
+            for row in range(len(episodes.begun))
+        ]
+        self._samplers = [self.task.sampler() for _ in self._shares]
+        self._pool: ThreadPoolExecutor | None = None
+        self.generators: list[np.random.Generator] = []
+        """Random generators of the environments' scenes; empty before the first reset."""
+        self._running = False
+        self._over = np.zeros(self.num_envs, bool)
+        self.terminated = np.ones(self.num_envs, bool)
+        """True where the last step terminated the episode, shape (num_envs,)."""
+        self.truncated = np.zeros(self.num_envs, bool)
+        """True where the last step truncated the episode, shape (num_envs,)."""
+        self.action_names = self.task.action_names
+        self.single_action_space = spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
+        self.single_observation_space = self.task.observation.space()
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    # What happened
+
+    @property
+    def arm(self) -> Arm:
+        """Arm that moves."""
+        return self.task.arm
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo model."""
+        return self._episodes[0].simulator.model
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far, all environments together."""
+        return sum(each.simulator.physics_steps for each in self._episodes)
+
+    @property
+    def scenes(self) -> Scenes | None:
+        """Scenes of the running episodes; None before the first reset."""
+        if not self._running:
+            return None
+        return Scenes.together([each.scenes for each in self._episodes if each.scenes is not None])
+
+    @property
+    def last_rollout(self) -> tuple[Rollout, ...]:
+        """Last movements at every physics step, one for each environment; empty before the first reset."""
+        if not self._running:
+            return ()
+        return tuple(
+            each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun))
+        )
+
+    @property
+    def last_plan(self) -> Plan | None:
+        """Last decisions as via-points and durations; None before the first, and where the arm is steered."""
+        plans = [each.last_plan for each in self._episodes if each.last_plan is not None]
+        if len(plans) < len(self._episodes):
+            return None
+        return Plan(*(np.concatenate(parts) for parts in zip(*plans, strict=True)))
+
+    @property
+    def last_plans(self) -> tuple[History, ...]:
+        """All plans of the running episodes with the times at which they began, [s]."""
+        return tuple(list(history) for each in self._episodes for history in each.history)
+
+    # Episodes
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
+            options: `start`, `goal` and `obstacles` set up a given scene, see
+                :func:`~viapoint.envs.core.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
+                environments to reset, all others keep their episodes.
+
+        Raises:
+            ValueError: A given scene is impossible; the environments are unchanged.
+        """
+        options = reset_options(options)
+        rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
+        generators, first_seed = self._seeded(seed, rows)
+        # Nothing changes before all scenes are there: impossible ones raise an error.
+        tried = [copy.deepcopy(generators[i]) for i in rows]
+        scenes = draw_given(options, self._samplers[0], tried)
+        for i, generator in zip(rows, tried, strict=True):
+            generators[i] = generator
+        self.generators = generators
+        self._np_random, self._np_random_seed = generators[0], first_seed
+        self._start(rows, scenes)
+        for flags in (self.terminated, self.truncated, self._over):
+            flags[rows] = False
+        return self.observe(), {}
+
+    def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
+        """Draw the scenes of the first environment from a generator, which was made from `seed`."""
+        self._np_random, self._np_random_seed = generator, seed
+
+    def step(self, actions: Any) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
+        """Make one decision in each environment; where an episode ends, the next begins as `autoreset_mode` says.
+
+        Args:
+            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
+        """
+        self._check_running()
+        over = self._over
+        if self.autoreset_mode == AutoresetMode.DISABLED and over.any():
+            raise gym.error.ResetNeeded(
+                f"episode {int(over.argmax())} is over: call reset(options={{'reset_mask': ...}}) before step()"
+            )
+        actions = checked_actions(actions, self.num_envs, self.action_names)
+        decision = self._joined(
+            self._each(lambda episodes, share: episodes.decide(actions[share], ~over[share]))
+        )
+        if over.any():  # with next-step autoreset, the next episodes begin instead
+            self._restart(over)
+            for part in (decision.reward, *decision.info.values()):
+                part[over] = 0
+            self.terminated[over] = False
+            self.truncated[over] = False
+            decision = decision._replace(observation=self.observe())
+        return self._as_step(decision, ~over)
+
+    def execute_actions(self, actions: Any) -> Decision:
+        """Make one decision in each environment and execute it until it ends, without a reset.
+
+        `terminated` and `truncated` tell which episodes ended; these must not be continued.
+        """
+        self._check_running()
+        actions = checked_actions(actions, self.num_envs, self.action_names)
+        decision = self._joined(self._each(lambda episodes, share: episodes.decide(actions[share])))
+        self._show()
+        return decision
+
+    def execute_plan(self, plan: Plan) -> Decision:
+        """Execute one plan in each environment, without a reset.
+
+        Args:
+            plan: Movements of all environments, from the present references to the goals.
+
+        Raises:
+            ValueError: A plan begins elsewhere.
+        """
+        self._check_running()
+        whole = Plan(np.asarray(plan.waypoints), np.asarray(plan.durations))
+        if len(whole.waypoints) != self.num_envs:
+            raise ValueError(f"plan must be {self.num_envs} movements, got {len(whole.waypoints)}")
+        return self._joined(self._each(lambda episodes, share: episodes.execute(whole.take(share))))
+
+    def move_goals(self, goals: Any) -> Observation:
+        """Move the targets of the running episodes, which jump no more, and return the new observations.
+
+        The next decision revises the plans without a jump of position, velocity or acceleration.
+
+        Args:
+            goals: New targets, shape (num_envs, 2) [m] in hand space, (num_envs, J) [rad] in joint space.
+
+        Raises:
+            ValueError: A target is out of reach; the episodes are unchanged.
+        """
+        scenes, space = self._check_running(), self.task.space
+        goals = finite_array("goals", goals, (self.num_envs, space.dimension))
+        inside = space.inside(goals)
+        if not inside.all():
+            row = int(inside.argmin())
+            raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
+        joints = space.joints(goals)
+        check_jumps(scenes._replace(goal=joints), self.arm)
+        self._each(lambda episodes, share: episodes.move_goals(joints[share]))
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """Return the present observations."""
+        parts = [each.observe() for each in self._episodes]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def state(self) -> dict[str, Any]:
+        """Return scenes, random generators and running episodes as values and arrays for :meth:`restore`.
+
+        Example:
+            >>> import gymnasium as gym
+            >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=2)
+            >>> first, _ = envs.reset(seed=0)
+            >>> state = envs.unwrapped.state()
+            >>> _ = envs.step(envs.action_space.sample())
+            >>> envs.unwrapped.restore(state)
+            >>> (envs.unwrapped.observe()["goal"] == first["goal"]).all()
+            np.True_
+        """
+        self._check_running()
+        return {
+            "generators": [generator.bit_generator.state for generator in self.generators],
+            "episodes": [each.state() for each in self._episodes],
+            "over": self._over.copy(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of environments of the same task, number and number of threads."""
+        if not self.generators:
+            self.generators = [np.random.default_rng() for _ in range(self.num_envs)]
+            self._np_random = self.generators[0]
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+        for each, part in zip(self._episodes, state["episodes"], strict=True):
+            each.restore(part)
+        self._over[:] = state["over"]
+        self._running = True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a pickle holds: the arguments, and the running episodes."""
+        return {**EzPickle.__getstate__(self), "running": self.state() if self._running else None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continue the running episodes of a pickle."""
+        running = state.pop("running", None)
+        EzPickle.__setstate__(self, state)
+        if running is not None:
+            self.restore(running)
+
+    def render(self) -> Any:
+        """Render the last movement of each environment in the render mode; after a reset, the scenes."""
+        self._check_running()
+        if self.render_mode is None:
+            modes = ", ".join(RENDER_MODES)
+            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
+            return None
+        if self.render_mode == "human":
+            self._renderers[0].render()
+            return None
+        return tuple(renderer.render() for renderer in self._renderers)
+
+    def _show(self) -> None:
+        """Show a whole episode in the window."""
+        if self.render_mode == "human" and (self.terminated | self.truncated)[0]:
+            self._renderers[0].render()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop worker threads and close windows."""
+        for renderer in self._renderers:
+            renderer.close()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    # Inside
+
+    def _each(self, job: Callable[[Episodes, Int], Any]) -> list[Any]:
+        """Return the results of a job for the episodes of each thread, which run side by side."""
+        if len(self._shares) == 1:
+            return [job(self._episodes[0], self._shares[0])]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(len(self._shares), thread_name_prefix="viapoint")
+        return list(self._pool.map(job, self._episodes, self._shares))
+
+    def _joined(self, parts: list[Decision]) -> Decision:
+        """Return the decisions of all environments together."""
+        observation = {
+            name: np.concatenate([part.observation[name] for part in parts]) for name in parts[0].observation
+        }
+        info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+        self.terminated = np.concatenate([part.terminated for part in parts])
+        self.truncated = np.concatenate([part.truncated for part in parts])
+        reward = np.concatenate([part.reward for part in parts])
+        return Decision(observation, reward, self.terminated, self.truncated, info)
+
+    def _as_step(self, decision: Decision, active: Bool) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
+        """Return the result of `step`, after the next episodes have begun where that is due."""
+        observation, info = decision.observation, decision.info
+        ended = self.terminated | self.truncated
+        self._over = ended.copy()
+        infos = dict(info)
+        for name in info:
+            infos[f"_{name}"] = active.copy()
+        self._show()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
+            self._restart(ended)
+            self._over[:] = False
+            last = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                last[i] = {name: part[i] for name, part in observation.items()}
+            final_info = {}
+            for name, value in info.items():
+                final_info[name] = np.where(ended, value, np.zeros_like(value))
+                final_info[f"_{name}"] = ended.copy()
+            infos |= {"final_obs": last, "_final_obs": ended.copy()}
+            infos |= {"final_info": final_info, "_final_info": ended.copy()}
+            observation = self.observe()
+        return observation, decision.reward, self.terminated.copy(), self.truncated.copy(), infos
+
+    def _restart(self, ended: Bool) -> None:
+        """Draw the next scenes of some environments, and start them."""
+
+        def restart(episodes: Episodes, share: Int) -> None:
+            rows = np.flatnonzero(ended[share])
+            if rows.size:
+                sampler = self._samplers[self._episodes.index(episodes)]
+                scenes = sampler([self.generators[share[row]] for row in rows])
+                episodes.start(rows, scenes, keep=True)
+
+        self._each(restart)
+
+    def _start(self, rows: Int, scenes: Scenes) -> None:
+        """Start given scenes in some environments."""
+        for episodes, share in zip(self._episodes, self._shares, strict=True):
+            inside = np.isin(rows, share)
+            if inside.any():
+                episodes.start(rows[inside] - share[0], scenes.take(inside))
+        self._running = True
+
+    def _check_running(self) -> Scenes:
+        """Return the running scenes, or raise an error before the first reset."""
+        scenes = self.scenes
+        if scenes is None:
+            raise gym.error.ResetNeeded("the episodes have not begun: call reset() before step()")
+        return scenes
+
+    def _seeded(
+        self, seed: int | Sequence[int | None] | None, rows: Int
+    ) -> tuple[list[np.random.Generator], int | None]:
+        """Return the generators of the next episodes, new where a seed is given, and the seed of the first."""
+        seeds, first_seed = seeds_of(seed, self.num_envs), self._np_random_seed
+        generators: list[Any] = list(self.generators) or [None] * self.num_envs
+        generators[0] = self._np_random
+        for i in rows:
+            if generators[i] is None or seeds[i] is not None:
+                generators[i], used = seeding.np_random(seeds[i])
+                first_seed = used if i == 0 else first_seed
+        return generators, first_seed

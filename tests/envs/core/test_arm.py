@@ -1,0 +1,97 @@
+"""Arms track movements of their joints, and say clearly what they are and are not."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from viapoint import primitives
+from viapoint.envs.core.arms.arm import arm_from_xml
+from viapoint.envs.core.arms.registry import arm_of, register_arm
+
+
+@pytest.mark.parametrize("name", ["planar", "panda"])
+@pytest.mark.parametrize("stride", [1, 4])
+def test_movements_at_half_of_the_speed_limits_are_tracked_within_a_milliradian(name, stride):
+    arm = arm_of(name)
+    rng = np.random.default_rng(0)
+    low, high = arm.joint_range.T
+    limit = np.minimum(arm.velocity_limit, 3.0)
+    model = arm.compile(0)
+    data = mujoco.MjData(model)
+    for _ in range(8):
+        start, goal = rng.uniform(low, high, (2, len(low)))
+        duration = float((1.875 * np.abs(goal - start) / (0.5 * limit)).max())
+        movement = primitives.point_to_point(start, goal, duration)
+        time = arm.timestep * np.arange(round(duration / arm.timestep) + 1)
+        motion = [part[None] for part in movement.sample(time)]
+        controls = arm.controls(*motion, stride)[0]
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = start
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        error = 0.0
+        for k in range(len(time) - 1):
+            data.ctrl[:] = controls[k]
+            mujoco.mj_step(model, data)
+            error = max(error, np.abs(data.qpos - motion[0][0, k + 1]).max())
+        assert error < 1e-3
+
+
+def test_built_in_arms_stick_out_by_five_millimetres_at_most_and_list_what_is_left_out():
+    arm = arm_of("panda")
+    assert arm.excess <= 0.005
+    assert {pair.reason for pair in arm.left_out} <= {"consecutive links", "in contact at home"}
+    compared = {frozenset((arm.group_names[a], arm.group_names[b])) for a, b in arm.spheres.pairs}
+    assert frozenset(("link0", "gripper")) in compared
+    assert frozenset(("link2", "gripper")) in compared
+
+
+NEEDLE = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="table" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+    <body name="a"><joint name="one" axis="0 0 1" range="-2 2"/>
+      <geom type="{kind}" {size} mass="1"/>
+      <body name="b" pos="0.3 0 0"><joint name="two" axis="0 0 1" range="-2 2"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1"/>
+        <body name="c" pos="0.3 0 0"><joint name="three" axis="0 0 1" range="-2.9 2.9"/>
+          <geom type="capsule" fromto="{gap} 0 0 {gap} 0.05 0" size="0.02" mass="1"/><site name="tip"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def small(kind="capsule", size='fromto="0 0 0 0.2 0 0" size="0.02"', gap=0.1):
+    xml = NEEDLE.format(kind=kind, size=size, gap=gap)
+    limits = {"velocity_limit": (2.0,) * 3, "torque_limit": (50.0,) * 3}
+    return arm_from_xml("small", xml, joints=("one", "two", "three"), tool="tip", home=(0.0, 0.0, 0.0), **limits)
+
+
+def test_collision_geoms_of_other_shapes_are_refused():
+    with pytest.raises(ValueError, match="capsules or spheres"):
+        small("box", 'size="0.1 0.1 0.1"')
+
+
+def test_pairs_that_are_near_at_home_are_compared_and_pairs_in_contact_are_left_out():
+    """The third link comes within a millimetre of the first at home, or touches it."""
+    near = small(size='fromto="0 0 0 0.2 0 0" size="0.02"', gap=-0.3589)
+    assert [(near.group_names[a], near.group_names[b]) for a, b in near.spheres.pairs] == [("a", "c")]
+    touching = small(gap=-0.37)
+    reasons = sorted(pair.reason for pair in touching.left_out)
+    assert reasons == ["consecutive links", "consecutive links", "in contact at home"]
+
+
+def test_arms_are_found_by_their_names():
+    arm = small()
+    register_arm(arm)
+    assert arm_of("small") is arm
+    assert arm_of(arm) is arm
+    with pytest.raises(ValueError, match="small"):
+        arm_of("large")
+    with pytest.raises(TypeError):
+        register_arm("small")
+    with pytest.raises(ValueError, match="built-in"):
+        register_arm(arm_of("panda"))

@@ -1,0 +1,1 @@
+"""Planning with known obstacles: candidates, compiled checks, and search."""

@@ -1,0 +1,96 @@
+"""Candidate actions that cover the action space evenly, the same ones in every scene."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from viapoint.envs.common.types import Single
+
+if TYPE_CHECKING:
+    from viapoint.envs.core.task import Task
+
+
+OBSERVED = "candidates"
+"""Part of an observation that holds the margins of candidates, see
+:class:`~viapoint.training.planning.observe_candidates.ObserveCandidates`."""
+
+
+def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
+    """Return candidate actions, shape (number, m), of which the first is the zero action.
+
+    From rest, clearance and reach do not depend on the duration. So all candidates but the first have the duration of
+    the greatest reward, and only their via-points and the split of their duration differ.
+
+    Args:
+        task: Task of the environment.
+        number: Number of candidates, 1 or more.
+        replanning: True where a movement may be under way; then candidates differ in their duration, too.
+    """
+    size, at = task.action.size, task.n_via * task.action.dimension
+    if replanning or not at:
+        return sobol_actions(number, size)
+    return _with_duration(number, size, at, best_duration(task))
+
+
+@functools.cache
+def _with_duration(number: int, size: int, at: int, duration: float) -> Single:
+    """Return Sobol points in all components but one, which is the duration."""
+    actions: Single = np.insert(sobol_actions(number, size - 1), at, np.float32(duration), axis=1)
+    actions[0] = 0.0
+    actions.flags.writeable = False
+    return actions
+
+
+def best_duration(task: Task) -> float:
+    """Return the duration component of the greatest reward of a straight movement.
+
+    With T relative to the duration of the zero action, the reward depends on it by
+
+        - w_smoothness log(1 + T^-5) - w_duration T,
+
+    as the jerk cost of a path scales with T^-5.
+    """
+    component = np.linspace(-1.0, 1.0, 401)
+    relative = np.exp(component * task.action.log_half_range)
+    weights = task.weights
+    reward = -weights.smoothness * np.log1p(relative**-5.0) - weights.duration * relative
+    return float(component[reward.argmax()])
+
+
+@functools.cache
+def sobol_actions(number: int, size: int) -> Single:
+    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
+    points = 2.0 * sobol_points(max(number - 1, 1), size)[: number - 1] - 1.0
+    actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
+    actions.flags.writeable = False
+    return actions
+
+
+@functools.cache
+def normal_steps(number: int, size: int, seed: int) -> Single:
+    """Return evenly spread steps of the standard normal distribution, shape (number, size)."""
+    import torch
+
+    engine = _sobol_engine(size, scramble=True, seed=seed)
+    uniform = engine.draw(number).clamp(1e-4, 1.0 - 1e-4)
+    steps: Single = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
+    steps.flags.writeable = False
+    return steps
+
+
+def sobol_points(number: int, size: int) -> Single:
+    """Return points of the Sobol sequence in the unit cube, shape (number, size), without its corner and its middle."""
+    engine = _sobol_engine(size)
+    engine.fast_forward(2)
+    points: Single = engine.draw(number).numpy()
+    return points
+
+
+def _sobol_engine(size: int, **kwargs: Any) -> Any:
+    import torch
+
+    kind: Any = torch.quasirandom.SobolEngine
+    return kind(size, **kwargs)

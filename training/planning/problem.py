@@ -1,0 +1,202 @@
+"""What a planner knows: start, goal and obstacles of B scenes, and the plans that actions stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Int
+from viapoint.envs.core.arms.chain import Spheres
+from viapoint.envs.core.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
+from viapoint.envs.core.outcome import SETTLING, straight_jerk_cost
+from viapoint.envs.core.replanning import NEARBY, revised_waypoints
+from viapoint.envs.core.scenes.scene import Scenes
+from viapoint.envs.core.task import Task
+from viapoint.training.planning.movements import (
+    MovementTable,
+    Setting,
+    movement_table,
+    shortest_durations,
+    table_costs,
+)
+
+NEAR = 0.05
+"""Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
+
+
+class Problem(NamedTuple):
+    """B planning problems in coordinates of the task's space."""
+
+    start: Float
+    """Present reference, shape (B, D)."""
+    velocity: Float
+    """Its velocity, shape (B, D)."""
+    acceleration: Float
+    """Its acceleration, shape (B, D)."""
+    goal: Float
+    """Goal, shape (B, D)."""
+    obstacles: Obstacles
+    """Obstacles now, with their velocities."""
+    vias: Float | None = None
+    """Via-points of the plan of a zero action, shape (B, K, D); None where no plan is under way."""
+    remaining: Float | None = None
+    """Remaining time of this plan, shape (B,), [s]."""
+    time_left: Float | None = None
+    """Time until the end of the episode, shape (B,), [s]."""
+
+    @classmethod
+    def of_observation(cls, observation: Mapping[str, Any], task: Task) -> Problem:
+        """Return the problems of B observations, parts of shape (B, .) each."""
+        parts = {name: np.asarray(part, dtype=np.float64) for name, part in observation.items()}
+        number = len(parts["joints"])
+        in_joints = task.space_name == "joints"
+        goal = parts["goal_joints"] if in_joints else parts["goal"][:, :2]
+        if "obstacles" in parts:
+            rows = task.observation.rows(parts["obstacles"])
+            obstacles = obstacles_from_rows(rows, task.shapes)
+        else:
+            obstacles = no_obstacles(number)
+        if not task.replanning:
+            start = parts["joints"] if in_joints else parts["hand"][:, :2]
+            rest = np.zeros_like(start)
+            return cls(start, rest, rest, goal, obstacles)
+        return cls(
+            start=parts["command"],
+            velocity=parts["velocity"],
+            acceleration=parts["acceleration"],
+            goal=goal,
+            obstacles=obstacles,
+            vias=parts.get("via", np.zeros((number, 0))).reshape(number, task.n_via, task.space.dimension),
+            remaining=parts["remaining"][:, 0],
+            time_left=parts["time_left"][:, 0],
+        )
+
+    @classmethod
+    def of_scenes(cls, scenes: Scenes, task: Task) -> Problem:
+        """Return the problems of scenes at their beginning."""
+        start, goal = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
+        rest = np.zeros_like(start)
+        return cls(start, rest, rest, goal, scenes.obstacles)
+
+    def take(self, rows: Any) -> Problem:
+        """Return some of the problems, by indices, mask or slice."""
+        return Problem(*(None if part is None else _some(part, rows) for part in self))
+
+
+class Moves(NamedTuple):
+    """Plans of H actions in each of B problems, as products of a table."""
+
+    offsets: Float
+    """Offsets from the start, see :mod:`viapoint.training.planning.movements`, shape (B, H, K + 3, D)."""
+    times: Int
+    """Indices of the passage times, shape (B, H)."""
+    duration: Float
+    """Durations, shape (B, H), [s]."""
+    rough: Float
+    """Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)."""
+    relative: Float
+    """Durations relative to that of the zero action, shape (B, H)."""
+
+
+def moves_of(task: Task, problem: Problem, actions: Float) -> Moves:
+    """Return the plans of actions of shape (B, H, m)."""
+    layout, table = task.action, movement_table(task.n_via)
+    start, goal = problem.start[:, None], problem.goal[:, None]
+    actions = np.asarray(actions, dtype=np.float64)
+    batch = actions.shape[:2]
+    columns, dimension = task.n_via + 3, layout.dimension
+    offsets = np.zeros((*batch, columns, dimension))
+    if problem.remaining is None or problem.vias is None:
+        waypoints = layout.waypoints(actions, np.broadcast_to(start, (*batch, dimension)), goal)
+        duration = layout.centre * np.exp(actions[..., task.n_via * dimension] * layout.log_half_range)
+    else:
+        waypoints, duration = revised_waypoints(
+            layout,
+            _line(problem)[:, None],
+            np.broadcast_to(start, (*batch, dimension)),
+            problem.vias[:, None],
+            np.broadcast_to(goal, (*batch, dimension)),
+            problem.remaining[:, None],
+            actions,
+        )
+        offsets[..., -2, :] = problem.velocity[:, None] * duration[..., None]
+        offsets[..., -1, :] = problem.acceleration[:, None] * duration[..., None] ** 2
+    offsets[..., : task.n_via + 1, :] = waypoints[..., 1:, :] - waypoints[..., :1, :]
+    flat = offsets.reshape(-1, columns, dimension)
+    times, cost = table_costs(table, flat)
+    if layout.space == "joints" and problem.remaining is None:
+        limits = np.array(layout.rate_limit)
+        duration = duration * shortest_durations(table, times, flat, limits).reshape(batch)
+    length = np.maximum(norm(problem.goal - problem.start), NEARBY[layout.space])
+    whole = layout.zero_duration(problem.start, problem.goal)
+    straight = straight_jerk_cost(length, whole)[:, None]
+    rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
+    return Moves(offsets, times.reshape(batch), duration, rough, duration / whole[:, None])
+
+
+def worth_of(task: Task, problem: Problem, moves: Moves) -> Float:
+    """Return the reward of plans that succeed, without the term for clearance, shape (B, H)."""
+    weights = task.weights
+    worth = weights.success - weights.smoothness * moves.rough - weights.duration * moves.relative
+    if problem.time_left is not None:
+        late = moves.duration + SETTLING > problem.time_left[:, None]
+        worth = worth - np.where(late, weights.success + weights.goal_error, 0.0)
+    return np.asarray(worth)
+
+
+def setting_of(task: Task, obstacles: Obstacles) -> Setting:
+    """Return arm and space for compiled functions; without spheres that no obstacle can come near."""
+    arm = task.arm
+    spheres, alone = arm.spheres, False
+    if task.space.of_hand:
+        spheres = _within_height(spheres, arm.chain.origin[:, 2], obstacles)
+        alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
+    return Setting(arm.chain, spheres, arm.joint_range, task.space.of_hand, alone)
+
+
+def table_of(task: Task) -> MovementTable:
+    """Return the table of movements of a task."""
+    return movement_table(task.n_via)
+
+
+def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Spheres:
+    """Return the groups of spheres of an arm in the plane that are near the heights of some obstacle."""
+    centre, half = bounding_boxes(obstacles)
+    tall = (np.abs(obstacles.rotation[..., 2, :]) * half).sum(axis=-1)
+    present = obstacles.present
+    low = float((centre[..., 2] - tall)[present].min(initial=1e9)) - NEAR
+    high = float((centre[..., 2] + tall)[present].max(initial=-1e9)) + NEAR
+    level = np.concatenate(([0.0], np.cumsum(heights)))
+    kept = []
+    for group, link in enumerate(spheres.link):
+        some = slice(spheres.first[group], spheres.first[group + 1])
+        place = level[link] + spheres.centre[some, 2]
+        if ((place + spheres.radius[some] > low) & (place - spheres.radius[some] < high)).any():
+            kept.append(group)
+    if not kept:  # one group at least, so that no table is empty
+        kept = [len(spheres.link) - 1]
+    rows = np.concatenate([np.arange(spheres.first[group], spheres.first[group + 1]) for group in kept])
+    counts = [spheres.first[group + 1] - spheres.first[group] for group in kept]
+    return Spheres(
+        centre=spheres.centre[rows],
+        radius=spheres.radius[rows],
+        first=np.concatenate(([0], np.cumsum(counts))),
+        link=spheres.link[kept],
+        ball_centre=spheres.ball_centre[kept],
+        ball_radius=spheres.ball_radius[kept],
+        pairs=np.zeros((0, 2), np.int64),
+    )
+
+
+def _line(problem: Problem) -> Float:
+    """Return the line of the offsets' frame, shape (B, D)."""
+    line = problem.goal - problem.start
+    return np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
+
+
+def _some(part: Any, rows: Any) -> Any:
+    """Return some rows of an array or of obstacles."""
+    return part.take(rows) if isinstance(part, Obstacles) else part[rows]

@@ -1,0 +1,239 @@
+"""Search for a movement with computed geometry, without a network and without simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from viapoint.envs.common.types import Float, Single
+from viapoint.envs.common.validation import whole_number
+from viapoint.envs.core.geometry.clearance import memory
+from viapoint.envs.core.geometry.compiled import compiled
+from viapoint.envs.core.geometry.obstacles import Obstacles
+from viapoint.envs.core.plans import Plan
+from viapoint.envs.core.registration import check_registered
+from viapoint.envs.core.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.core.scenes.options import draw_given
+from viapoint.envs.core.task import Task
+from viapoint.training.planning.candidates import candidate_actions, sobol_actions
+from viapoint.training.planning.movements import MovementTable, Setting, least_clearance
+from viapoint.training.planning.problem import Moves, Problem, moves_of, setting_of, table_of, worth_of
+
+CLEARANCE_MARGIN = 0.001
+"""Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
+KEEP_BONUS = 0.1
+"""Reward by which another plan must be better than the present one, as each change of plan costs jerk."""
+HORIZONS = (1e9, 1.2, 0.9, 0.6, 0.3)
+"""Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course."""
+N_CENTRES = 4
+"""Number of best candidates that a round of refinement samples around."""
+SPREAD = 0.25
+"""Half the side of the cube that the first round samples around each centre; each further round halves it."""
+INFEASIBLE = -1e6
+"""Merit of plans that are not clear, less their depth."""
+
+
+class GeometrySearch:
+    """Planner that checks a fixed set of actions with computed geometry and takes the best one.
+
+    The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. They are checked
+    in the order of the reward that they would have without obstacles, until no other one can be better. Where nothing
+    moves, clearance does not depend on the duration; then all candidates but the first have the duration of the greatest
+    reward.
+
+    When replanning, the present plan is kept as long as it is clear and no other plan is better by KEEP_BONUS. Where no
+    plan is clear to its end, the search takes one that is clear for the longest of HORIZONS.
+
+    Args:
+        task: Task of an environment, or id of a registered environment.
+        n_checks: Candidates checked before any refinement, 1 or more.
+        refinements: Rounds in which `per_round` more candidates are checked around the best ones.
+        per_round: Candidates of each round.
+        **kwargs: Arguments of the environment, if an id is given.
+
+    Raises:
+        ValueError: A number is out of range.
+
+    Example:
+        >>> from viapoint.envs import Cylinder
+        >>> from viapoint.training import GeometrySearch
+        >>> search = GeometrySearch("viapoint/PlanarObstacles-v0", n_checks=64)
+        >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), [Cylinder(0.03, 0.04, position=(-0.05, 0.35, 0.0))])
+        >>> plan.waypoints.shape, plan.durations.shape
+        ((3, 2), (2,))
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        n_checks: int = 512,
+        *,
+        refinements: int = 0,
+        per_round: int = 64,
+        **kwargs: Any,
+    ) -> None:
+        self.task = registered_task(task, **kwargs) if isinstance(task, str) else task
+        self.n_checks = whole_number("n_checks", n_checks, 1)
+        self.refinements = whole_number("refinements", refinements, 0)
+        self.per_round = whole_number("per_round", per_round, 1)
+
+    @property
+    def total_checks(self) -> int:
+        """Number of candidates that are checked for one decision."""
+        return self.n_checks + self.refinements * self.per_round
+
+    @property
+    def name(self) -> str:
+        """Name in tables of results."""
+        return f"search, {self.total_checks} checks"
+
+    def decide(self, observation: Mapping[str, Any], scenes: Any = None) -> Float:
+        """Return the best action of each of B observations, shape (B, m).
+
+        Args:
+            observation: Parts of shape (B, .) each.
+            scenes: Unused; part of the protocol :class:`~viapoint.training.planners.baselines.Method`.
+        """
+        return self.solve(Problem.of_observation(observation, self.task))
+
+    def solve(self, problem: Problem) -> Float:
+        """Return the best action of each of B problems, shape (B, m)."""
+        moving = problem.remaining is not None
+        actions = candidate_actions(self.task, self.n_checks, replanning=moving)
+        candidates = np.broadcast_to(actions, (len(problem.start), *actions.shape))
+        merit = merits(self.task, problem, candidates)
+        for each in range(self.refinements):
+            top = np.argsort(-merit, axis=-1, kind="stable")[:, :N_CENTRES]
+            centres = np.take_along_axis(candidates, top[..., None], axis=1)
+            steps = SPREAD * 0.5**each * self._steps(moving)
+            near = np.clip(centres[:, np.arange(self.per_round) % centres.shape[1]] + steps, -1.0, 1.0)
+            candidates = np.concatenate((candidates, near), axis=1)
+            merit = np.concatenate((merit, merits(self.task, problem, near)), axis=1)
+        best = merit.argmax(axis=1)
+        return np.asarray(candidates[np.arange(len(best)), best], dtype=np.float64)
+
+    def predict(
+        self,
+        observation: Mapping[str, Any],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Single, None]:
+        """Return the best action of one observation, shape (m,), or of a batch, shape (B, m), and no state.
+
+        The signature is that of Stable-Baselines3's `predict`; only the observation is used.
+        """
+        parts = {name: np.asarray(part) for name, part in observation.items()}
+        if parts["joints"].ndim > 1:
+            return self.decide(parts).astype(np.float32), None
+        return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
+
+    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> Plan:
+        """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
+
+        Where no candidate stays clear and in reach, the plan is the one with the least violation.
+
+        Args:
+            start: Start, as `reset` takes it.
+            goal: Goal, as `reset` takes it.
+            obstacles: Shapes or dictionaries.
+
+        Raises:
+            ValueError: An argument is not allowed, an end is out of reach or touches an obstacle.
+        """
+        given = {"start": start, "goal": goal, "obstacles": obstacles}
+        scenes = draw_given(given, self.task.sampler(), [np.random.default_rng(0)])
+        problem = Problem.of_scenes(scenes, self.task)
+        return self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
+
+    def _steps(self, moving: bool) -> Single:
+        """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""
+        size, at = self.task.action.size, self.task.n_via * self.task.action.dimension
+        if moving or not at:
+            return sobol_actions(self.per_round + 1, size)[1:]
+        return np.insert(sobol_actions(self.per_round + 1, size - 1)[1:], at, 0.0, axis=1)
+
+
+def merits(task: Task, problem: Problem, actions: Float) -> Float:
+    """Return the merit of actions of shape (B, H, m), by which the best one has the greatest, shape (B, H).
+
+    The merit of a clear plan is its reward if the physics follows it, and that of others is near INFEASIBLE. It is a
+    lower bound for plans that are certainly no better than another one. When replanning, a first action of zero, which
+    keeps the plan, gains KEEP_BONUS.
+    """
+    moves = moves_of(task, problem, actions)
+    worth = worth_of(task, problem, moves)
+    replanning = problem.remaining is not None
+    if replanning and not actions[:, 0].any():
+        worth[:, 0] += KEEP_BONUS
+    setting = setting_of(task, problem.obstacles)
+    horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
+    gain = task.weights.clearance / CLEARANCE_UNIT
+    return _merits(setting, table_of(task), problem.start, moves, worth, problem.obstacles, horizons, gain)
+
+
+@compiled
+def _merits(
+    setting: Setting,
+    table: MovementTable,
+    start: Float,
+    moves: Moves,
+    worth: Float,
+    obstacles: Obstacles,
+    horizons: Float,
+    gain: float,
+) -> Float:
+    """Return the merits of H plans in each of B problems, see :func:`merits`."""
+    number, plans = worth.shape
+    found = np.full((number, plans), 3.0 * INFEASIBLE)
+    placed = memory(setting.chain, setting.spheres)
+    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
+    high = CLEARANCE_RANGE[1]
+    for b in range(number):
+        order = np.argsort(-worth[b])
+        for rank in range(len(horizons)):
+            best, deepest = 2.0 * INFEASIBLE, -1e9
+            for h in order:
+                if worth[b, h] + gain * high <= best:
+                    break
+                floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
+                clearance = least_clearance(
+                    setting,
+                    table,
+                    moves.times[b, h],
+                    start[b],
+                    moves.offsets[b, h],
+                    moves.duration[b, h],
+                    obstacles,
+                    b,
+                    high,
+                    floor,
+                    horizons[rank],
+                    position,
+                    joints,
+                    placed,
+                )
+                if clearance >= CLEARANCE_MARGIN:
+                    value = worth[b, h] + gain * clearance - rank
+                    best = max(best, value)
+                else:
+                    value = INFEASIBLE + clearance
+                    deepest = max(deepest, clearance)
+                found[b, h] = max(found[b, h], value)
+            if best > INFEASIBLE:
+                break
+    return found
+
+
+def registered_task(env_id: str, **kwargs: Any) -> Task:
+    """Return the task of a registered environment made with `kwargs`."""
+    check_registered(env_id)
+    env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
+    task: Task = env.unwrapped.task
+    env.close()
+    return task
+
+
