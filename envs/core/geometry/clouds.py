@@ -71,7 +71,8 @@ def cloud_distance(
 ) -> tuple[float, float, float, float]:
     """Return the distance of a point from the nearest sphere of a cloud, and its gradient.
 
-    Beyond `limit`, the distance is a lower bound that is greater than `limit`, or `limit` itself. The grid gives a lower bound at once; where that is not enough, the tree gives the nearest point.
+    The grid gives a lower bound at once, the result where it is beyond `limit`. Otherwise the tree gives the nearest
+    point; if there is none within `limit`, the result is `limit`.
     """
     radius = clouds.radius[index]
     bound = _lower_bound(clouds, index, x, y, z) - radius

@@ -83,7 +83,15 @@ class Obstacles(NamedTuple):
     def take(self, scenes: Any) -> Obstacles:
         """Return some of the scenes, by indices, mask or slice."""
         scenes = np.arange(len(self.kind))[scenes]
-        return Obstacles(*(part[scenes] for part in self[:5]), self.meshes, self.clouds)
+        return Obstacles(
+            self.kind[scenes],
+            self.centre[scenes],
+            self.rotation[scenes],
+            self.size[scenes],
+            self.velocity[scenes],
+            self.meshes,
+            self.clouds,
+        )
 
     def put(self, scenes: Any, others: Obstacles) -> Obstacles:
         """Return the obstacles after scenes were overwritten in place; only tables of shapes are new.
@@ -94,10 +102,13 @@ class Obstacles(NamedTuple):
         """
         for mine, theirs in zip(self[:5], others[:5], strict=True):
             mine[scenes] = theirs
-        ours = np.zeros(self.kind.shape, bool)
-        ours[scenes] = True
-        meshes = self._merged(MESH, ours, split_meshes(self.meshes), split_meshes(others.meshes))
-        clouds = self._merged(POINT_CLOUD, ours, split_clouds(self.clouds), split_clouds(others.clouds))
+        tables = (self.meshes.normals, others.meshes.normals, self.clouds.points, others.clouds.points)
+        if not any(map(len, tables)):
+            return self
+        new = np.zeros(self.kind.shape, bool)
+        new[scenes] = True
+        meshes = self._merged(MESH, new, split_meshes(self.meshes), split_meshes(others.meshes))
+        clouds = self._merged(POINT_CLOUD, new, split_clouds(self.clouds), split_clouds(others.clouds))
         return self._replace(meshes=join_meshes(meshes), clouds=join_clouds(clouds))
 
     def _merged(self, kind: int, new: Bool, before: list[Table], added: list[Table]) -> list[Table]:
@@ -269,7 +280,7 @@ def _mesh_boxes(meshes: Meshes) -> Float:
 def _cloud_boxes(clouds: Clouds) -> Float:
     """Return the least and greatest corner of clouds, shape (C, 2, 3), [m]."""
     roots = clouds.boxes[clouds.node[:-1] + 1].reshape(-1, 2, 3)
-    return roots + clouds.radius[:, None, None] * np.array([[-1.0], [1.0]])
+    return np.asarray(roots + clouds.radius[:, None, None] * np.array([[-1.0], [1.0]]))
 
 
 def observation_rows(obstacles: Obstacles, kinds: Sequence[str]) -> Float:
@@ -316,32 +327,30 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     Raises:
         ValueError: A row is a mesh without a name or a point cloud, which rows do not describe.
     """
-    names = [name for name in kinds if name in REGISTERED_MESHES]
-    known = [MESH if name in names else KINDS.index(name) for name in kinds]
-    tables = [names.index(name) if name in names else -1 for name in kinds]
-    column = rows[..., : len(kinds)].argmax(axis=-1)
-    values = rows[..., len(kinds) :].astype(np.float64)
-    found = no_obstacles(*rows.shape[:2])
-    found = found._replace(meshes=join_meshes(REGISTERED_MESHES[name].mesh for name in names))
-    present = values[..., -1] > 0.5
-    kind, table = np.array(known)[column][present], np.array(tables)[column][present]
+    named = {name: mesh for name in kinds if (mesh := REGISTERED_MESHES.get(name)) is not None}
+    numbers = np.array([MESH if name in named else KINDS.index(name) for name in kinds])
+    tables = np.array([list(named).index(name) if name in named else -1 for name in kinds])
+    meshes = join_meshes(shape.mesh for shape in named.values() if shape.mesh is not None)
+    found = no_obstacles(*rows.shape[:2])._replace(meshes=meshes)
+    present = rows[..., -1] > 0.5
+    column = rows[present][:, : len(kinds)].argmax(axis=-1)
+    kind, table = numbers[column], tables[column]
     if ((kind == POINT_CLOUD) | ((kind == MESH) & (table < 0))).any():
-        raise ValueError("rows do not describe meshes without a name and point clouds")
-    values = values[present]
-    centre, half = values[:, :3], values[:, 9:12]
+        raise ValueError("rows do not describe point clouds, and meshes without a name")
+    values = rows[present][:, len(kinds) :].astype(np.float64)
+    centre, half, velocity = values[:, :3], values[:, 9:12], values[:, 12:15]
+    # Rows in single precision have axes that are not quite orthonormal.
     first = values[:, 3:6] / np.linalg.norm(values[:, 3:6], axis=-1, keepdims=True)
     third = np.cross(first, values[:, 6:9])
     third /= np.linalg.norm(third, axis=-1, keepdims=True)
     rotation = np.stack((first, np.cross(third, first), third), axis=-1)
     size = np.einsum("...i,...ij->...j", half, np.linalg.pinv(BOXES)[kind])
     centre = centre + EXTENT * third * (kind == HALF_SPACE)[:, None]
-    for index, name in enumerate(names):
-        some = table == index
-        box = _mesh_boxes(found.meshes)[index]
-        centre[some] -= rotation[some] @ (0.5 * (box[0] + box[1]))
-        size[some] = (index, REGISTERED_MESHES[name].packed_size[1], 0.0)
-    parts = (kind, centre, rotation, size, values[:, 12:15])
-    for array, part in zip(found[:5], parts, strict=True):
+    for index, (box, shape) in enumerate(zip(_mesh_boxes(meshes), named.values(), strict=True)):
+        same = table == index
+        centre[same] -= rotation[same] @ box.mean(axis=0)
+        size[same] = (index, shape.packed_size[1], 0.0)
+    for array, part in zip(found[:5], (kind, centre, rotation, size, velocity), strict=True):
         array[present] = part
     return found
 

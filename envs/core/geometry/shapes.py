@@ -523,8 +523,8 @@ REGISTERED_MESHES: dict[str, ConvexMesh] = {}
 def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
     """Register a convex mesh under a name, so that scenes and observations may contain it.
 
-    The name is then a shape: dictionaries take it as `shape`, environments in `shapes`. Files store the name only, so
-    register the mesh before you load one of them. Registering the same mesh again changes nothing.
+    The name is then a shape: dictionaries take it as `shape`, environments in `shapes`. Registering the same mesh again
+    changes nothing.
 
     Args:
         name: Identifier, which no other shape has.

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from viapoint.envs.core.scenes.layout import Furniture, Layout, Room, between, centred, sign
+from viapoint.envs.core.scenes.layout import Furniture, Layout, Room, between, centred, mix, sign
 
 WORKSPACE = (-0.45, 0.35, 0.15, 0.60)
 """Least and greatest x, least and greatest y of starts and goals, [m]."""
@@ -28,8 +28,12 @@ WALL_HALF_WIDTH = (0.007, 0.011)
 """Bars of structures, [m]."""
 TILT = 0.6
 """Greatest angle between a bar of clutter and the perpendicular of the straight line, [rad]."""
-NEAR, SPREAD = 0.10, 0.26
-"""Greatest distances of obstacles from the straight line, for half of them and for the others, [m]."""
+IN_THE_WAY = 0.03
+"""Greatest distance of the first obstacle from the straight line, [m]."""
+NEAREST, STEP, SPREAD = 0.05, 0.05, 0.08
+"""Least distance of the next two from the line, what it grows by for every two more, and its range, [m]."""
+ASIDE = 0.12
+"""Greatest distance of other obstacles from the forearm on the line, where links must clear, too, [m]."""
 
 Point = tuple[float, float]
 
@@ -42,47 +46,52 @@ def clutter(rng: np.random.Generator, room: Room) -> Layout:
         return furniture.layout()
     kinds = room.allowed("cylinder", "box")
     # Some are drawn in vain: those that touch the arm at an end are left out.
-    for row in range(2 * count + 1):
-        x = length * between(rng, 0.2, 0.8)
-        y = centred(rng, NEAR if row % 2 else SPREAD) if row else centred(rng, 0.03)
-        if row and room.tall:
-            x, y = _between_base_and(rng, furniture, x, y)
-        if kinds[int(len(kinds) * rng.random())] == "cylinder":
-            furniture.post(x, y, between(rng, *POST_RADIUS))
+    spare, in_the_way = (count + 2, 3) if room.tall else (2, 1)
+    side = sign(rng)
+    for row, numbers in enumerate(rng.random((count + spare, 7)).tolist()):
+        along, across, kind, size, half, tilt, share = numbers
+        x, y = length * (0.2 + 0.6 * along), IN_THE_WAY * (2.0 * across - 1.0)
+        if row >= in_the_way:
+            # Near to far in turns on both sides, so that together they close more ways around.
+            side = -side
+            rank = (row - in_the_way) // 2
+            y = side * (NEAREST + STEP * rank + SPREAD * across)
+            if room.tall:
+                x, y = _beside_forearm(furniture, x, share, ASIDE * side * across)
+        if kinds[int(len(kinds) * kind)] == "cylinder":
+            furniture.post(x, y, mix(POST_RADIUS, size))
         else:
-            half = between(rng, *BAR_HALF_LENGTH)
-            heading = 0.5 * math.pi + centred(rng, TILT)
-            furniture.bar(x, y, heading, (-half, half), between(rng, *BAR_HALF_WIDTH))
+            reach = mix(BAR_HALF_LENGTH, half)
+            heading = 0.5 * math.pi + TILT * (2.0 * tilt - 1.0)
+            furniture.bar(x, y, heading, (-reach, reach), mix(BAR_HALF_WIDTH, size))
     return furniture.layout(keep=count)
 
 
 def gate(rng: np.random.Generator, room: Room) -> Layout:
-    """Return two walls in one line, with a gap between them beside the straight line."""
+    """Return two walls in one line, with a gap between them that the hand, or the forearm, must pass."""
     furniture, length = _along_line(rng, room)
-    x, y = _beside_line(rng, length)
-    heading = 0.5 * math.pi + centred(rng, 0.4)
-    half_width = between(rng, *WALL_HALF_WIDTH)
-    gap = room.hand + half_width + between(rng, 0.009, 0.022)
-    for direction in (heading, heading + math.pi):
-        furniture.bar(x, y, direction, (gap, gap + between(rng, 0.28, 0.56)), half_width)
+    x, y, heading = _passage(rng, furniture, length)
+    half_width, gap = _wall(rng, room)
+    for side in (-0.5 * math.pi, 0.5 * math.pi):
+        furniture.bar(x, y, heading + side, (gap, gap + _length(rng, room)), half_width)
     return furniture.layout()
 
 
 def corridor(rng: np.random.Generator, room: Room) -> Layout:
-    """Return a narrow lane between two bars beside the straight line, and a wall on either side of it."""
+    """Return a narrow lane between two bars, with a wall on either side of it where the hand alone must pass."""
     furniture, length = _along_line(rng, room)
-    x, y = _beside_line(rng, length)
-    heading, half = centred(rng, 0.3), between(rng, 0.06, 0.12)
-    half_width = between(rng, *WALL_HALF_WIDTH)
-    away = room.hand + half_width + between(rng, 0.012, 0.03)
+    x, y, heading = _passage(rng, furniture, length)
+    half = between(rng, 0.05, 0.09) if room.tall else between(rng, 0.06, 0.12)
+    half_width, away = _wall(rng, room)
     place = centred(rng, 0.8) * half
     foot = x + place * math.cos(heading), y + place * math.sin(heading)
-    for side in (1.0, -1.0):
-        across = heading + side * 0.5 * math.pi
+    for side in (-0.5 * math.pi, 0.5 * math.pi):
+        across = heading + side
         lane = x + away * math.cos(across), y + away * math.sin(across)
         furniture.bar(*lane, heading, (-half, half), half_width)
         first = away + 2.0 * half_width
-        furniture.bar(*foot, across, (first, first + between(rng, 0.16, 0.4)), half_width)
+        if not room.tall:
+            furniture.bar(*foot, across, (first, first + _length(rng, room)), half_width)
     return furniture.layout()
 
 
@@ -90,11 +99,10 @@ def ring(rng: np.random.Generator, room: Room) -> Layout:
     """Return posts or bars around the goal or the start, with one opening."""
     furniture, length = _along_line(rng, room)
     x = length if rng.random() < 0.5 else 0.0
+    entry = centred(rng, math.pi)
     if room.tall:
-        base = furniture.base
-        entry = math.atan2(base[1], base[0] - x) + centred(rng, 0.7)
-    else:
-        entry = centred(rng, math.pi)
+        elbow = furniture.elbow(x, 0.0)
+        entry = math.atan2(elbow[1], elbow[0] - x) + centred(rng, 0.3)
     gap = room.hand + between(rng, 0.004, 0.012) * (4.0 if room.tall else 1.0)
     if rng.random() < 0.4 and "cylinder" in room.kinds:
         # The hand does not fit between neighbouring posts, but between the first and the last one.
@@ -120,20 +128,18 @@ def ring(rng: np.random.Generator, room: Room) -> Layout:
 
 
 def oblique_bar(rng: np.random.Generator, room: Room) -> Layout:
-    """Return long parallel bars at an oblique angle across the straight line, with a gap between them."""
+    """Return long parallel bars at an oblique angle, with a gap between them that the hand, or forearm, must pass."""
     furniture, length = _along_line(rng, room)
-    x, y = _beside_line(rng, length)
-    half_width = between(rng, *WALL_HALF_WIDTH)
-    side = -math.copysign(1.0, y)
-    heading = side * 0.5 * math.pi + sign(rng) * between(rng, 0.5, 1.05)
-    first = room.hand + half_width + between(rng, 0.009, 0.024)
-    furniture.bar(x, y, heading, (first, first + between(rng, 0.26, 0.5)), half_width)
-    last = room.hand + half_width + between(rng, 0.009, 0.024)
-    furniture.bar(x, y, heading, (-last, -last - between(rng, 0.26, 0.5)), half_width)
-    shift = sign(rng) * between(rng, 0.07, 0.12)
-    x, y = x - shift * math.sin(heading), y + shift * math.cos(heading)
+    x, y, heading = _passage(rng, furniture, length)
+    heading += 0.5 * math.pi + sign(rng) * between(rng, 0.4, 1.0)
+    half_width, gap = _wall(rng, room)
+    gap += 0.01
+    for side in (0.0, math.pi):
+        furniture.bar(x, y, heading + side, (gap, gap + _length(rng, room)), half_width)
     if not room.tall:
-        furniture.bar(x, y, heading, (first, first + between(rng, 0.26, 0.5)), half_width)
+        shift = sign(rng) * between(rng, 0.07, 0.12)
+        x, y = x - shift * math.sin(heading), y + shift * math.cos(heading)
+        furniture.bar(x, y, heading, (gap, gap + _length(rng, room)), half_width)
     return furniture.layout()
 
 
@@ -141,7 +147,8 @@ def cul_de_sac(rng: np.random.Generator, room: Room) -> Layout:
     """Return a pocket of bars that is open towards the start, and walls beside it that leave little room."""
     furniture, length = _along_line(rng, room)
     end = length * between(rng, 0.5, 0.75)
-    heading, half_width = centred(rng, 0.3), between(rng, *WALL_HALF_WIDTH)
+    heading = centred(rng, 0.3)
+    half_width, gap = _wall(rng, room)
     wide, deep = between(rng, 0.045, 0.09), between(rng, 0.1, 0.2)
     across = heading + 0.5 * math.pi
     furniture.bar(end, 0.0, across, (-wide, wide), half_width)
@@ -149,12 +156,36 @@ def cul_de_sac(rng: np.random.Generator, room: Room) -> Layout:
     for side in (1.0, -1.0):
         corner = end + side * wide * math.cos(across), side * wide * math.sin(across)
         furniture.bar(*corner, heading + math.pi - side * splay, (0.0, deep), half_width)
+    if room.tall:
+        return furniture.layout()
     side = sign(rng)
-    gap = 2.0 * room.hand + 2.0 * half_width + between(rng, 0.02, 0.05)
-    furniture.bar(end, 0.0, across, (side * (wide + gap), side * (wide + gap + 0.3)), half_width)
-    first = wide + 2.0 * half_width
-    furniture.bar(end, 0.0, across, (-side * first, -side * (first + between(rng, 0.16, 0.4))), half_width)
+    for direction, first in ((side, wide + 2.0 * gap), (-side, wide + 2.0 * half_width)):
+        last = first + _length(rng, room)
+        furniture.bar(end, 0.0, across, (direction * first, direction * last), half_width)
     return furniture.layout()
+
+
+def _wall(rng: np.random.Generator, room: Room) -> tuple[float, float]:
+    """Return half the width of walls, and the distance of their middles from what passes between them, [m]."""
+    half_width = between(rng, *WALL_HALF_WIDTH)
+    gap = between(rng, 0.010, 0.045) if room.tall else between(rng, 0.009, 0.024)
+    return half_width, room.hand + half_width + gap
+
+
+def _length(rng: np.random.Generator, room: Room) -> float:
+    """Return the length of a wall, [m]; long ones leave no room for links."""
+    return between(rng, 0.08, 0.25) if room.tall else between(rng, 0.16, 0.50)
+
+
+def _passage(rng: np.random.Generator, furniture: Furniture, length: float) -> tuple[float, float, float]:
+    """Return a place, and the direction in which the hand passes it, or in which the forearm lies in it at an end."""
+    if not furniture.room.tall:
+        return length * between(rng, 0.25, 0.75), sign(rng) * between(rng, 0.03, 0.13), centred(rng, 0.4)
+    end = length if rng.random() < 0.5 else 0.0
+    elbow = furniture.elbow(end, 0.0)
+    x, y = elbow[0] - end, elbow[1]
+    share = between(rng, 0.15, 0.6)
+    return end + share * x, share * y, math.atan2(y, x) + centred(rng, 0.25)
 
 
 def _along_line(rng: np.random.Generator, room: Room) -> tuple[Furniture, float]:
@@ -174,10 +205,7 @@ def _ends(rng: np.random.Generator, room: Room) -> tuple[Point, Point]:
         return room.start, room.goal
     first = room.start if room.start is not None else room.goal
     for _ in range(DRAWS):
-        if first is None:
-            one = between(rng, *WORKSPACE[:2]), between(rng, *WORKSPACE[2:])
-        else:
-            one = first
+        one = first or (between(rng, *WORKSPACE[:2]), between(rng, *WORKSPACE[2:]))
         distance, angle = between(rng, *DISTANCE), centred(rng, math.pi)
         other = one[0] + distance * math.cos(angle), one[1] + distance * math.sin(angle)
         if _within_reach(one, other):
@@ -198,13 +226,10 @@ def _within_reach(one: Point, other: Point) -> bool:
     return math.hypot(one[0] + foot * x, one[1] + foot * y) > REACH[0]
 
 
-def _beside_line(rng: np.random.Generator, length: float) -> Point:
-    """Return a point that the hand must pass, beside the straight line."""
-    return length * between(rng, 0.25, 0.75), sign(rng) * between(rng, 0.03, 0.13)
-
-
-def _between_base_and(rng: np.random.Generator, furniture: Furniture, x: float, y: float) -> Point:
-    """Return a point on the ray from the base to a point, where links pass, too."""
-    share = between(rng, 0.3, 1.25)
-    base = furniture.base
-    return base[0] + share * (x - base[0]), base[1] + share * (y - base[1])
+def _beside_forearm(furniture: Furniture, x: float, share: float, aside: float) -> Point:
+    """Return a point beside the forearm, or beyond the elbow, with the hand on the line."""
+    elbow = furniture.elbow(x, 0.0)
+    share = 1.4 * share - 0.4
+    u, v = x - elbow[0], -elbow[1]
+    length = math.hypot(u, v)
+    return elbow[0] + share * u - aside * v / length, elbow[1] + share * v + aside * u / length

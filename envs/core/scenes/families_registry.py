@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.validation import whole_number
-
 from viapoint.envs.core.geometry.obstacles import KINDS, MESH, pack
 from viapoint.envs.core.geometry.shapes import Shape
 from viapoint.envs.core.scenes import families_plane, families_space
-from viapoint.envs.core.scenes.layout import PLACE, ROW, Layout, Place, Room
+from viapoint.envs.core.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
 
 Build = Callable[[np.random.Generator, Room], Any]
 """Function of a random generator and a room that returns a layout, see :func:`register_scene_family`."""
@@ -75,8 +74,9 @@ def scene_families(plane: bool) -> Mapping[str, SceneFamily]:
 
     Example:
         >>> from viapoint.envs.core.scenes.families_registry import scene_families
-        >>> [name for name, family in scene_families(plane=False).items() if not family.trained]
-        ['cage', 'wall_window']
+        >>> families = scene_families(plane=False)
+        >>> families["shelf"].trained, families["cage"].trained
+        (True, False)
     """
     return MappingProxyType({name: each for (there, name), each in FAMILIES.items() if there == plane})
 
@@ -105,7 +105,9 @@ def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], m
         if missing:
             raise ValueError(f"the family {name!r} needs obstacles of the kinds {', '.join(sorted(missing))}")
         if family.n_obstacles > max(most, 1):
-            raise ValueError(f"the family {name!r} needs {family.n_obstacles} obstacles, n_obstacles allows {most}")
+            raise ValueError(
+                f"the family {name!r} needs {family.n_obstacles} obstacles, n_obstacles allows {most}"
+            )
     return tuple(families)
 
 
@@ -189,9 +191,12 @@ def _checked(name: str, build: Build) -> Build:
             found = {KINDS[int(kind)] for kind in layout.rows[::ROW]}
             if not found <= set(room.kinds):
                 raise ValueError(f"kinds must be among {room.kinds}, got {sorted(found)}")
-            count = layout.keep or len(layout.rows) // ROW
-            if count > room.most:
-                raise ValueError(f"there must be at most {room.most} obstacles, got {count}")
+            drawn = len(layout.rows) // ROW
+            count = layout.keep or drawn
+            if count > room.most or drawn > most_rows(room.most):
+                raise ValueError(f"there must be at most {room.most} obstacles, got {count} of {drawn}")
+            if max(len(layout.goals), len(layout.starts)) > MOST_PLACES * PLACE:
+                raise ValueError(f"there must be at most {MOST_PLACES} places of starts, and of goals")
         except (TypeError, ValueError) as error:
             raise ValueError(f"scene family {name!r}: {error}") from None
         return layout

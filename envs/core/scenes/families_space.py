@@ -1,8 +1,8 @@
 """Scene families in space: furniture around an arm, and the places where one would reach.
 
 A family is a function of a random generator and a :class:`~viapoint.envs.core.scenes.layout.Room`. The frame of its
-furniture has its origin under the middle of the front, which faces the arm, and its x axis points away from the arm. The
-reference arm has a reach of 0.855 m and its shoulder 0.333 m above its base.
+furniture has its origin under the middle of the front, which faces the arm, and its x axis points away from the arm.
+Sizes are for an arm with a reach of 0.855 m and its shoulder 0.333 m above its base, such as the Panda.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def shelf(rng: np.random.Generator, room: Room) -> Layout:
             for y in (-half_width, half_width):
                 furniture.box((x, y, middle), (THICKNESS, THICKNESS, half_height + 0.2))
     for compartment in range(compartments):
-        board = lowest + compartment * gap
-        _things(rng, furniture, int(3 * rng.random()), board, 2.0 * half_depth, half_width)
+        height = lowest + compartment * gap
+        _things(rng, furniture, int(3 * rng.random()), height, 2.0 * half_depth, half_width)
         reach = min(half_depth, 0.17)
-        position = (reach, 0.0, board + 0.5 * gap)
+        position = (reach, 0.0, height + 0.5 * gap)
         half = (reach, 0.85 * half_width, 0.5 * gap - HAND_ROOM)
         furniture.goal(position, half, FORWARDS, CONE)
     if rng.random() < 0.5:
@@ -188,9 +188,7 @@ def clutter(rng: np.random.Generator, room: Room) -> Layout:
     return furniture.layout(keep=count)
 
 
-def _in_front(
-    rng: np.random.Generator, room: Room, near: float, far: float, twist: float = 0.5
-) -> Furniture:
+def _in_front(rng: np.random.Generator, room: Room, near: float, far: float, twist: float = 0.5) -> Furniture:
     """Return furniture without parts whose front is somewhere around the arm, at a distance from it."""
     bearing, distance = between(rng, *room.turn), between(rng, near, far)
     x, y = distance * math.cos(bearing), distance * math.sin(bearing)

@@ -14,10 +14,18 @@ ROW = 16
 """Numbers of an obstacle in a layout: kind, centre, rotation matrix row by row, sizes."""
 PLACE = 12
 """Numbers of a place in a layout: position, approach, half sizes, cosine and sine of the yaw, angle of the cone."""
+MOST_PLACES = 8
+"""Greatest number of places of starts, or of goals, of a layout."""
 TALL = 0.1
 """Half height above which obstacles in the plane are in the way of the links, [m]."""
 
 Vector = tuple[float, float, float]
+NOWHERE = (0.0, 0.0, 0.0)
+
+
+def most_rows(most: int) -> int:
+    """Return how many obstacles a layout may have of which at most so many are kept."""
+    return 2 * most + 3
 
 
 class Room(NamedTuple):
@@ -42,6 +50,9 @@ class Room(NamedTuple):
     """Half height of obstacles in the plane, [m]."""
     hand: float = 0.0
     """Radius of the part of the arm that must pass between obstacles in the plane, [m] of the reference arm."""
+    links: tuple[float, float] = (0.0, 0.0)
+    """Lengths of upper arm and forearm in the plane, the first negative if the elbow is on the left, [m] of the
+    reference arm."""
     start: tuple[float, float] | None = None
     """Given start of the hand in the plane, [m] of the reference arm."""
     goal: tuple[float, float] | None = None
@@ -125,8 +136,18 @@ class Furniture:
     @property
     def base(self) -> tuple[float, float]:
         """Base of the arm in the frame, [m]."""
-        x, y = -self._x, -self._y
-        return self._cosine * x + self._sine * y, self._cosine * y - self._sine * x
+        return self._local(0.0, 0.0)
+
+    def elbow(self, x: float, y: float) -> tuple[float, float]:
+        """Return the elbow of an arm in the plane with its hand at a place, in the frame, [m]."""
+        upper, fore = self.room.links
+        x, y = self._turned(x, y)
+        x, y = self._x + x, self._y + y
+        # Law of cosines for the angle between upper arm and hand, seen from the shoulder.
+        away = math.hypot(x, y)
+        cosine = (away * away + upper * upper - fore * fore) / (2.0 * away * abs(upper))
+        angle = math.atan2(y, x) - math.copysign(math.acos(min(max(cosine, -1.0), 1.0)), upper)
+        return self._local(abs(upper) * math.cos(angle), abs(upper) * math.sin(angle))
 
     def box(self, centre: Vector, half: Vector, yaw: float = 0.0) -> None:
         """Add a box that is turned about the vertical axis."""
@@ -167,21 +188,13 @@ class Furniture:
         self.box(centre, half, heading)
 
     def goal(
-        self,
-        position: Vector,
-        half: Vector = (0.0, 0.0, 0.0),
-        approach: Vector = (0.0, 0.0, 0.0),
-        cone: float = 0.0,
+        self, position: Vector, half: Vector = NOWHERE, approach: Vector = NOWHERE, cone: float = 0.0
     ) -> None:
         """Add a place of goals, see :class:`Place`."""
         self._place(self._goals, position, half, approach, cone)
 
     def start(
-        self,
-        position: Vector,
-        half: Vector = (0.0, 0.0, 0.0),
-        approach: Vector = (0.0, 0.0, 0.0),
-        cone: float = 0.0,
+        self, position: Vector, half: Vector = NOWHERE, approach: Vector = NOWHERE, cone: float = 0.0
     ) -> None:
         """Add a place of starts, see :class:`Place`."""
         self._place(self._starts, position, half, approach, cone)
@@ -215,6 +228,11 @@ class Furniture:
         """Return a horizontal vector of the frame in the world."""
         return self._cosine * x - self._sine * y, self._sine * x + self._cosine * y
 
+    def _local(self, x: float, y: float) -> tuple[float, float]:
+        """Return a point that is seen from the base in the frame, [m]."""
+        x, y = x - self._x, y - self._y
+        return self._cosine * x + self._sine * y, self._cosine * y - self._sine * x
+
     def _world(self, point: Vector) -> Vector:
         """Return a point of the frame in the world, [m]."""
         x, y = self._turned(point[0], point[1])
@@ -224,6 +242,11 @@ class Furniture:
             foot[1] + scale * (self._y + y),
             foot[2] + scale * point[2],
         )
+
+
+def mix(limits: tuple[float, float], share: float) -> float:
+    """Return the number at a share of the way from a lower limit to an upper one."""
+    return limits[0] + (limits[1] - limits[0]) * share
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:

@@ -1,41 +1,58 @@
 """Rejection sampling of scenes.
 
-A layout is drawn, then several pairs of start and goal for it. A scene is accepted if both ends are free and the straight
-movement between them is not. A scene depends on its own random generator only, whatever the batch.
+A layout is drawn, then several pairs of start and goal for it. A scene is accepted if both ends are free and the
+straight movement between them is not. A scene depends on its own random generator only, whatever the batch.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.core.arms.arm import Arm
-from viapoint.envs.core.geometry.obstacles import ABSENT, Obstacles, no_obstacles
+from viapoint.envs.core.arms.inverse_kinematics import planar_joints
+from viapoint.envs.core.arms.kinematics import link_poses, sphere_centres
+from viapoint.envs.core.geometry.clearance import memory
+from viapoint.envs.core.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.core.plans import SpaceName
-from viapoint.envs.core.scenes.ends import Attempts, Mover, draw_ends
-from viapoint.envs.core.scenes.families_registry import check_families, scene_families
-from viapoint.envs.core.scenes.layout import PLACE, ROW, TALL, Layout, Room
-from viapoint.envs.core.scenes.motions import Changes, draw_courses, draw_jumps
+from viapoint.envs.core.scenes import families_plane, families_space
+from viapoint.envs.core.scenes.ends import PAIRS, Attempts, Draft, Mover, draw_ends, numbers_of_end
+from viapoint.envs.core.scenes.families_registry import Build, check_families, scene_families
+from viapoint.envs.core.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, most_rows
+from viapoint.envs.core.scenes.motions import (
+    CANDIDATES,
+    COURSE_NUMBERS,
+    Changes,
+    draw_courses,
+    draw_jumps,
+    numbers_of_jumps,
+)
 from viapoint.envs.core.scenes.scene import MOST_JUMPS, Scenes, resting
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
 PLANE_MARGIN, SPACE_MARGIN = 0.025, 0.02
 """Least clearance of starts and goals from obstacles, [m]."""
+LIMIT_MARGIN = 0.02
+"""Least distance of ends from the joint limits, [rad] or [m]; at most a tenth of the range."""
 LEAST_WAY = 0.5
 """Least length of the way from start to goal in joint space, [rad]."""
-PLANE_REACH, SPACE_REACH = 0.6755, 0.97
+PLANE_REACH, SPACE_REACH = 0.6755, 0.947
 """Reaches of the tools of the reference arms, measured from joint 2, [m]."""
 SHOULDER = 0.333
 """Height of joint 2 of the reference arm in space, [m]."""
+REACH_SAMPLES = 2000
+"""Configurations among which the reach of an arm is looked for."""
+MOST_DRAWN = 32
+"""Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given."""
 ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 """Layouts that are drawn for a scene at most, and layouts after which another family is tried."""
-MOST_PLACES = 8
-"""Greatest number of places of a layout."""
 
 
 class Given(NamedTuple):
@@ -88,25 +105,18 @@ class SceneSampler:
         durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
     ) -> None:
         fewest, most = fewest_and_most("n_obstacles", n_obstacles, rows, rows)
-        fewest_and_most("jumps", jumps, MOST_JUMPS, MOST_JUMPS)
+        jumps = fewest_and_most("jumps", jumps, MOST_JUMPS, MOST_JUMPS)
         self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
         self.plane = is_planar(arm)
         self.families = check_families(families, self.plane, kinds, most)
-        self.room = room_of(arm, self.plane, kinds, (fewest, most), tall)
-        self.changes = Changes(jumps[0], jumps[1], moving, durations)
-        self.mover = Mover(
-            arm.chain,
-            arm.spheres,
-            arm.joint_range,
-            arm.velocity_limit,
-            arm.home,
-            self.plane,
-            space == "hand",
-            PLANE_MARGIN if self.plane else SPACE_MARGIN,
-            0.0 if self.plane else LEAST_WAY,
-        )
+        most = min(most, max(fewest, MOST_DRAWN))
+        self.room = room_of(arm, kinds, (fewest, most), tall)
+        self.changes = Changes(*jumps, moving, *durations)
+        self._mover = mover_of(arm, space, self.plane)
         self._builds = [scene_families(self.plane)[name].build for name in self.families]
-        self._candidates = max(2 * most + 2, rows)
+        self._bare = families_plane.clutter if self.plane else families_space.clutter
+        self._width = max(most_rows(most), rows)
+        self._memories = [memory(arm.chain, arm.spheres) for _ in range(3)]
 
     def __call__(self, generators: Sequence[np.random.Generator], given: Given | None = None) -> Scenes:
         """Draw one scene from each of N random generators.
@@ -119,35 +129,79 @@ class SceneSampler:
             RuntimeError: No scene was found in many attempts.
         """
         given = given or Given()
-        number, joints = len(generators), len(self.arm.home)
-        attempts = Attempts.empty(number, self._candidates, MOST_PLACES, joints)
+        draft = self._draft(len(generators), given)
+        rooms = self._rooms(len(generators), given)
+        bare = self.room.most == 0 or given.obstacles is not None
+        builds = [self._bare if bare else self._any_family(rng) for rng in generators]
+        pending = np.arange(len(generators))
+        for attempt in range(ATTEMPTS):
+            for i in map(int, pending):
+                rng = generators[i]
+                if attempt and attempt % FAMILY_ATTEMPTS == 0 and not bare:
+                    builds[i] = self._any_family(rng)
+                self._write(draft.attempts, i, builds[i](rng, rooms[i]), given)
+                rng.random(out=draft.attempts.numbers[i])
+            found = draw_ends(draft, pending)
+            found[found] = self._change(draft, pending[found], generators, given)
+            pending = pending[~found]
+            if not len(pending):
+                return self._finished(draft)
+        raise RuntimeError(
+            f"no scene of the families {', '.join(self.families)} with {self.room.fewest} to {self.room.most} "
+            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.arm.name!r}; allow fewer obstacles or "
+            "other families, or give other ends"
+        )
+
+    def _draft(self, number: int, given: Given) -> Draft:
+        """Return N scenes with the given parts."""
+        width, joints = self._width, len(self.arm.home)
+        attempts = Attempts(
+            rows=np.zeros((number, width, ROW)),
+            n_rows=np.zeros(number, np.int64),
+            keep=np.zeros(number, np.int64),
+            places=np.zeros((number, 2, MOST_PLACES, PLACE)),
+            n_places=np.zeros((number, 2), np.int64),
+            fixed=np.zeros((number, 2), np.bool_),
+            numbers=np.zeros((number, PAIRS, 2, numbers_of_end(joints))),
+        )
         ends = np.zeros((number, 2, joints))
         for end, configurations in enumerate((given.start, given.goal)):
             if configurations is not None:
                 ends[:, end] = configurations
                 attempts.fixed[:, end] = True
-        obstacles = given.obstacles or no_obstacles(number, self._candidates)
+        if given.obstacles is not None:
+            attempts.n_rows[:] = -1
+        obstacles = no_obstacles(number, width) if given.obstacles is None else given.obstacles
         scenes = resting(ends[:, 0], ends[:, 1], obstacles)
-        rooms = self._rooms(number, given)
-        builds = [self._any_family(rng) for rng in generators]
-        pending = np.arange(number)
-        for attempt in range(ATTEMPTS):
-            for i in pending:
-                rng = generators[i]
-                if attempt and attempt % FAMILY_ATTEMPTS == 0:
-                    builds[i] = self._any_family(rng)
-                layout = builds[i](rng, rooms[i])
-                self._write(attempts, int(i), layout, given)
-                rng.random(out=attempts.numbers[i])
-            found = draw_ends(self.mover, attempts, pending, ends, obstacles)
-            found &= self._change(generators, pending, found, scenes, given)
-            pending = pending[~found]
-            if not len(pending):
-                return self._without_spare_rows(scenes)
-        raise RuntimeError(
-            f"no scene of the families {', '.join(self.families)} with {self.room.fewest} to {self.room.most} "
-            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.arm.name!r}; allow fewer obstacles or "
-            "other families, or give other ends"
+        if given.jumps is not None:
+            scenes.jumps[:] = given.jumps
+        if given.turns is not None:
+            scenes.turn_time[:], scenes.turn_velocity[:] = given.turns
+        changes = scenes.turn_time, scenes.turn_velocity, scenes.jumps
+        return Draft(self._mover, attempts, ends, obstacles, *changes, *self._memories)
+
+    def _finished(self, draft: Draft) -> Scenes:
+        """Return drawn scenes, without the rows for obstacles that were left out."""
+        rows = slice(0, self.rows)
+        given = draft.obstacles
+        obstacles = given._replace(
+            kind=given.kind[:, rows].copy(),
+            centre=given.centre[:, rows].copy(),
+            rotation=given.rotation[:, rows].copy(),
+            size=given.size[:, rows].copy(),
+            velocity=given.velocity[:, rows].copy(),
+        )
+        absent = ~obstacles.present
+        for part in (obstacles.centre, obstacles.size, obstacles.velocity):
+            part[absent] = 0.0
+        obstacles.rotation[absent] = np.eye(3)
+        return Scenes(
+            start=draft.ends[:, 0].copy(),
+            goal=draft.ends[:, 1].copy(),
+            obstacles=obstacles,
+            jumps=draft.jumps,
+            turn_time=draft.turn_time[:, rows].copy(),
+            turn_velocity=draft.turn_velocity[:, rows].copy(),
         )
 
     def _any_family(self, rng: np.random.Generator) -> Build:
@@ -173,54 +227,88 @@ class SceneSampler:
         rows, starts, goals, keep = layout.rows, layout.starts, layout.goals, layout.keep
         attempts.keep[scene] = keep
         if given.obstacles is None:
-            attempts.count[scene] = len(rows) // ROW
-            attempts.rows[scene, : len(rows)] = rows
+            attempts.n_rows[scene] = len(rows) // ROW
+            attempts.rows[scene].reshape(-1)[: len(rows)] = rows
         for end, places in enumerate((starts, goals)):
-            attempts.places[scene, end, : len(places)] = places
+            attempts.places[scene, end].reshape(-1)[: len(places)] = places
             attempts.n_places[scene, end] = len(places) // PLACE
 
     def _change(
-        self,
-        generators: Sequence[np.random.Generator],
-        scenes: Scenes,
-        which: Int,
-        given: Given,
+        self, draft: Draft, which: Int, generators: Sequence[np.random.Generator], given: Given
     ) -> Bool:
-        """Draw the changes of the scenes at some indices, and return True for those in which they fit, shape (K,)."""
-        number, joints = len(which), len(self.arm.home)
-        obstacles, turns = scenes.obstacles, Turns(scenes.turn_time, scenes.turn_velocity)
-        ends = np.stack((scenes.start, scenes.goal), axis=1)
-        thing = self.mover, self.changes, which, ends, obstacles, turns
+        """Draw the changes of K scenes, and return True for those in which they fit, shape (K,)."""
+
+        def numbers(*shape: int) -> Float:
+            return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
+
         if self.changes.moving and given.obstacles is None:
-            numbers = np.empty((number, obstacles.kind.shape[1], CANDIDATES, NUMBERS_OF_COURSE))
-            for k, scene in enumerate(which):
-                generators[scene].random(out=numbers[k])
-            draw_courses(*thing, numbers)
+            draw_courses(draft, self.changes, which, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
         if self.changes.most_jumps == 0 or given.jumps is not None:
-            return np.ones(number, bool)
-        numbers = np.empty((number, numbers_of_jumps(joints)))
-        for k, scene in enumerate(which):
-            generators[scene].random(out=numbers[k])
-        return draw_jumps(*thing, scenes.jumps, numbers)
+            return np.ones(len(which), bool)
+        return draw_jumps(draft, self.changes, which, numbers(numbers_of_jumps(len(self.arm.home))))
 
 
 def is_planar(arm: Arm) -> bool:
     """Return True for an arm of two hinges with vertical axes."""
     if len(arm.home) != 2 or arm.chain.sliding.any():
         return False
-    placed = memory(arm.chain, arm.spheres)
-    place(arm.chain, arm.spheres, arm.home, placed)
-    return bool((np.abs(placed.rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
+    rotation, _ = link_poses(arm.chain, arm.home)
+    return bool((np.abs(rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
+
+
+def mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
+    """Return what compiled functions know of an arm."""
+    width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
+    margin = np.minimum(LIMIT_MARGIN, 0.1 * width)
+    away = arm.hand(arm.home) - arm.chain.origin[0]
+    return Mover(
+        chain=arm.chain,
+        spheres=arm.spheres,
+        joint_range=arm.joint_range,
+        inner_range=arm.joint_range + margin[:, None] * np.array([1.0, -1.0]),
+        velocity_limit=arm.velocity_limit,
+        home=arm.home,
+        bearing=math.atan2(away[1], away[0]),
+        plane=plane,
+        of_hand=space == "hand",
+        margin=PLANE_MARGIN if plane else SPACE_MARGIN,
+        least_way=0.0 if plane else LEAST_WAY,
+    )
 
 
 def room_of(arm: Arm, kinds: tuple[str, ...], n_obstacles: tuple[int, int], tall: bool) -> Room:
     """Return the room for layouts around an arm."""
     plane = is_planar(arm)
-    rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
-    joints = rng.uniform(low, high, (REACH_SAMPLES, len(low)))
+    joints = np.random.default_rng(0).uniform(low, high, (REACH_SAMPLES, len(low)))
     foot = arm.chain.origin[0].copy()
-    reach = float(np.sqrt(((arm.hand(joints) - foot) ** 2).sum(axis=-1)).max())
-    scale = reach / (PLANE_REACH if plane else SPACE_REACH)
-    foot[2] = 0.0 if plane else foot[2] - SHOULDER * scale
-    ...
+    if plane:
+        foot[2] = arm.hand(arm.home)[2]
+    reach = float(norm(arm.hand(joints) - foot).max())
+    scale = round(reach / (PLANE_REACH if plane else SPACE_REACH), 2)
+    height = TALL_HALF_HEIGHT if tall else LOW_HALF_HEIGHT
+    foot[2] -= 0.0 if plane else SHOULDER * scale
+    turns = not arm.chain.sliding[0] and high[0] - low[0] < 2.0 * np.pi
+    centres = sphere_centres(arm.chain, arm.spheres, arm.home)
+    low_enough = np.abs(centres[:, 2] - foot[2]) < height + arm.spheres.radius
+    passing = arm.spheres.radius[low_enough & (np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) > 1)]
+
+    return Room(
+        kinds,
+        *n_obstacles,
+        scale=scale,
+        foot=(float(foot[0]), float(foot[1]), float(foot[2])),
+        turn=(float(low[0]), float(high[0])) if turns else (-math.pi, math.pi),
+        height=height,
+        hand=float(passing.max(initial=0.0)) / scale,
+        links=_links(arm, scale) if plane else (0.0, 0.0),
+    )
+
+
+def _links(arm: Arm, scale: float) -> tuple[float, float]:
+    """Return the lengths of the links of an arm in the plane, see :class:`Room`."""
+    _, origin = link_poses(arm.chain, planar_joints(arm, arm.hand(arm.home)[:2]))
+    upper, fore = origin[2] - origin[1], arm.hand(arm.home) - origin[2]
+    left = upper[0] * fore[1] - upper[1] * fore[0] < 0.0
+    lengths = float(norm(upper[:2])) / scale, float(norm(fore[:2])) / scale
+    return -lengths[0] if left else lengths[0], lengths[1]

@@ -7,26 +7,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.core.arms.arm import Arm
 from viapoint.envs.core.arms.chain import Chain, Spheres
 from viapoint.envs.core.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
 from viapoint.envs.core.geometry.compiled import compiled
 from viapoint.envs.core.geometry.distance import point_distance
-from viapoint.envs.core.geometry.obstacles import (
-    ABSENT,
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    HALF_SPACE,
-    MESH,
-    SPHERE,
-    Obstacles,
-    no_obstacles,
-)
+from viapoint.envs.core.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
 
 MOST_JUMPS = 4
 """Greatest number of jumps of the target in an episode."""
+ENDS = ("start", "goal")
+"""Names of the ends of a movement."""
 NEVER = 1e9
 """Time of a change that does not happen, [s]."""
 ROUNDING = 1e-9
@@ -34,11 +27,9 @@ ROUNDING = 1e-9
 LEAST_APART = 0.02
 """Least difference of start and goal in the joint that moves most, [rad] or [m]."""
 FARTHEST = 2.0
-"""Greatest coordinate and half length of an obstacle, [m]; half-spaces have none."""
+"""Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none."""
 FASTEST = 1.0
 """Greatest speed of an obstacle, [m/s]."""
-LENGTHS = {SPHERE: 1, CAPSULE: 2, CYLINDER: 2, BOX: 3}
-"""Number of sizes that must be positive, by kind."""
 
 
 class Scenes(NamedTuple):
@@ -137,17 +128,24 @@ def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
 
 @compiled
 def row_clearance(
-    spheres: Spheres, placed: Placed, obstacles: Obstacles, scene: int, row: int, time: float, floor: float
+    spheres: Spheres,
+    placed: Placed,
+    obstacles: Obstacles,
+    scene: int,
+    row: int,
+    time: float,
+    least: float,
+    floor: float,
+    link: int,
 ) -> float:
-    """Return the clearance of a placed arm from one obstacle, at most FAR, without its base, [m].
+    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
 
     The search stops at the first clearance below `floor`; the exact value below it does not matter.
     """
-    least = FAR
     if obstacles.kind[scene, row] == ABSENT:
         return least
     for group in range(len(spheres.link)):
-        if spheres.link[group] == 0:
+        if spheres.link[group] < link:
             continue
         ball = placed.ball[group]
         size = spheres.ball_radius[group]
@@ -183,80 +181,67 @@ def row_clearances(
         place(chain, spheres, joints[scene], placed)
         own[scene] = self_clearance(spheres, placed, FAR, -FAR)
         for row in range(rows):
-            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, -FAR)
+            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, FAR, -FAR, 1)
     return found, own
 
 
-@compiled
-def contains_base(chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles) -> Bool:
-    """Return True for obstacles that contain all spheres of the base, shape (N, n)."""
-    placed = memory(chain, spheres)
-    place(chain, spheres, joints, placed)
-    found = np.zeros(obstacles.kind.shape, np.bool_)
-    for scene in range(found.shape[0]):
-        for row in range(found.shape[1]):
-            if obstacles.kind[scene, row] == ABSENT:
-                continue
-            outside = False
-            some = False
-            for group in range(len(spheres.link)):
-                if spheres.link[group] != 0:
-                    continue
-                place_group(spheres, group, placed)
-                for sphere in range(spheres.first[group], spheres.first[group + 1]):
-                    here, radius = placed.centre[sphere], spheres.radius[sphere]
-                    away = point_distance(obstacles, scene, row, here[0], here[1], here[2], 0.0, FAR)
-                    some = True
-                    outside = outside or away + radius > 0.0
-            found[scene, row] = some and not outside
-    return found
-
-
-class Check:
-    """Check of N scenes; its methods raise ValueError for the first scene that has a fault.
+def check_scenes(
+    scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = (), ends: Sequence[str] = ENDS
+) -> None:
+    """Check that a movement can start and end in each scene, and its changes.
 
     Args:
-        scenes: Scenes.
+        scenes: N scenes whose obstacles were made from shapes.
         arm: Arm.
         names: Names of the obstacles, for messages: one list for each scene.
-    """
+        ends: Ends that are looked at, `start` and `goal`; jumps are only checked together with both.
 
-    def __init__(self, scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -> None:
+    Raises:
+        ValueError: A scene is impossible; the message names the scene, the fault and what is allowed.
+    """
+    check = _Check(scenes, arm, names)
+    check.obstacles()
+    for name in ends:
+        check.end(name, getattr(scenes, name), scenes.obstacles)
+    if len(ends) == len(ENDS):
+        apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
+        allowed = f"start and goal must differ by {LEAST_APART} or more in a joint"
+        check.refuse(apart < LEAST_APART, allowed, apart)
+        check.jumps()
+
+
+def check_jumps(scenes: Scenes, arm: Arm) -> None:
+    """Check the jumps of the target.
+
+    Raises:
+        ValueError: A jump is not later than the one before it, or its target is impossible.
+    """
+    _Check(scenes, arm, ()).jumps()
+
+
+class _Check:
+    """Checks of N scenes, which raise ValueError for the first scene that has a fault."""
+
+    def __init__(self, scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]]) -> None:
         self.scenes, self.arm, self.names = scenes, arm, names
 
-    def all(self) -> None:
-        """Check that a movement can start and end in each scene, and its changes."""
-        self.obstacles()
-        for name, joints in (("start", self.scenes.start), ("goal", self.scenes.goal)):
-            self.end(name, joints, self.scenes.obstacles)
-        apart = np.abs(self.scenes.goal - self.scenes.start).max(axis=-1)
-        self._refuse(apart < LEAST_APART, f"start and goal must differ by {LEAST_APART} or more in a joint", apart)
-        self.changes()
-
     def obstacles(self) -> None:
-        """Check sizes, places and velocities of obstacles."""
-        obstacles = self.scenes.obstacles
-        kind, present = obstacles.kind, obstacles.present
-        parts = (obstacles.centre, obstacles.size, obstacles.velocity, self.scenes.turn_velocity)
-        for values in parts:
-            finite = np.isfinite(values).all(axis=-1)
-            self._refuse_row(present & ~finite, "must be finite")
-        for number, count in LENGTHS.items():
-            size = obstacles.size[..., :count]
-            wrong = (size.min(axis=-1) <= 0.0) | (size.max(axis=-1) > FARTHEST)
-            self._refuse_row((kind == number) & wrong, f"must have sizes over 0 and up to {FARTHEST:g} m")
-        wide = (kind >= MESH) & (obstacles.size[..., 1] > FARTHEST)
-        self._refuse_row(wide, f"must reach at most {FARTHEST:g} m from its own origin")
-        far = present & (kind != HALF_SPACE) & (np.abs(obstacles.centre).max(axis=-1) > FARTHEST)
-        self._refuse_row(far, f"must have its centre at most {FARTHEST:g} m from the origin along each axis")
+        """Check sizes, places and courses of obstacles."""
+        obstacles, turn_time = self.scenes.obstacles, self.scenes.turn_time
+        kind, present, size = obstacles.kind, obstacles.present, obstacles.size
+        # The first size of meshes and clouds is an index.
+        largest = np.where(kind >= MESH, size[..., 1], size.max(axis=-1))
+        self.refuse_row(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest)
+        away = np.abs(obstacles.centre).max(axis=-1)
+        far = present & (kind != HALF_SPACE) & (away > FARTHEST)
+        self.refuse_row(far, f"must be at most {FARTHEST:g} m from the origin along each axis", away)
         for velocity in (obstacles.velocity, self.scenes.turn_velocity):
-            speed = np.sqrt((velocity**2).sum(axis=-1))
-            self._refuse_row(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed)
-        inside = contains_base(self.arm.chain, self.arm.spheres, self.arm.home, obstacles)
-        self._refuse_row(inside, "may touch the base of the arm, but not contain all of it")
+            speed = norm(velocity)
+            self.refuse_row(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed)
+        self.refuse_row(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time)
 
     def end(self, name: str, joints: Float, obstacles: Obstacles, where: Bool | None = None) -> None:
-        """Check an end: finite, inside the joint limits, and free of the arm itself and of obstacles.
+        """Check an end: inside the joint limits, and free of the arm itself and of obstacles.
 
         Args:
             name: Name of the end.
@@ -265,51 +250,49 @@ class Check:
             where: True for scenes that have this end, shape (N,); by default all have it.
         """
         there = np.ones(len(joints), bool) if where is None else where
-        self._refuse(there & ~np.isfinite(joints).all(axis=-1), f"{name} must be finite")
         for joint, (low, high) in enumerate(self.arm.joint_range):
             position = joints[:, joint]
             outside = (position < low - ROUNDING) | (position > high + ROUNDING)
-            named = f"{name}: joint {self.arm.joint_names[joint]!r}"
-            self._refuse(there & outside, f"{named} must be from {low:.4g} to {high:.4g}", position)
+            allowed = f"must be from {low:.4g} to {high:.4g}"
+            self.refuse(there & outside, f"{name}: joint {self.arm.joint_names[joint]!r} {allowed}", position)
         rows, own = row_clearances(self.arm.chain, self.arm.spheres, joints, obstacles)
-        self._refuse(there & (own <= 0.0), f"{name}: the arm touches itself; its clearance must be over 0 m", own)
+        touches = "the arm touches itself; its clearance must be over 0 m"
+        self.refuse(there & (own <= 0.0), f"{name}: {touches}", own)
         touches = f"touches the arm at the {name}; its clearance must be over 0 m"
-        self._refuse_row(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows)
+        self.refuse_row(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows)
 
-    def changes(self) -> None:
-        """Check jumps of the target and changes of course."""
+    def jumps(self) -> None:
+        """Check the jumps of the target."""
         scenes = self.scenes
-        turns = scenes.obstacles.present & (scenes.turn_time < NEVER)
-        late = ~(scenes.turn_time > 0.0)
-        self._refuse_row(turns & late, "must change its course after 0 s", scenes.turn_time)
         before = np.zeros(len(scenes.start))
         for jump in range(MOST_JUMPS):
             time = scenes.jump_times[:, jump]
             given = time < NEVER
             if not given.any():
                 break
-            name = f"target of jump {jump}"
-            self._refuse(given & ~(time > before), f"{name} must come after {'the one before it' if jump else '0 s'}", time)
+            late = given & (time <= before)
+            self.refuse(late, f"jump {jump} must come after the one before it, and after 0 s", time)
             obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
-            self.end(name, np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal), obstacles, given)
-            before = np.where(given, time, before)
+            target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
+            self.end(f"target of jump {jump}", target, obstacles, given)
+            before = time
 
-    def _refuse(self, wrong: Bool, message: str, values: Float | None = None) -> None:
+    def refuse(self, wrong: Bool, message: str, values: Float) -> None:
         """Raise ValueError for the first scene in which something is wrong, shape (N,)."""
         if wrong.any():
             scene = int(wrong.argmax())
-            got = "" if values is None else f", got {values[scene]:.4g}"
-            raise ValueError(f"{self._scene(scene)}{message}{got}")
+            raise ValueError(f"{self._scene(scene)}{message}, got {values[scene]:.4g}")
 
-    def _refuse_row(self, wrong: Bool, message: str, values: Float | None = None) -> None:
+    def refuse_row(self, wrong: Bool, message: str, values: Float) -> None:
         """Raise ValueError for the first obstacle with which something is wrong, shape (N, n)."""
         if wrong.any():
             scene = int(wrong.any(axis=-1).argmax())
             row = int(wrong[scene].argmax())
             known = self.names[scene] if scene < len(self.names) else ()
             name = f" {known[row]!r}" if row < len(known) and known[row] else ""
-            got = "" if values is None else f", got {values[scene, row]:.4g}"
-            raise ValueError(f"{self._scene(scene)}obstacle {row}{name} {message}{got}")
+            raise ValueError(
+                f"{self._scene(scene)}obstacle {row}{name} {message}, got {values[scene, row]:.4g}"
+            )
 
     def _scene(self, scene: int) -> str:
         """Return the beginning of a message: the scene, if there are several."""

@@ -1,0 +1,316 @@
+"""Scenes that are given to `reset` as options, and files of scenes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+from viapoint.envs.core.arms.arm import Arm
+from viapoint.envs.core.arms.inverse_kinematics import inverse_kinematics, planar_joints
+from viapoint.envs.core.arms.kinematics import sphere_centres
+from viapoint.envs.core.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
+from viapoint.envs.core.geometry.shapes import (
+    REGISTERED_MESHES,
+    ConvexMesh,
+    Shape,
+    as_obstacles,
+    obstacles_from_json,
+)
+from viapoint.envs.core.plans import SpaceName
+from viapoint.envs.core.scenes.sampler import Given, SceneSampler
+from viapoint.envs.core.scenes.scene import (
+    ENDS,
+    MOST_JUMPS,
+    NEVER,
+    Scenes,
+    check_scenes,
+    resting,
+    row_clearances,
+)
+
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns")
+"""Options of `reset` that give a scene, or a part of one."""
+FORMAT = "viapoint-scene"
+"""Value of the key `format` of a scene file."""
+REACHED = 1e-6
+"""Greatest distance of the hand from a given place, [m]."""
+
+
+class Pose(NamedTuple):
+    """Pose of the tool.
+
+    Example:
+        >>> from viapoint.envs.core.scenes.options import Pose
+        >>> Pose(position=(0.5, 0.1, 0.4), quaternion=(0.0, 1.0, 0.0, 0.0)).position  # pointing downwards
+        (0.5, 0.1, 0.4)
+    """
+
+    position: Any
+    """Shape (3,), [m]."""
+    quaternion: Any = None
+    """Orientation (w, x, y, z), shape (4,); None for any."""
+
+
+def draw_given(
+    options: Mapping[str, Any], sampler: SceneSampler, generators: Sequence[np.random.Generator]
+) -> Scenes:
+    """Return N scenes with the parts that `options` gives; the other parts are drawn to fit.
+
+    Drawn obstacles stand in the way of given ends; drawn ends are free of given obstacles.
+
+    Args:
+        options: May hold `start` and `goal`: in hand space positions of the hand, shape (2,), (3,) or N of them, [m];
+            in joint space joint positions, shape (J,) or (N, J), or a :class:`Pose` or its dictionary, or N of them.
+            `obstacles`: a list of shapes or dictionaries, or their JSON, for all scenes, or N such lists. `jumps`: rows
+            (time [s], target), and `turns`: rows (time [s], velocity [m/s]) for each given obstacle, of zeros for none;
+            shape (n, .) for all scenes or (N, n, .).
+        sampler: Sampler of the task's scenes.
+        generators: N random generators.
+
+    Raises:
+        ValueError: A part has another shape or is not finite, a name is unknown, or a scene is impossible.
+    """
+    _refuse_unknown(options)
+    if not options:
+        return sampler(generators)
+    number, arm = len(generators), sampler.arm
+    shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
+    obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
+    names = [[shape.name for shape in each] for each in shapes or ()]
+    ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
+    home = np.tile(arm.home, (number, 1))
+    scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
+    if "jumps" in options:
+        scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, number))
+    if "turns" in options:
+        if shapes is None:
+            raise ValueError("options['turns'] are those of options['obstacles'], which must be given, too")
+        turns = _rows("turns", options["turns"], (number, sampler.rows, 4))
+        given = (turns != 0.0).any(axis=-1)
+        scenes.turn_time[given] = turns[given][:, 0]
+        scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
+    # What is wrong with the given parts is said before others are drawn around them.
+    check_scenes(scenes, arm, names, tuple(ends))
+    parts = Given(
+        start=ends.get("start"),
+        goal=ends.get("goal"),
+        obstacles=None if shapes is None else obstacles,
+        jumps=scenes.jumps if "jumps" in options else None,
+        turns=(scenes.turn_time, scenes.turn_velocity) if "turns" in options else None,
+    )
+    try:
+        drawn = sampler(generators, parts)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    check_scenes(drawn, arm, names)
+    return drawn
+
+
+def _refuse_unknown(names: Mapping[str, Any]) -> None:
+    """Check the names of options."""
+    unknown = ", ".join(repr(name) for name in names if name not in OPTIONS)
+    if unknown:
+        raise ValueError(f"options of reset are {', '.join(OPTIONS)} and reset_mask, got {unknown}")
+
+
+def _shapes(value: Any, sampler: SceneSampler, number: int) -> list[list[Shape]]:
+    """Return the given obstacles of N scenes."""
+    if isinstance(value, str):
+        value = obstacles_from_json(value)
+    several = (
+        isinstance(value, Sequence) and bool(value) and all(isinstance(each, list | tuple) for each in value)
+    )
+    if several and len(value) != number:
+        raise ValueError(f"options['obstacles'] must be one list, or {number} lists, got {len(value)}")
+    try:
+        lists = [as_obstacles(each) for each in value] if several else [as_obstacles(value)] * number
+    except ValueError as error:
+        raise ValueError(f"options['obstacles']: {error}") from None
+    for shapes in lists:
+        if len(shapes) > sampler.rows:
+            raise ValueError(
+                f"options['obstacles'] must be at most {sampler.rows}, got {len(shapes)}; make the environment with "
+                "a greater n_obstacles"
+            )
+        for row, shape in enumerate(shapes):
+            _check_shape(row, shape, sampler)
+    return lists
+
+
+def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
+    """Check that a task has obstacles of a kind, and that one does not contain the base of the arm."""
+    kinds = {shape.kind}
+    if isinstance(shape, ConvexMesh):
+        for name, mesh in REGISTERED_MESHES.items():
+            if np.array_equal(mesh.vertices, shape.vertices):
+                kinds.add(name)
+    if not kinds & set(sampler.kinds):
+        allowed = ", ".join(sampler.kinds)
+        raise ValueError(f"obstacle {row} must be one of the shapes of the task, {allowed}, got {shape.kind}")
+    arm = sampler.arm
+    base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
+    centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
+    if base.any() and (shape.distance(centres) + arm.spheres.radius[base]).max() <= 0.0:
+        named = f" {shape.name!r}" if shape.name else ""
+        raise ValueError(f"obstacle {row}{named} may touch the base of the arm, but not contain all of it")
+
+
+def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> Float:
+    """Return the joint positions of a given end, shape (N, J)."""
+    number, joints = len(obstacles.kind), len(sampler.arm.home)
+    label = f"options[{name!r}]"
+    several = [value] * number if isinstance(value, Pose | Mapping) else value
+    if (
+        isinstance(several, Sequence)
+        and several
+        and all(isinstance(each, Pose | Mapping) for each in several)
+    ):
+        if len(several) != number:
+            raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
+        poses = [_pose(label, each) for each in several]
+        if sampler.space == "joints":
+            found = [_solution(label, pose, sampler.arm, obstacles.take([i])) for i, pose in enumerate(poses)]
+            return np.array(found)
+        value = [pose.position for pose in poses]
+    if sampler.space == "joints":
+        array = finite_array(label, value, (joints,), (number, joints))
+        return np.array(np.broadcast_to(array, (number, joints)), order="C")
+    array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
+    height = sampler.room.foot[2]
+    if array.shape[-1] == 3 and (np.abs(array[..., 2] - height) > REACHED).any():
+        raise ValueError(
+            f"{label} must have z = {height:g} m, which is the plane of the hand, got {array.tolist()}"
+        )
+    return _planar(label, sampler.arm, np.broadcast_to(array[..., :2], (number, 2)))
+
+
+def _planar(label: str, arm: Arm, hand: Float) -> Float:
+    """Return the joint positions for places of the hand in the plane, shape (..., 2)."""
+    joints = np.clip(planar_joints(arm, np.array(hand, order="C")), *arm.joint_range.T)
+    away = norm(arm.hand(joints)[..., :2] - hand)
+    if (away > REACHED).any():
+        where = hand[away > REACHED][0].tolist()
+        raise ValueError(
+            f"{label} must be within the arm's reach, got {where} m: the nearest place found is "
+            f"{1e3 * away.max():.1f} mm away"
+        )
+    return joints
+
+
+def _pose(label: str, value: Any) -> Pose:
+    """Return a pose from itself or a dictionary."""
+    if isinstance(value, Pose):
+        return value
+    if "position" not in value or not set(value) <= set(Pose._fields):
+        raise ValueError(f"{label} must have a position, and may have a quaternion, got {value!r:.80}")
+    return Pose(**value)
+
+
+def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles) -> Float:
+    """Return joint positions with the tool at a pose, the first that are free, shape (J,)."""
+    try:
+        found = inverse_kinematics(arm, pose.position, pose.quaternion)
+    except ValueError as error:
+        raise ValueError(f"{label}: {error}") from None
+    many = obstacles.take(np.zeros(len(found), np.int64))
+    rows, own = row_clearances(arm.chain, arm.spheres, found, many)
+    free = np.minimum(rows.min(axis=-1, initial=1.0), own) > 0.0
+    # If none is free, the check of the scene says why.
+    return np.asarray(found[int(free.argmax())])
+
+
+def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
+    """Return given jumps of N scenes in joint positions, the absent ones last."""
+    joints = len(sampler.arm.home)
+    size = 2 if sampler.space == "hand" else joints
+    given = _rows("jumps", value, (number, MOST_JUMPS, 1 + size))
+    present = (given != 0.0).any(axis=-1)
+    jumps = np.zeros((number, MOST_JUMPS, 1 + joints))
+    targets = given[present][:, 1:]
+    if sampler.space == "hand":
+        targets = _planar("target of options['jumps']", sampler.arm, targets)
+    jumps[present] = np.concatenate((given[present][:, :1], targets), axis=-1)
+    order = np.argsort(~present, axis=-1, kind="stable")
+    return np.take_along_axis(jumps, order[..., None], axis=1)
+
+
+def _rows(name: str, value: Any, shape: tuple[int, int, int]) -> Float:
+    """Return an option as rows of N scenes; rows of zeros stand behind the given ones."""
+    number, most, size = shape
+    array = finite_array(f"options[{name!r}]", value)
+    found = np.zeros(shape)
+    if array.size == 0:
+        return found
+    fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number)
+    if not fits or array.shape[-1] != size or array.shape[-2] > most:
+        raise ValueError(
+            f"options[{name!r}] must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
+            f"{array.shape}"
+        )
+    found[:, : array.shape[-2]] = array
+    return found
+
+
+def scene_to_json(
+    scenes: Scenes, arm: Arm, space: SpaceName | None = None, *, scene: int = 0, env_id: str = ""
+) -> str:
+    """Return a scene as JSON, which :func:`scene_from_json` reads as options of `reset`.
+
+    Args:
+        scenes: N scenes.
+        arm: Arm.
+        space: Space of the task; by default, that of the arm.
+        scene: Index of the scene.
+        env_id: Environment of the scene, for readers of the file.
+    """
+    of_hand = (arm.space if space is None else space) == "hand"
+
+    def coordinates(joints: Float) -> list[Any]:
+        return (arm.hand(joints)[..., :2] if of_hand else joints).tolist()  # type: ignore[no-any-return]
+
+    record: dict[str, Any] = {"format": FORMAT}
+    if env_id:
+        record["env"] = env_id
+    record["start"] = coordinates(scenes.start[scene])
+    record["goal"] = coordinates(scenes.goal[scene])
+    record["obstacles"] = [shape.to_dict() for shape in unpack(scenes.obstacles, scene)]
+    times = scenes.jump_times[scene]
+    jumps = scenes.jumps[scene][times < NEVER]
+    if len(jumps):
+        record["jumps"] = [[float(row[0]), *coordinates(row[1:])] for row in jumps]
+    present = scenes.obstacles.present[scene]
+    turn_time = scenes.turn_time[scene][present]
+    if (turn_time < NEVER).any():
+        turns = np.column_stack((turn_time, scenes.turn_velocity[scene][present]))
+        record["turns"] = np.where(turn_time[:, None] < NEVER, turns, 0.0).tolist()
+    return json.dumps(record, indent=1) + "\n"
+
+
+def scene_from_json(text: str | bytes) -> dict[str, Any]:
+    """Return the options of `reset` from the JSON of :func:`scene_to_json`; numbers are checked by `reset`.
+
+    Raises:
+        ValueError: The text is no scene file, or an obstacle is not allowed.
+
+    Example:
+        >>> from viapoint.envs.core.scenes.options import scene_from_json
+        >>> scene_from_json('{"format": "viapoint-scene", "goal": [0.1, 0.4]}')
+        {'goal': [0.1, 0.4]}
+    """
+    try:
+        record = json.loads(text)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"the scene file is not JSON: {error}") from None
+    if not isinstance(record, Mapping) or record.get("format") != FORMAT:
+        raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
+    options = {name: value for name, value in record.items() if name not in ("format", "env")}
+    _refuse_unknown(options)
+    if "obstacles" in options:
+        options["obstacles"] = as_obstacles(options["obstacles"])
+    return options

@@ -1,0 +1,300 @@
+"""Arms that are loaded from MJCF files are those of the file."""
+
+import re
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from viapoint.envs.core.arms.kinematics import forward, sphere_centres, torques
+from viapoint.envs.core.arms.load import load_arm
+
+sys.path.append(str(Path(__file__).parent))
+from self_contact import check_contact_implies_overlap, least_pair_distance
+
+UR5E = Path(__file__).parents[3] / "docs" / "ur5e.xml"
+TEXT = UR5E.read_text(encoding="utf-8")
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+CUBE = " ".join(f"{x} {y} {z}" for x, y, z in np.ndindex(2, 2, 2))
+FETCH = {
+    "hand_site": "robot0:grip",
+    "joints": [
+        f"robot0:{name}_joint"
+        for name in (
+            "shoulder_pan", "shoulder_lift", "upperarm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll",
+        )
+    ],
+    "joint_range": [(-1.6, 1.6), (-1.2, 1.5), (-3.1, 3.1), (-2.2, 2.2), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)],
+    "torque_limit": (33.8, 131.7, 76.9, 66.1, 29.3, 25.7, 7.3),
+    "velocity_limit": 1.5,
+    "home": (0.0, -0.5, 0.0, 1.3, 0.0, 0.77, 0.0),
+}  # fmt: skip
+
+
+def ur5e(file=TEXT, **changes):
+    arguments = {"hand_site": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
+    return load_arm(file, **{**arguments, **changes})
+
+
+def changed(*pairs):
+    """Text of the file with some words replaced, which must be there."""
+    text = TEXT
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ur5e()
+
+
+def check_it_is_the_arm_of(text, arm):
+    """Hand and torques are those of the file's model, and spheres contain its boxes and the centres of its geoms."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    address = [int(model.joint(name).qposadr[0]) for name in arm.joint_names]
+    freedom = [int(model.joint(name).dofadr[0]) for name in arm.joint_names]
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
+    for joints in rng.uniform(*arm.joint_range.T, (20, len(address))):
+        rates, changes = rng.normal(size=(2, len(address)))
+        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+        data.qpos[address], data.qvel[freedom], data.qacc[freedom] = joints, rates, changes
+        mujoco.mj_inverse(model, data)
+        position, axes = forward(arm.chain, joints)
+        np.testing.assert_allclose(position, data.site("hand").xpos, atol=1e-5)
+        np.testing.assert_allclose(axes, data.site("hand").xmat.reshape(3, 3), atol=1e-5)
+        if len(address) == model.nv:
+            needed = torques(arm.chain, joints, rates, changes)
+            np.testing.assert_allclose(needed, data.qfrc_inverse + data.qfrc_constraint, rtol=1e-3, atol=1e-2)
+        centres = sphere_centres(arm.chain, arm.spheres, joints)
+        for geom in range(model.ngeom):
+            if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX.value:
+                points = data.geom_xpos[geom][None]
+            else:
+                points = (
+                    data.geom_xpos[geom]
+                    + (corners * model.geom_size[geom]) @ data.geom_xmat[geom].reshape(3, 3).T
+                )
+            apart = np.linalg.norm(points[:, None] - centres, axis=-1) - arm.spheres.radius
+            assert apart.min(axis=1).max() < 1e-5
+
+
+def test_it_is_the_arm_of_the_file(arm):
+    check_it_is_the_arm_of(TEXT, arm)
+    assert arm.joint_names == JOINTS
+    assert arm.excess <= 0.03
+    np.testing.assert_allclose(arm.torque_limit, [150.0] * 3 + [28.0] * 3)
+
+
+def test_contact_with_itself_implies_that_spheres_overlap(arm):
+    check_contact_implies_overlap(arm)
+
+
+def test_its_file_its_text_and_its_specification_are_the_same_arm(arm):
+    spec = mujoco.MjSpec.from_string(TEXT)
+    others = ur5e(str(UR5E)), ur5e(UR5E), ur5e(spec)
+    assert [each.name for each in others] == ["ur5e", "ur5e", "ur5e-like"]
+    assert all(each.xml == arm.xml for each in others)
+    assert len(spec.joints) == 6  # the specification of the caller is not changed
+
+
+def test_it_tracks_a_movement(arm):
+    model, goal = arm.compile(0), arm.home + 0.5
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data, time = mujoco.MjData(model), np.arange(0.0, 1.5, arm.timestep)
+    share = (time / time[-1])[:, None]
+    position = arm.home + (10 * share**3 - 15 * share**4 + 6 * share**5) * (goal - arm.home)
+    velocity = np.gradient(position, arm.timestep, axis=0)
+    controls = arm.controls(
+        position[None], velocity[None], np.gradient(velocity, arm.timestep, axis=0)[None], 4
+    )[0]
+    data.qpos[:] = arm.home
+    for k in range(len(time) - 1):
+        data.ctrl[:] = controls[k]
+        mujoco.mj_step(model, data)
+        assert np.abs(data.qpos - position[k + 1]).max() < 1e-3
+
+
+FINGERS = "".join(
+    f'<body name="{side}" pos="0 {y} 0.22"><joint name="{side}_root" axis="1 0 0"/><geom size=".01" mass=".05"/>'
+    f'<body name="{side}_tip" pos="0 {y} 0.03"><joint name="{side}_knuckle" axis="1 0 0"/>'
+    '<geom type="box" size=".008 .008 .02" mass=".05"/></body></body>'
+    for side, y in (("left", 0.04), ("right", -0.04))
+)
+
+
+def test_fingers_with_several_joints_stay_where_the_keyframe_has_them():
+    pose = " ".join(map(str, (*HOME, 0.5, -0.9, -0.3, 0.7)))
+    text = changed(
+        ('<site name="hand"', FINGERS + '<site name="hand"'),
+        ("</worldbody>", f'</worldbody><keyframe><key qpos="{pose}"/></keyframe>'),
+    )
+    arm = ur5e(text)
+    assert arm.group_names[-4:] == ("left", "left_tip", "right", "right_tip")
+    check_it_is_the_arm_of(text, arm)
+
+
+SHOULDER = '<body name="shoulder" pos="0 0 0.1625">'
+CARRIAGE = (
+    '<body name="carriage"><joint name="lift" type="slide" axis="0 0.6 0.8" range="0 0.5" damping="3" armature="2" '
+    'actuatorfrcrange="-900 900"/><geom type="box" size=".05 .05 .05" mass="2"/>' + SHOULDER
+)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_slide_is_fixed_as_in_the_keyframe_or_is_a_joint(moves):
+    qpos = " ".join(map(str, (0.2, *HOME)))
+    key = f'</worldbody><keyframe><key qpos="{qpos}"/></keyframe>'
+    text = changed((SHOULDER, CARRIAGE), ("</body>\n  </worldbody>", "</body></body>" + key))
+    names = ("lift", *JOINTS) if moves else JOINTS
+    home = (0.2, *HOME) if moves else HOME
+    arm = ur5e(text, joints=names, home=home, origin=(0.0, 0.0, 0.0))
+    assert arm.chain.sliding.tolist() == ([True] if moves else []) + [False] * 6
+    assert "carriage" in arm.group_names
+    check_it_is_the_arm_of(text, arm)
+
+
+def test_an_arm_of_two_joints_and_a_home_in_the_middle_of_the_ranges(arm):
+    text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0 1"'))
+    two = ur5e(text, joints=JOINTS[:2], hand_site="hand", home=None, torque_limit=500.0)
+    np.testing.assert_allclose(two.home, [0.0, 0.5], atol=1e-5)
+    assert {"shoulder", "upper_arm", "wrist_3"} <= set(two.group_names)
+
+
+def test_pairs_that_the_file_does_not_let_collide_are_left_out():
+    bits = ('size="0.055" mass="8.058"', 'size="0.055" mass="8.058" contype="2" conaffinity="2"')
+    exclude = ("</worldbody>", '</worldbody><contact><exclude body1="shoulder" body2="wrist_3"/></contact>')
+    arm = ur5e(changed(bits, exclude))
+    out = {
+        frozenset((pair.first, pair.second)) for pair in arm.left_out if pair.reason != "consecutive links"
+    }
+    assert out == {frozenset(("shoulder", "wrist_3"))} | {
+        frozenset(("upper_arm", other)) for other in ("base_0", "wrist_1", "wrist_2", "wrist_3")
+    }
+
+
+def test_joints_and_bodies_may_have_any_names(arm):
+    names = ("hand", "obstacle_0", "origin", "world", "a/b", "meshes")
+    pairs = [(f'joint name="{old}"', f'joint name="{new}"') for old, new in zip(JOINTS, names, strict=True)]
+    other = ur5e(changed(*pairs, ('body name="wrist_1"', 'body name="obstacle_0"')), joints=names)
+    np.testing.assert_array_equal(other.hand(HOME), arm.hand(HOME))
+    assert other.compile(2).nbody == arm.compile(2).nbody
+
+
+@pytest.mark.parametrize("gap", [0.02, 0.004])
+def test_bodies_that_are_near_at_home_are_compared_and_fitted_closely(gap):
+    text = near_arm(gap)
+    arm = load_arm(
+        text, hand_site="tool", joints=("one", "two", "three"), velocity_limit=1.0, torque_limit=1e3
+    )
+    assert [(arm.group_names[a], arm.group_names[b]) for a, b in arm.spheres.pairs] == [("a", "c")]
+    assert 0.0 < least_pair_distance(arm, arm.home).min() < gap
+
+
+def test_bodies_that_touch_at_home_are_left_out_and_bodies_too_close_are_refused():
+    arguments = {
+        "hand_site": "tool",
+        "joints": ("one", "two", "three"),
+        "velocity_limit": 1.0,
+        "torque_limit": 1e3,
+    }
+    arm = load_arm(near_arm(-0.001), **arguments)
+    assert [(pair.first, pair.second) for pair in arm.left_out if pair.reason == "in contact at home"] == [
+        ("a", "c")
+    ]
+    with pytest.raises(ValueError, match="'a' and 'c'"):
+        load_arm(near_arm(1e-4), **arguments)
+
+
+def near_arm(gap):
+    """Three links, of which the third has a box at a distance from a ball of the first."""
+    return f"""
+    <mujoco><worldbody>
+      <body name="a"><joint name="one" axis="0 0 1" range="-1 1"/><geom size="0.05" mass="1"/>
+        <body name="b" pos="0 0 0.5"><joint name="two" axis="1 0 0" range="-1 1"/><geom size="0.05" mass="1"/>
+          <body name="c"><joint name="three" axis="0 1 0" range="-1 1"/>
+            <geom type="box" size="0.02 0.02 0.02" pos="0 0 {-0.5 + 0.05 + 0.02 + gap}" mass="0.1"/>
+            <site name="tool" pos="0 0 0.2"/>
+          </body>
+        </body>
+      </body>
+    </worldbody></mujoco>"""
+
+
+def test_without_velocity_limits_a_warning_names_the_default():
+    with pytest.warns(UserWarning, match="2 rad/s"):
+        arm = ur5e(velocity_limit=None)
+    np.testing.assert_array_equal(arm.velocity_limit, 2.0)
+    custom = (
+        "<worldbody>",
+        '<custom><numeric name="velocity_limit" data="1 2 3 4 5 6"/></custom><worldbody>',
+    )
+    np.testing.assert_array_equal(
+        ur5e(changed(custom), velocity_limit=None).velocity_limit, np.arange(1.0, 7.0)
+    )
+
+
+REFUSED = [
+    ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
+    ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
+    ({"hand_site": "tool"}, ValueError), ({"name": 5}, ValueError), ({"name": ""}, ValueError),
+    *[({"joints": joints}, ValueError) for joints in (
+        5, "elbow", JOINTS[:1], (*JOINTS[:5], "wrist_4"), (*JOINTS[:5], JOINTS[0]), (JOINTS[1], JOINTS[0], *JOINTS[2:]),
+    )],
+    *[({"home": home}, ValueError) for home in (HOME[:3], (7.0, *HOME[1:]), "up", (np.nan, *HOME[1:]))],
+    *[({"origin": origin}, ValueError) for origin in ("base", (0, 0), (0.0, 0.0, np.nan))],
+    *[({"joint_range": ranges}, ValueError) for ranges in (
+        {}, [(-np.inf, np.inf)] * 6, [(0.0, 1.0), (0.0,)], [(1.0, -1.0)] * 6,
+    )],
+    *[({"velocity_limit": limit}, ValueError) for limit in ({}, 0.0, -1.0, [1.0, 2.0])],
+    *[({"torque_limit": limit}, ValueError) for limit in (-1.0, [1e-3] * 6, "strong")],
+    *[({"tolerance": tolerance}, ValueError) for tolerance in (0.0, "fine", np.nan)],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "error"), REFUSED)
+def test_invalid_arguments_are_refused(arguments, error):
+    with pytest.raises(error):
+        ur5e(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "other"),
+    [
+        (r' range="-6.2832 6.2832"', ""),  # joints without limits
+        (r' actuatorfrcrange="[^"]*"', ""),  # and without torques
+        (r'<joint name="elbow" range', '<joint name="elbow" type="ball" range'),
+        (r"<geom[^>]*/>", ""),
+        (r"<geom type[^>]*/>", ""),  # bodies without mass
+        (r"(?s).{20}$", ""),  # no XML
+        (r'<geom type="box"', '<geom type="sdf" mesh="cube" mass="0.1"/><geom type="box"'),
+        (r'<joint name="wrist_1" class="wrist"/>((?s:.*?))<joint name="wrist_2"',
+         r'\1<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"'),  # two in one body
+        (r'actuatorfrcrange="-28 28"', 'actuatorfrcrange="0 28"'),  # motors that pull one way
+    ],
+)  # fmt: skip
+def test_files_that_lack_something_are_refused(pattern, other):
+    text = TEXT.replace("<worldbody>", f'<asset><mesh name="cube" vertex="{CUBE}"/></asset><worldbody>')
+    text, number = re.subn(pattern, other, text)
+    assert number
+    with pytest.raises(ValueError):
+        ur5e(text)
+
+
+@pytest.mark.skipif(find_spec("gymnasium_robotics") is None, reason="gymnasium-robotics is not installed")
+def test_the_fetch_of_gymnasium_robotics():
+    assets = Path(find_spec("gymnasium_robotics").submodule_search_locations[0]) / "envs" / "assets"
+    path = assets / "fetch" / "reach.xml"
+    for missing in ("joint_range", "torque_limit"):
+        with pytest.raises(ValueError):
+            load_arm(path, **{**FETCH, missing: None})
+    arm = load_arm(path, **FETCH)
+    assert least_pair_distance(arm, arm.home).min() > 0.0
+    assert "robot0:base_link" in arm.group_names
+    check_contact_implies_overlap(arm)

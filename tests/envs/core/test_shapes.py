@@ -1,0 +1,335 @@
+"""Obstacles are the same as shapes, dictionaries, JSON, packed arrays, rows and geoms; bad input is refused."""
+
+import json
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from viapoint.envs.core.geometry.distance import signed_distances
+from viapoint.envs.core.geometry.obstacles import (
+    ABSENT,
+    KINDS,
+    POSE_SIZE,
+    add_to_model,
+    bounding_boxes,
+    geoms_of,
+    no_obstacles,
+    observation_rows,
+    obstacles_from_rows,
+    pack,
+    unpack,
+)
+from viapoint.envs.core.geometry.shapes import (
+    REGISTERED_MESHES,
+    SHAPES,
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    HalfSpace,
+    PointCloud,
+    Sphere,
+    as_obstacle,
+    as_obstacles,
+    check_kinds,
+    obstacles_from_json,
+    obstacles_to_json,
+    register_mesh,
+)
+
+sys.path.append(str(Path(__file__).parent))
+from random_shapes import random_shape
+
+ALL = pytest.mark.parametrize("kind", KINDS)
+CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
+WEDGE = CUBE[[0, 1, 2, 3, 4, 5]]
+TETRAHEDRON = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]) / 10
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+TWISTED = [(0, 1, 2), (5, 4, 3), (0, 3, 1), (3, 4, 1), (1, 4, 2), (4, 5, 2), (2, 5, 0), (5, 3, 0)]
+"""Faces of Schoenhardt's polyhedron, whose vertices are convex, but which is not."""
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+@pytest.fixture
+def wedge():
+    """A registered mesh, which is gone afterwards."""
+    register_mesh("wedge", WEDGE)
+    yield "wedge"
+    del REGISTERED_MESHES["wedge"]
+
+
+def some_shapes(rng, kinds=KINDS, number=3):
+    return [random_shape(kind, rng, moving=True) for kind in kinds for _ in range(number)]
+
+
+def prism(twist):
+    """Vertices of a prism over a triangle whose upper end is turned."""
+    turn = np.arange(3) * 2.0 * np.pi / 3.0
+    ends = [
+        np.stack((np.cos(a), np.sin(a), np.full(3, z)), axis=1) for a, z in ((turn, 0), (turn + twist, 1))
+    ]
+    return np.concatenate(ends)
+
+
+# Forms of an obstacle
+
+
+@ALL
+def test_dictionaries_and_json_keep_shapes_as_they_are(kind, rng):
+    every = some_shapes(rng, [kind], 20)
+    off = [{**shape.to_dict(), "quaternion": 1.0005 * shape.quaternion, "name": "it"} for shape in every]
+    every += as_obstacles(off)
+    assert obstacles_from_json(obstacles_to_json(every)) == every
+    assert as_obstacles(each.to_dict() for each in every) == every
+    assert every[0] != as_obstacle({**every[0].to_dict(), "name": "it"})
+    assert every[0] != every[1]
+    assert json.loads(obstacles_to_json(every))[0]["shape"] == kind
+    np.testing.assert_allclose([np.linalg.norm(each.quaternion) for each in every], 1.0, atol=1e-12)
+
+
+@ALL
+def test_the_arrays_of_a_shape_are_its_own(kind, rng):
+    given = random_shape(kind, rng)
+    values = {
+        name: np.array(getattr(given, name)) for name in given.parameters() if name not in ("name", "faces")
+    }
+    shape = SHAPES[KINDS.index(kind)](**values)
+    for name, value in values.items():
+        value[...] = 9.0
+        own = getattr(shape, name)
+        assert not isinstance(own, np.ndarray) or not own.flags.writeable
+    assert shape == given
+
+
+def test_packed_obstacles_are_unpacked_as_the_same_shapes(rng):
+    scenes = [some_shapes(rng), [], some_shapes(rng, KINDS[:3], 1)]
+    obstacles = pack(scenes)
+    assert obstacles.present.sum(axis=1).tolist() == [len(scene) for scene in scenes]
+    points = rng.uniform(-0.5, 0.5, (300, 3))
+    for i, scene in enumerate(scenes):
+        again = unpack(obstacles, i)
+        assert [shape.kind for shape in again] == [shape.kind for shape in scene]
+        np.testing.assert_allclose(
+            signed_distances(again, points), signed_distances(scene, points), atol=1e-9
+        )
+        for one, other in zip(again, scene, strict=True):
+            np.testing.assert_array_equal(one.velocity, other.velocity)
+    assert pack([scenes[0]], rows=30).kind.shape == (1, 30)
+    with pytest.raises(ValueError, match="at most 5 obstacles"):
+        pack([scenes[2], scenes[0]], rows=5)
+
+
+def test_scenes_are_taken_and_put(rng):
+    """Tables hold what is in use, once."""
+    first, second = some_shapes(rng), some_shapes(rng)
+    obstacles = pack([first, first, second])
+    other = pack([second, second], rows=len(first))
+    assert len(obstacles.meshes.first) - 1 == len(obstacles.clouds.radius) == 6
+    assert obstacles.take(np.array([True, False, True])).kind.shape[0] == 2
+    before = obstacles.take([0, 1])
+    changed = obstacles.put([1], other.take(slice(1, 2)))
+    changed = changed.put([2], changed.take([0]))
+    points = rng.uniform(-0.5, 0.5, (100, 3))
+    for scene, shapes in enumerate((first, second, first)):
+        np.testing.assert_allclose(
+            signed_distances(unpack(changed, scene), points), signed_distances(shapes, points), atol=1e-9
+        )
+    assert len(changed.meshes.first) - 1 == 6
+    np.testing.assert_array_equal(changed.kind, obstacles.kind)  # in place
+    assert len(changed.put([1], before.take([0])).clouds.radius) == 3
+    empty = no_obstacles(2, 4)
+    assert (empty.kind == ABSENT).all()
+    assert all(np.isfinite(part).all() for part in empty[:5])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_rows_of_observations_are_read_back(dtype, rng, wedge):
+    kinds = ("box", wedge, "half_space", "sphere", "capsule", "cylinder")
+    meshes = [{"shape": wedge, "position": rng.normal(size=3), "velocity": (0.1, 0.2, 0.3)} for _ in range(2)]
+    scenes = [some_shapes(rng, KINDS[:5]), [*meshes, *some_shapes(rng, KINDS[:2])], []]
+    rows = observation_rows(pack(scenes, rows=20), kinds)
+    assert rows.shape == (3, 20, len(kinds) + POSE_SIZE)
+    assert (rows[~pack(scenes, rows=20).present] == 0.0).all()
+    again = obstacles_from_rows(rows.astype(dtype), kinds)
+    atol = 1e-5 if dtype is np.float32 else 1e-9
+    points = rng.uniform(-0.5, 0.5, (100, 3))
+    for i, scene in enumerate(scenes):
+        found = signed_distances(unpack(again, i), points)
+        np.testing.assert_allclose(found, signed_distances(scene, points), atol=atol)
+    np.testing.assert_allclose(observation_rows(again, kinds), rows, atol=atol)
+
+
+def test_bounding_boxes_contain_the_shapes(rng):
+    shapes = some_shapes(rng)
+    centre, half = (part[0] for part in bounding_boxes(pack([shapes])))
+    for shape, middle, size in zip(shapes, centre, half, strict=True):
+        points = middle + rng.uniform(-1.2, 1.2, (20_000, 3)) * size @ shape.rotation.T
+        inside = points[shape.distance(points) < 0.0]
+        if shape.kind == "half_space":
+            assert shape.distance(middle) == pytest.approx(-1.0)
+            continue
+        local = np.abs((inside - middle) @ shape.rotation) / size
+        assert (local.max(axis=0) <= 1.0 + 1e-12).all()
+        assert (local.max(axis=0) > 0.8).all()
+
+
+def test_geoms_are_those_that_mujoco_compiles(rng, wedge):
+    shapes = [*some_shapes(rng, KINDS[:5]), as_obstacle({"shape": wedge, "position": (0.1, 0.2, 0.3)})]
+    spec = mujoco.MjSpec()
+    assert add_to_model(spec, shapes)[0] == ["obstacle_0_0"]
+    model, geoms = spec.compile(), geoms_of(pack([shapes, []], rows=len(shapes)))
+    assert geoms.mesh[0].tolist() == [""] * 15 + [wedge]
+    np.testing.assert_array_equal(geoms.type[0], model.geom_type)
+    plain = slice(0, 15)
+    np.testing.assert_allclose(geoms.size[0, plain], model.geom_size[plain])
+    np.testing.assert_allclose(geoms.bound[0, plain], model.geom_rbound[plain])
+    np.testing.assert_allclose(geoms.position[0, plain], model.geom_pos[plain])
+    turns = np.abs((geoms.quaternion[0] * model.geom_quat).sum(axis=-1))
+    np.testing.assert_allclose(turns[plain], 1.0, atol=1e-12)
+    closed = slice(0, 12)
+    np.testing.assert_allclose(geoms.box[0, closed], model.geom_aabb[closed], atol=1e-12)
+    with pytest.raises(ValueError, match="name"):
+        geoms_of(pack([[ConvexMesh(CUBE)]]))
+    with pytest.raises(ValueError, match="cloud"):
+        geoms_of(pack([[PointCloud(CUBE)]]))
+
+
+# Constructors
+
+
+def test_a_capsule_between_two_points_has_them_as_ends():
+    bar = Capsule.between((0.1, 0.2, 0.3), (0.4, 0.1, 0.2), 0.02, name="bar")
+    way = bar.half_length * bar.rotation[:, 2]
+    np.testing.assert_allclose(bar.position + way, (0.4, 0.1, 0.2), atol=1e-12)
+    np.testing.assert_allclose(bar.position - way, (0.1, 0.2, 0.3), atol=1e-12)
+
+
+def test_a_half_space_faces_normals_of_any_length():
+    wall = HalfSpace.facing((1e-30, 0.0, 0.0), position=(0.5, 0.0, 0.0))
+    np.testing.assert_allclose(wall.rotation[:, 2], (1.0, 0.0, 0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("flat", [1.0, 0.05])
+def test_hulls_are_closed_and_convex_and_look_outwards(flat, rng):
+    for number in (4, 8, 40, 300):
+        points = rng.normal(size=(number, 3)) * (1.0, 1.0, flat)
+        mesh = ConvexMesh.hull(points)
+        corners, normals = mesh.mesh.corners, mesh.mesh.normals
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert ((across * normals).sum(axis=1) > 0.0).all()
+        assert ((points[:, None] - corners[:, 0]) * normals).sum(axis=-1).max() < 1e-6
+        assert len(corners) == 2 * len(mesh.vertices) - 4  # Euler's formula
+        assert ConvexMesh.hull(mesh.vertices) == mesh
+        faces = np.array(
+            [[np.flatnonzero((mesh.vertices == p).all(axis=1))[0] for p in face] for face in corners]
+        )
+        assert ConvexMesh(mesh.vertices, faces).mesh.corners.shape == corners.shape
+        np.testing.assert_allclose(mesh.distance(mesh.vertices), 0.0, atol=1e-9)
+
+
+def test_a_covering_cloud_contains_the_spheres_of_its_points(rng):
+    points = rng.normal(size=(500, 3)) * 0.2
+    cloud = PointCloud.covering(points, spacing=0.1, radius=0.01)
+    assert len(cloud.points) < 450
+    assert (cloud.distance(points) <= -0.01 + 1e-12).all()
+
+
+def test_a_registered_mesh_is_a_shape(wedge):
+    register_mesh(wedge, WEDGE.tolist())  # the same again
+    placed = as_obstacle({"shape": wedge, "position": (1.0, 0.0, 0.0)})
+    assert placed == ConvexMesh(WEDGE, position=(1.0, 0.0, 0.0))
+    assert check_kinds(["box", wedge]) == ("box", wedge)
+    rows = observation_rows(pack([[placed]]), ["box", wedge])
+    assert rows[0, 0, :2].tolist() == [0.0, 1.0]
+
+
+# Refusals
+
+REFUSED = {
+    "sphere": [{"radius": radius} for radius in (0.0, np.nan, -0.1, "a", None, True, (0.1, 0.1), 1j)],
+    "capsule": [{"radius": 0.1, "half_length": 0.1, "name": 3}, {"radius": 0.1}],
+    "cylinder": [{"radius": np.ones(4), "half_length": 1.0}, {"radius": 0.1, "half_length": np.inf}],
+    "box": [{}, {"size": (0.1, -0.1, 0.1)}, {"size": (0.1, 0.1)}, {"size": (1, 1, 1), "centre": 0}],
+    "half_space": [
+        *({"position": position} for position in ((0, 0), (0, 0, np.inf), "abc", np.zeros((2, 3)))),
+        *({"quaternion": quaternion} for quaternion in ((1, 1, 0, 0), (0, 0, 0, 0), (1.002, 0, 0, 0), (1, 0, 0))),
+        *({"velocity": velocity} for velocity in ((0, 0), (0, 0, np.nan))),
+    ],
+    "convex_mesh": [
+        *({"vertices": given} for given in (CUBE[:3], CUBE[:4], np.zeros((5, 3)), CUBE * np.nan, CUBE * 1e200)),
+        {"vertices": [*CUBE, (0.05, 0.05, 0.05)]},
+        *({"vertices": TETRAHEDRON, "faces": faces} for faces in (FACES[:3], [*FACES[:3], (1, 3, 2)], [], "a")),
+        *({"vertices": TETRAHEDRON, "faces": faces} for faces in ([(0, 1, 4)], [(0, 1)], [(0.0, 1.0, 2.0)])),
+        {"vertices": prism(-0.5), "faces": TWISTED},
+    ],
+    "point_cloud": [
+        *({"points": points} for points in ([(0, 0, 0), (0, np.nan, 0)], np.zeros((0, 3)))),
+        *({"points": CUBE, "radius": radius} for radius in (0, np.ones(8))),
+    ],
+    "torus": [{}],
+    3: [{}],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "value", ["box", {"size": (1, 1, 1)}, *({"shape": kind, **each} for kind in REFUSED for each in REFUSED[kind])]
+)  # fmt: skip
+def test_invalid_obstacles_are_refused_with_their_index(value):
+    with pytest.raises(ValueError, match=r"^obstacle 1: "):
+        as_obstacles([Sphere(0.1), value])
+
+
+def test_the_faces_of_a_mesh_are_accepted():
+    assert ConvexMesh(TETRAHEDRON, FACES).distance((-0.1, 0.0, 0.0)) == pytest.approx(0.1)
+    straight = ConvexMesh(prism(0.0), TWISTED)
+    assert ConvexMesh(prism(0.0)).distance((0.0, 0.0, 2.0)) == straight.distance((0.0, 0.0, 2.0))
+
+
+POINT, BALL = np.ones(3), Sphere(0.1)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        *((HalfSpace.facing, (normal,)) for normal in ((0, 0, 0), (0, np.nan, 1), (0, 1))),
+        *((Capsule.between, ((0, 0, 1), end, 0.1)) for end in ((0, 0, 1), (0, 1), (0, 0, np.inf))),
+        *((ConvexMesh.hull, (points,)) for points in (CUBE[:4], CUBE[:3])),
+        *((PointCloud.covering, (CUBE, *numbers)) for numbers in ((-1.0,), (0.0,), (0.2, -0.1))),
+        *((BALL.distance, (points,)) for points in (0.1, (0.1, 0.2), np.zeros((3, 4)), POINT * np.nan, "a")),
+        *((BALL.distance, (POINT, radius)) for radius in (np.nan, -0.1, "a", None, 1j, [0.1, np.inf])),
+        (add_to_model, (mujoco.MjSpec(), [Sphere(0.1, name="obstacle_1"), BALL])),
+        *((signed_distances, (each, POINT)) for each in (BALL, None, "box", [{"shape": "boxx"}])),
+        *((signed_distances, ([], points)) for points in ((0, 1), POINT * np.nan)),
+        *((obstacles_from_json, (text,)) for text in ("[", "{}", "[" * 100_000, None, '[{"shape": 1}]')),
+        *((register_mesh, (name, CUBE)) for name in ("box", "a b", 3, "")),
+        (register_mesh, ("dent", [*CUBE, (0.05, 0.05, 0.05)])),
+        *((check_kinds, (names,)) for names in (["boxx"], ["box", "box"], [3])),
+        (observation_rows, (pack([[BALL]]), ("box",))),
+        (observation_rows, (pack([[ConvexMesh(CUBE)]]), ("box",))),
+        (obstacles_from_rows, (observation_rows(pack([[PointCloud(CUBE)]]), ("point_cloud",)), ("point_cloud",))),
+        (obstacles_from_rows, (observation_rows(pack([[ConvexMesh(CUBE)]]), ("convex_mesh",)), ("convex_mesh",))),
+    ],
+)  # fmt: skip
+def test_invalid_arguments_are_refused(function, arguments):
+    with pytest.raises(ValueError):
+        function(*arguments)
+
+
+def test_another_mesh_of_a_registered_name_is_refused(wedge):
+    with pytest.raises(ValueError, match="another shape"):
+        register_mesh(wedge, CUBE)
+
+
+def test_shapes_cannot_be_changed():
+    with pytest.raises(AttributeError):
+        BALL.radius = 0.2
+    with pytest.raises(ValueError):
+        Box((0.1, 0.1, 0.1)).size[0] = 0.2
+    assert Cylinder(0.1, 0.2) == Cylinder(radius=0.1, half_length=0.2)
