@@ -1,11 +1,12 @@
-"""Environments in which one decision is one movement."""
+"""The environment: reaching around obstacles, N times and once."""
 
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, ClassVar, NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,112 +15,60 @@ from gymnasium.utils import EzPickle, seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from viapoint.envs.actions.via_points import Plan, checked_plan
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import (
     as_given,
     checked_actions,
+    finite_array,
     masked_rows,
     reset_options,
     seeds_of,
     whole_number,
 )
-from viapoint.envs.config import EnvConfig, ViaPointConfig
-from viapoint.envs.mdp.rewards import reward_terms
-from viapoint.envs.rendering.renderer import RENDER_MODES, MovementRenderer
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.episodes import Decision, Episodes, History
+from viapoint.envs.events import Trigger
+from viapoint.envs.outcome import Rollout
+from viapoint.envs.plans import Plan, SpaceName, Timing
+from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
+from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.options import draw_given
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.executor import Execution, Executor, join_groups
-from viapoint.envs.sim.outcome import Rollout
-from viapoint.envs.sim.simulator import Simulator
+from viapoint.envs.scenes.scene import Scenes, check_jumps
+from viapoint.envs.task import END, Task
 
-METADATA: dict[str, Any] = {
-    "render_modes": RENDER_MODES,
-    "render_fps": 50,
-    "autoreset_mode": AutoresetMode.SAME_STEP,
-}
-SINGLE_METADATA = {name: value for name, value in METADATA.items() if name != "autoreset_mode"}
-
-
-class Scheduler:
-    """Runner of stages on a background thread, which starts with the first job, or on the calling thread alone.
-
-    The physics engine is C code that releases Python's global lock, so a background thread can compute references and
-    outcomes in NumPy while the main thread waits for the engine. No result depends on it.
-    """
-
-    def __init__(self, threaded: bool) -> None:
-        self._threaded = threaded
-        self._pool: ThreadPoolExecutor | None = None
-
-    def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Run `job(*arguments)` on the background thread; jobs run one at a time in the order of submission."""
-        if not self._threaded:
-            return _run_now(job, *arguments)
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix="viapoint")
-        return self._pool.submit(job, *arguments)
-
-    def run(
-        self,
-        groups: Sequence[Any],
-        build_references: Callable[[Any], Any],
-        simulate: Callable[[Any], Any],
-        measure: Callable[[Any, Any], Any],
-        meanwhile: Callable[[], Any] | None = None,
-    ) -> tuple[list[Any], Future[Any] | None]:
-        """Run three stages over groups: `simulate` on the calling thread, the others on the background thread.
-
-        With one group there is nothing to overlap, and all stages run on the calling thread. The independent job
-        `meanwhile` may run during the physics; its future is returned with the results of the last stage.
-        """
-        submit = self.submit if len(groups) > 1 else _run_now
-        references = [submit(build_references, group) for group in groups]
-        # The physics waits for the first references only, so the independent job comes after all of them.
-        following = None if meanwhile is None else self.submit(meanwhile)
-        measured = [submit(measure, each.result(), simulate(each.result())) for each in references]
-        return [each.result() for each in measured], following
-
-    def close(self) -> None:
-        """Stop the background thread."""
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
-
-
-def _run_now(job: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Run a job on the calling thread and return its completed future."""
-    done: Future[Any] = Future()
-    done.set_result(job(*arguments))
-    return done
-
-
-class Decision(NamedTuple):
-    """Results of one decision in N environments."""
-
-    observation: Observation
-    reward: Float
-    info: dict[str, Any]
+SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+LEAST_SHARE = 4
+"""Fewest environments for which a thread is worth its while."""
 
 
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Reaching around obstacles by via-points, `num_envs` times.
 
-    Every episode is one decision, so every step ends all episodes and starts the next ones (same-step autoreset): the
-    returned observations are the first ones of the new episodes. The last observations of the old episodes are in
-    `info["final_obs"]`; their info is in `info["final_info"]` and, as all episodes end together, at the top level of
-    `info` too.
+    When an episode ends, the next one begins as `autoreset_mode` says. With same-step autoreset, the default, the
+    returned observation is the first one of the new episode; the last one of the old is in `info["final_obs"]`, and its
+    info in `info["final_info"]` and, as that of the other environments, at the top level of `info`.
 
     Args:
         num_envs: Number of environments N.
         arm: Arm that moves, a record or its name.
-        whole_arm: True if the links must clear the obstacles, too; False for the hand alone.
+        space: Space in which movements are planned: `hand` or `joints`; by default that of the arm.
         n_via: Number of via-points of an action.
-        n_obstacles: Number of obstacles, or the fewest and the most.
-        shapes: Shapes that obstacles may have, such as `("capsule", "box")`; spheres are capsules without a length.
         timing: `optimal` passage times, or `learned` ones as part of the action.
-        duration_range: Shortest and longest movement, [s].
-        reward_weights: Some or all of the weights of :class:`~viapoint.envs.mdp.rewards.RewardWeights`.
+        duration_range: Shortest and longest movement: in hand space [s], in joint space multiples of the shortest
+            movement that the velocity limits allow.
+        n_obstacles: Number of obstacles, or the fewest and the most.
+        shapes: Shapes that obstacles may have; by default those of the families.
+        families: Names of scene families that are drawn; a repeated name is drawn more often.
+        whole_arm: True if obstacles in the plane are so tall that the links must clear them, too.
+        moving_obstacles: True if the obstacles move.
+        n_jumps: Number of jumps of the target, or the fewest and the most.
+        decide_at: `end`, one decision for a movement; `steps`, a velocity in every control step; or events that end a
+            decision before the goal, some of `horizon`, `target`, `course`, `clearance`.
+        horizon: Time after which a decision ends, [s].
+        margin: Predicted clearance below which a decision ends, [m].
+        control_step: Time for which an action holds with `decide_at="steps"`, [s].
+        reward_weights: Some or all of the weights of :class:`~viapoint.envs.rewards.RewardWeights`.
+        autoreset_mode: `SameStep`, `NextStep` or `Disabled`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
@@ -134,72 +83,115 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         (16,)
     """
 
-    metadata = METADATA
-    config_kind: ClassVar[type[EnvConfig]] = ViaPointConfig
-    """Class of the keyword arguments, with their defaults."""
-    __signature__ = ViaPointConfig.signature()
+    metadata = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
-        self.config = config = self.config_kind.of(kwargs)
-        EzPickle.__init__(self, num_envs, **as_given(kwargs))
-        self.task = config.task()
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        arm: Arm | str = "planar",
+        space: SpaceName | None = None,
+        n_via: int = 1,
+        timing: Timing = "optimal",
+        duration_range: tuple[float, float] | None = None,
+        n_obstacles: int | tuple[int, int] = (1, 5),
+        shapes: str | Sequence[str] | None = None,
+        families: str | Sequence[str] | None = None,
+        whole_arm: bool = False,
+        moving_obstacles: bool = False,
+        n_jumps: int | tuple[int, int] = 0,
+        decide_at: str | Sequence[Trigger] = END,
+        horizon: float = 0.3,
+        margin: float = 0.02,
+        control_step: float = 0.04,
+        reward_weights: RewardWeights | Mapping[str, float] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        threads: int = 0,
+    ) -> None:
+        given = as_given({name: value for name, value in locals().items() if name not in ("self", "__class__")})
+        EzPickle.__init__(self, **given)
+        own = ("num_envs", "autoreset_mode", "render_mode", "width", "height", "threads")
+        self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
-        threads = whole_number("threads", config.threads, 0)
-        self.arm, self.action_layout = self.task.arm, self.task.action
-        self.observation_layout = self.task.observation
-        self._sampler = self.task.sampler()
-        self._simulator = Simulator(
-            self.task.collision_model,
-            n_obstacles=self.observation_layout.n_rows,
-            num_envs=self.num_envs,
-            threads=threads,
-            shapes=self.task.scenes.shapes,
-        )
-        self._scheduler = Scheduler(threaded=threads != 1)
-        self._executor = Executor(self._simulator)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**SINGLE_METADATA, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = render_mode
+        number = whole_number("threads", threads, 0) or os.cpu_count() or 1
+        number = max(min(number, self.num_envs // LEAST_SHARE), 1)
+        self._shares = np.array_split(np.arange(self.num_envs), number)
+        self._episodes = [Episodes(self.task, len(share)) for share in self._shares]
+        self._renderers = [
+            EpisodeRenderer(episodes, row, render_mode, width, height, SINGLE_METADATA["render_fps"])
+            for episodes in self._episodes
+            for row in range(len(episodes.begun))
+        ]
+        self._samplers = [self.task.sampler() for _ in self._shares]
+        self._pool: ThreadPoolExecutor | None = None
         self.generators: list[np.random.Generator] = []
         """Random generators of the environments' scenes; empty before the first reset."""
-        self.scenes: Scenes | None = None
-        """Scenes of the running episodes; None before the first reset."""
-        self.terminated = np.ones(self.num_envs, dtype=bool)
+        self._running = False
+        self._over = np.zeros(self.num_envs, bool)
+        self.terminated = np.ones(self.num_envs, bool)
         """True where the last step terminated the episode, shape (num_envs,)."""
-        self.truncated = ~self.terminated
+        self.truncated = np.zeros(self.num_envs, bool)
         """True where the last step truncated the episode, shape (num_envs,)."""
-        self._last: Execution | None = None
-        self.action_names = self.action_layout.names
-        self.render_mode = config.render_mode
-        self._renderer = MovementRenderer(
-            self._simulator, self.render_mode, config.width, config.height, METADATA["render_fps"]
-        )
-        self._build()
+        self.action_names = self.task.action_names
         self.single_action_space = spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
-        self.single_observation_space = self.observation_layout.space()
+        self.single_observation_space = self.task.observation.space()
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-    def _build(self) -> None:
-        """Create what only a subclass has, before the spaces."""
+    # What happened
+
+    @property
+    def arm(self) -> Arm:
+        """Arm that moves."""
+        return self.task.arm
 
     @property
     def model(self) -> Any:
         """MuJoCo model."""
-        return self._simulator.model
+        return self._episodes[0].simulator.model
 
     @property
     def physics_steps(self) -> int:
         """Physics steps simulated so far, all environments together."""
-        return self._simulator.physics_steps
+        return sum(each.simulator.physics_steps for each in self._episodes)
+
+    @property
+    def scenes(self) -> Scenes | None:
+        """Scenes of the running episodes; None before the first reset."""
+        if not self._running:
+            return None
+        return Scenes.together([each.scenes for each in self._episodes if each.scenes is not None])
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
-        """Last movements at every physics step, one for each environment; empty before the first."""
-        return () if self._last is None else tuple(map(self._rollout, range(self.num_envs)))
+        """Last movements at every physics step, one for each environment; empty before the first reset."""
+        if not self._running:
+            return ()
+        return tuple(
+            each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun))
+        )
 
     @property
     def last_plan(self) -> Plan | None:
-        """Last decisions as via-points [m] and durations [s]; None before the first."""
-        return None if self._last is None else self._last.plan
+        """Last decisions as via-points and durations; None before the first, and where the arm is steered."""
+        plans = [each.last_plan for each in self._episodes if each.last_plan is not None]
+        if len(plans) < len(self._episodes):
+            return None
+        return Plan(*(np.concatenate(parts) for parts in zip(*plans, strict=True)))
+
+    @property
+    def last_plans(self) -> tuple[History, ...]:
+        """All plans of the running episodes with the times at which they began, [s]."""
+        return tuple(list(history) for each in self._episodes for history in each.history)
+
+    # Episodes
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -210,64 +202,110 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
             options: `start`, `goal` and `obstacles` set up a given scene, see
                 :func:`~viapoint.envs.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
-                environments to reset, all others keep their scenes.
+                environments to reset, all others keep their episodes.
 
         Raises:
             ValueError: A given scene is impossible; the environments are unchanged.
         """
         options = reset_options(options)
-        rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self.scenes is not None)
+        rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         generators, first_seed = self._seeded(seed, rows)
         # Nothing changes before all scenes are there: impossible ones raise an error.
-        scenes = self._draw(generators, rows, options)
+        tried = [copy.deepcopy(generators[i]) for i in rows]
+        scenes = draw_given(options, self._samplers[0], tried)
+        for i, generator in zip(rows, tried, strict=True):
+            generators[i] = generator
         self.generators = generators
-        self.use_generator(generators[0], first_seed)
-        if len(rows) == self.num_envs:
-            self._last = None
+        self._np_random, self._np_random_seed = generators[0], first_seed
         self._start(rows, scenes)
+        for flags in (self.terminated, self.truncated, self._over):
+            flags[rows] = False
         return self.observe(), {}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
         """Draw the scenes of the first environment from a generator, which was made from `seed`."""
         self._np_random, self._np_random_seed = generator, seed
 
-    def step(self, actions: Any) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Execute one action in each environment; where an episode ends, start the next.
+    def step(self, actions: Any) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
+        """Make one decision in each environment; where an episode ends, the next begins as `autoreset_mode` says.
 
         Args:
             actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
         """
-        rows = np.arange(self.num_envs)
-        # The next scenes depend on no outcome, so they are drawn during the physics.
-        decision, following = self._execute(
-            self._decode(actions), lambda: self._draw(self.generators, rows, {})
+        self._check_running()
+        over = self._over
+        if self.autoreset_mode == AutoresetMode.DISABLED and over.any():
+            raise gym.error.ResetNeeded(
+                f"episode {int(over.argmax())} is over: call reset(options={{'reset_mask': ...}}) before step()"
+            )
+        actions = checked_actions(actions, self.num_envs, self.action_names)
+        decision = self._joined(
+            self._each(lambda episodes, share: episodes.decide(actions[share], ~over[share]))
         )
-        assert following is not None
-        self._start(rows, following.result())
-        return self._as_step(decision)
+        if over.any():  # with next-step autoreset, the next episodes begin instead
+            self._restart(over)
+            for part in (decision.reward, *decision.info.values()):
+                part[over] = 0
+            self.terminated[over] = False
+            self.truncated[over] = False
+            decision = decision._replace(observation=self.observe())
+        return self._as_step(decision, ~over)
 
-    def _as_step(self, decision: Decision) -> tuple[Observation, Float, Any, Any, dict[str, Any]]:
-        """Return the result of `step`: that of a decision, after which the next episodes have begun where one ended."""
-        observation, reward, info = decision
-        ended = self.terminated | self.truncated
-        infos = dict(info)
-        for name in info:
-            infos[f"_{name}"] = np.ones(self.num_envs, dtype=bool)
-        if ended.any():
-            last = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(ended):
-                last[i] = {name: part[i] for name, part in observation.items()}
-            final_info = {}
-            for name, value in info.items():
-                final_info[name] = np.where(ended, value, np.zeros_like(value))
-                final_info[f"_{name}"] = ended.copy()
-            infos |= {"final_obs": last, "_final_obs": ended.copy()}
-            infos |= {"final_info": final_info, "_final_info": ended.copy()}
-            observation = self.observe()
-        return observation, reward, self.terminated.copy(), self.truncated.copy(), infos
+    def execute_actions(self, actions: Any) -> Decision:
+        """Make one decision in each environment and execute it until it ends, without a reset.
+
+        `terminated` and `truncated` tell which episodes ended; these must not be continued.
+        """
+        self._check_running()
+        actions = checked_actions(actions, self.num_envs, self.action_names)
+        decision = self._joined(self._each(lambda episodes, share: episodes.decide(actions[share])))
+        self._show()
+        return decision
+
+    def execute_plan(self, plan: Plan) -> Decision:
+        """Execute one plan in each environment, without a reset.
+
+        Args:
+            plan: Movements of all environments, from the present references to the goals.
+
+        Raises:
+            ValueError: A plan begins elsewhere.
+        """
+        self._check_running()
+        whole = Plan(np.asarray(plan.waypoints), np.asarray(plan.durations))
+        if len(whole.waypoints) != self.num_envs:
+            raise ValueError(f"plan must be {self.num_envs} movements, got {len(whole.waypoints)}")
+        return self._joined(self._each(lambda episodes, share: episodes.execute(whole.take(share))))
+
+    def move_goals(self, goals: Any) -> Observation:
+        """Move the targets of the running episodes, which jump no more, and return the new observations.
+
+        The next decision revises the plans without a jump of position, velocity or acceleration.
+
+        Args:
+            goals: New targets, shape (num_envs, 2) [m] in hand space, (num_envs, J) [rad] in joint space.
+
+        Raises:
+            ValueError: A target is out of reach; the episodes are unchanged.
+        """
+        scenes, space = self._check_running(), self.task.space
+        goals = finite_array("goals", goals, (self.num_envs, space.dimension))
+        inside = space.inside(goals)
+        if not inside.all():
+            row = int(inside.argmin())
+            raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
+        joints = space.joints(goals)
+        check_jumps(scenes._replace(goal=joints), self.arm)
+        self._each(lambda episodes, share: episodes.move_goals(joints[share]))
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """Return the present observations."""
+        parts = [each.observe() for each in self._episodes]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def state(self) -> dict[str, Any]:
-        """Return scenes, random generators and counters as values and arrays for :meth:`restore`.
+        """Return scenes, random generators and running episodes as values and arrays for :meth:`restore`.
 
         Example:
             >>> import gymnasium as gym
@@ -279,113 +317,132 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             >>> (envs.unwrapped.observe()["goal"] == first["goal"]).all()
             np.True_
         """
+        self._check_running()
         return {
             "generators": [generator.bit_generator.state for generator in self.generators],
-            "scenes": self._check_running().as_options(),
-            "physics_steps": self.physics_steps,
+            "episodes": [each.state() for each in self._episodes],
+            "over": self._over.copy(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of environments of the same kind and number."""
-        self.reset(options=state["scenes"])
+        """Continue from a state of environments of the same task, number and number of threads."""
+        if not self.generators:
+            self.generators = [np.random.default_rng() for _ in range(self.num_envs)]
+            self._np_random = self.generators[0]
         for generator, saved in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
-        self._simulator.physics_steps = int(state["physics_steps"])
+        for each, part in zip(self._episodes, state["episodes"], strict=True):
+            each.restore(part)
+        self._over[:] = state["over"]
+        self._running = True
 
-    def execute_actions(self, actions: Any) -> Decision:
-        """Execute one movement in each environment, without a reset.
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a pickle holds: the arguments, and the running episodes."""
+        return {**EzPickle.__getstate__(self), "running": self.state() if self._running else None}
 
-        Args:
-            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
-        """
-        return self._execute(self._decode(actions))[0]
-
-    def execute_plan(self, plan: Plan) -> Decision:
-        """Execute one plan in each environment, with any number of via-points, without a reset.
-
-        Args:
-            plan: Movements of all environments, from the starts to the goals.
-
-        Raises:
-            ValueError: A plan starts elsewhere.
-        """
-        return self._execute(checked_plan(plan, self._check_running().start))[0]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continue the running episodes of a pickle."""
+        running = state.pop("running", None)
+        EzPickle.__setstate__(self, state)
+        if running is not None:
+            self.restore(running)
 
     def render(self) -> Any:
         """Render the last movement of each environment in the render mode; after a reset, the scenes."""
-        if self._last is None:
-            self._check_running()
-        shown = 1 if self.render_mode == "human" else self.num_envs
-        frames = tuple(self._render_one(sim) for sim in range(shown))
-        return None if self.render_mode in (None, "human") else frames
+        self._check_running()
+        if self.render_mode is None:
+            modes = ", ".join(RENDER_MODES)
+            gym.logger.warn(f"render() does nothing without a render_mode; choose one of {modes}")
+            return None
+        if self.render_mode == "human":
+            self._renderers[0].render()
+            return None
+        return tuple(renderer.render() for renderer in self._renderers)
+
+    def _show(self) -> None:
+        """Show a whole episode in the window."""
+        if self.render_mode == "human" and (self.terminated | self.truncated)[0]:
+            self._renderers[0].render()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Stop worker threads and close the render window."""
-        self._scheduler.close()
-        self._renderer.close()
+        """Stop worker threads and close windows."""
+        for renderer in self._renderers:
+            renderer.close()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
 
-    def _decode(self, actions: Any) -> Plan:
-        """Stage 1: return the movements that actions stand for."""
-        scenes = self._check_running()
-        actions = checked_actions(actions, self.num_envs, self.action_names)
-        return self.action_layout.decode(actions, scenes.start, scenes.goal)
+    # Inside
 
-    def _execute(
-        self, plan: Plan, meanwhile: Callable[[], Scenes] | None = None
-    ) -> tuple[Decision, Future[Scenes] | None]:
-        """Stages 2 to 7: scale time, build references, simulate, measure, score and observe.
+    def _each(self, job: Callable[[Episodes, Int], Any]) -> list[Any]:
+        """Return the results of a job for the episodes of each thread, which run side by side."""
+        if len(self._shares) == 1:
+            return [job(self._episodes[0], self._shares[0])]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(len(self._shares), thread_name_prefix="viapoint")
+        return list(self._pool.map(job, self._episodes, self._shares))
 
-        The job `meanwhile` runs during the physics; its future is returned.
-        """
-        stages, scenes = self._executor, self._check_running()
-        scaled = stages.scale_time(scenes, plan)
-        groups, following = self._scheduler.run(
-            scaled.groups(), stages.build_references, stages.simulate, stages.measure, meanwhile
-        )
-        self._last = execution = join_groups(scenes, plan, groups)
-        self.scenes = None
-        terms = reward_terms(execution.outcome, self.action_layout.centre_duration, self.task.weights)
-        reward, info = terms.total(), {**execution.outcome._asdict(), **terms.as_info()}
-        hand = np.asarray(self.arm.hand_position(execution.joints))
-        observation = self.observation_layout.observe(execution.joints, hand, execution.scenes)
-        if self.render_mode == "human":
-            self.render()
-        return Decision(observation, reward, info), following
+    def _joined(self, parts: list[Decision]) -> Decision:
+        """Return the decisions of all environments together."""
+        observation = {
+            name: np.concatenate([part.observation[name] for part in parts]) for name in parts[0].observation
+        }
+        info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+        self.terminated = np.concatenate([part.terminated for part in parts])
+        self.truncated = np.concatenate([part.truncated for part in parts])
+        reward = np.concatenate([part.reward for part in parts])
+        return Decision(observation, reward, self.terminated, self.truncated, info)
 
-    def _render_one(self, sim: int) -> Any:
-        if self.render_mode is None:
-            gym.logger.warn(
-                f"render() does nothing without a render_mode; choose one of {', '.join(RENDER_MODES)}"
-            )
-            return None
-        if self._last is None or (self.scenes is not None and self.num_envs == 1):
-            assert self.scenes is not None
-            return self._renderer.still(self.scenes.take([sim]))
-        scenes, plan = self._last.scenes.take([sim]), self._last.plan.take([sim])
-        return self._renderer.movement(scenes, plan, self._rollout(sim))
+    def _as_step(self, decision: Decision, active: Bool) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
+        """Return the result of `step`, after the next episodes have begun where that is due."""
+        observation, info = decision.observation, decision.info
+        ended = self.terminated | self.truncated
+        self._over = ended.copy()
+        infos = dict(info)
+        for name in info:
+            infos[f"_{name}"] = active.copy()
+        self._show()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
+            self._restart(ended)
+            self._over[:] = False
+            last = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                last[i] = {name: part[i] for name, part in observation.items()}
+            final_info = {}
+            for name, value in info.items():
+                final_info[name] = np.where(ended, value, np.zeros_like(value))
+                final_info[f"_{name}"] = ended.copy()
+            infos |= {"final_obs": last, "_final_obs": ended.copy()}
+            infos |= {"final_info": final_info, "_final_info": ended.copy()}
+            observation = self.observe()
+        return observation, decision.reward, self.terminated.copy(), self.truncated.copy(), infos
 
-    def _rollout(self, sim: int) -> Rollout:
-        """Return the movement of one environment at every physics step."""
-        scene, planned, joints, contact = self._recorded(sim)
-        hand = np.asarray(self.arm.hand_position(joints))
-        time = np.asarray(np.arange(1, len(joints) + 1) * self._simulator.timestep)
-        clearance = self._clearance(scene, hand, joints, time)
-        return Rollout(time, planned, joints, hand, contact, clearance)
+    def _restart(self, ended: Bool) -> None:
+        """Draw the next scenes of some environments, and start them."""
 
-    def _recorded(self, sim: int) -> tuple[Any, Float, Float, Bool]:
-        """Return the scene of one environment, and planned positions, joint angles and contacts of its movement."""
-        assert self._last is not None
-        return self._last.scenes.take([sim]), *self._executor.recorded(self._last, sim)
+        def restart(episodes: Episodes, share: Int) -> None:
+            rows = np.flatnonzero(ended[share])
+            if rows.size:
+                sampler = self._samplers[self._episodes.index(episodes)]
+                scenes = sampler([self.generators[share[row]] for row in rows])
+                episodes.start(rows, scenes, keep=True)
 
-    def _clearance(self, scene: Any, hand: Float, joints: Float, time: Float) -> Float:
-        """Return the clearance in one scene at each time, shape (T,), [m]."""
-        obstacles, present = (np.repeat(part, len(time), axis=0) for part in (scene.obstacles, scene.present))
-        return self.task.collision_model.least_clearance(hand[:, None], obstacles, present, joints[:, None])
+        self._each(restart)
+
+    def _start(self, rows: Int, scenes: Scenes) -> None:
+        """Start given scenes in some environments."""
+        for episodes, share in zip(self._episodes, self._shares, strict=True):
+            inside = np.isin(rows, share)
+            if inside.any():
+                episodes.start(rows[inside] - share[0], scenes.take(inside))
+        self._running = True
 
     def _check_running(self) -> Scenes:
-        if self.scenes is None:
-            raise gym.error.ResetNeeded("the episodes are over or have not begun: call reset() before step()")
-        return self.scenes
+        """Return the running scenes, or raise an error before the first reset."""
+        scenes = self.scenes
+        if scenes is None:
+            raise gym.error.ResetNeeded("the episodes have not begun: call reset() before step()")
+        return scenes
 
     def _seeded(
         self, seed: int | Sequence[int | None] | None, rows: Int
@@ -399,117 +456,3 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 generators[i], used = seeding.np_random(seeds[i])
                 first_seed = used if i == 0 else first_seed
         return generators, first_seed
-
-    def _draw(self, generators: list[np.random.Generator], rows: Int, options: Mapping[str, Any]) -> Scenes:
-        """Sample or set up scenes for some environments; if one is refused, the generators are unchanged."""
-        if not options:
-            return self._sampler([generators[i] for i in rows])
-        tried = [copy.deepcopy(generators[i]) for i in rows]
-        scenes = draw_given(options, self._sampler, tried, self.observation_layout.n_rows)
-        for i, generator in zip(rows, tried, strict=True):
-            generators[i] = generator
-        return scenes
-
-    def _start(self, rows: Int, scenes: Scenes) -> Float:
-        """Start episodes with the arms at rest at the start and the obstacles in place; return the joint angles."""
-        if self.scenes is None or len(rows) == self.num_envs:
-            self.scenes = scenes
-        else:
-            self.scenes = type(scenes)(*(field.copy() for field in self.scenes))
-            self.scenes.put(rows, scenes)
-        joints = np.asarray(self.arm.inverse_kinematics(scenes.start))
-        self._simulator.place(rows, joints, scenes.obstacles, scenes.present)
-        return joints
-
-    def observe(self) -> Observation:
-        """Return the present observations."""
-        assert self.scenes is not None
-        joints = np.asarray(self.arm.inverse_kinematics(self.scenes.start))
-        return self.observation_layout.observe(joints, self.scenes.start, self.scenes)
-
-
-class ReachEnv(gym.Env[Any, Any], EzPickle):
-    """One environment of a :class:`ReachVectorEnv`, with the same keyword arguments.
-
-    Example:
-        >>> import gymnasium as gym
-        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
-        >>> observation, _ = env.reset(seed=0)
-        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        >>> type(env.unwrapped).__name__
-        'ReachEnv'
-    """
-
-    metadata = SINGLE_METADATA
-    batch_kind: ClassVar[type[ReachVectorEnv]] = ReachVectorEnv
-    """Vector environment class that this environment wraps."""
-
-    def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
-        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
-        self.batch = self.batch_kind(1, threads=threads, **kwargs)
-        """Vector environment with one environment."""
-        self.observation_space = self.batch.single_observation_space
-        self.action_space = self.batch.single_action_space
-        self.render_mode = self.batch.render_mode
-        self.task = self.batch.task
-        self.action_layout = self.batch.action_layout
-        self.observation_layout = self.batch.observation_layout
-        self._over = True
-
-    @property
-    def last_rollout(self) -> Rollout | None:
-        """Last movement at every physics step; None before the first."""
-        rollouts = self.batch.last_rollout
-        return rollouts[0] if rollouts else None
-
-    @property
-    def last_plan(self) -> Plan | None:
-        """Last decision as via-points (K + 2, D) [m] and durations (K + 1,) [s]; None before the first."""
-        plan = self.batch.last_plan
-        return None if plan is None else plan.take(0)
-
-    @property
-    def model(self) -> Any:
-        """MuJoCo model."""
-        return self.batch.model
-
-    @property
-    def physics_steps(self) -> int:
-        """Physics steps simulated so far."""
-        return self.batch.physics_steps
-
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode; see :meth:`ReachVectorEnv.reset`."""
-        self.batch.use_generator(self._np_random, self._np_random_seed)
-        observation, info = self.batch.reset(seed=seed, options=options)
-        self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
-        self._over = False
-        if self.render_mode == "human":
-            self.batch.render()
-        return {name: part[0] for name, part in observation.items()}, info
-
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Execute one action, see :meth:`ReachVectorEnv.step`; where it is a movement, it ends the episode.
-
-        Args:
-            action: Shape (m,), in [-1, 1]; components beyond are clipped.
-        """
-        if self._over:
-            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
-        observation, reward, info = self.batch.execute_actions([action])
-        terminated, truncated = bool(self.batch.terminated[0]), bool(self.batch.truncated[0])
-        self._over = terminated or truncated
-        seen = {name: part[0] for name, part in observation.items()}
-        values = {name: value[0].item() for name, value in info.items()}
-        return seen, float(reward[0]), terminated, truncated, values
-
-    def render(self) -> Any:
-        """Render the last movement in the render mode; after a reset, the scene."""
-        frames = self.batch.render()
-        return None if frames is None else frames[0]
-
-    def close(self) -> None:
-        """Stop worker threads and close the render window."""
-        self.batch.close()

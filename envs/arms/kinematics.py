@@ -1,220 +1,358 @@
-"""Forward kinematics and inverse dynamics of a serial chain of hinges.
+"""Forward kinematics, Jacobians and inverse dynamics of a chain of joints.
 
-All functions are batched, and compute in the precision of their arguments. A vector is kept as its three components,
-each an array over the batch, so that every operation is one pass over contiguous memory. Products with constants that
-are 0 or 1 in a robot's dimensions are skipped: most entries of its link frames are.
+Compiled functions work on one configuration and fill arrays of the caller. The functions at the end of the module are
+batched over leading axes; they check their arguments and return new arrays.
 """
 
 from __future__ import annotations
 
-import functools
-import operator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+import math
 
 import numpy as np
 
-from viapoint.envs.common.arrays import cosine_and_sine
-from viapoint.envs.common.types import Array
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.kernels import inlined, kernel
 
-Vector = Any
-"""Three components: an array of shape (3, ...) or three arrays."""
-Constants = tuple[float, float, float]
-"""Vector that is the same in the whole batch."""
-
-GRAVITY = 9.81
-"""Gravitational acceleration along -z, [m/s^2]."""
+Vector = tuple[float, float, float]
+"""Three components."""
 
 
-class Frame(NamedTuple):
-    """Joint frame in the world: its axes, z along the joint, and its origin [m]."""
+@kernel
+def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
+    """Fill the world frames of links 0 to J.
 
-    x: Vector
-    y: Vector
-    z: Vector
-    origin: Vector
-
-    def rotate(self, vector: Constants) -> Vector:
-        """Return a vector of this frame in world axes."""
-        return _combine((self.x, self.y, self.z), vector)
-
-    def transform(self, point: Constants) -> Vector:
-        """Return the world position of a point of this frame, [m]."""
-        return self.origin + self.rotate(point)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hinge:
-    """Hinge about the z axis of its frame, with the mass of all bodies that move with it and no later hinge."""
-
-    turn: tuple[Constants, Constants, Constants]
-    """Axes x, y and z of the frame at angle 0, in the frame of the previous joint."""
-    offset: Constants
-    """Origin of the frame, in the frame of the previous joint, [m]."""
-    mass: float
-    """Mass, [kg]."""
-    centre: Constants
-    """Centre of mass, [m]."""
-    inertia: tuple[Constants, Constants, Constants]
-    """Rotational inertia about the centre of mass, [kg m^2]."""
-
-    @functools.cached_property
-    def first_moments(self) -> Constants:
-        """First moments of the mass about the frame's origin, [kg m]."""
-        x, y, z = self.centre
-        return self.mass * x, self.mass * y, self.mass * z
-
-    @functools.cached_property
-    def second_moments(self) -> tuple[Constants, ...]:
-        """Second moments of the mass about the frame's origin, the integral of r r^T dm, [kg m^2]."""
-        inertia, centre = np.array(self.inertia), np.array(self.centre)
-        about_centre = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-        return tuple(map(tuple, (about_centre + self.mass * np.outer(centre, centre)).tolist()))
-
-    def to_joint_frame(self, vector: Vector, cosine: Array, sine: Array) -> Vector:
-        """Return a vector of the previous joint's frame in this joint's frame."""
-        x, y, z = (_combine(vector, axis) for axis in self.turn)
-        return [cosine * x + sine * y, cosine * y - sine * x, z]
-
-    def to_previous_frame(self, vector: Vector, cosine: Array, sine: Array) -> Vector:
-        """Return a vector of this joint's frame in the previous joint's frame."""
-        x, y, z = vector
-        turned = cosine * x - sine * y, sine * x + cosine * y, z
-        return [_combine(turned, weights) for weights in zip(*self.turn, strict=True)]
+    Args:
+        chain: Chain of J joints.
+        joints: Configuration, shape (J,), [rad] or [m].
+        rotation: Axes of the frames as columns, shape (J + 1, 3, 3).
+        origin: Origins of the frames, shape (J + 1, 3), [m].
+    """
+    for row in range(3):
+        for column in range(3):
+            rotation[0, row, column] = 0.0
+        rotation[0, row, row] = 1.0
+        origin[0, row] = 0.0
+    fixed, place = chain.rotation, chain.origin
+    for j in range(joints.shape[0]):
+        slides = chain.sliding[j]
+        cosine, sine, shift = 1.0, 0.0, 0.0
+        if slides:
+            shift = joints[j]
+        else:
+            cosine, sine = math.cos(joints[j]), math.sin(joints[j])
+        for row in range(3):
+            a, b, c = rotation[j, row, 0], rotation[j, row, 1], rotation[j, row, 2]
+            # A row of the frame of the joint at 0, and then turned about its z axis.
+            x = a * fixed[j, 0, 0] + b * fixed[j, 1, 0] + c * fixed[j, 2, 0]
+            y = a * fixed[j, 0, 1] + b * fixed[j, 1, 1] + c * fixed[j, 2, 1]
+            z = a * fixed[j, 0, 2] + b * fixed[j, 1, 2] + c * fixed[j, 2, 2]
+            rotation[j + 1, row, 0] = cosine * x + sine * y
+            rotation[j + 1, row, 1] = cosine * y - sine * x
+            rotation[j + 1, row, 2] = z
+            along = a * place[j, 0] + b * place[j, 1] + c * place[j, 2]
+            origin[j + 1, row] = origin[j, row] + along + shift * z
 
 
-@dataclass(frozen=True, kw_only=True)
-class Chain:
-    """Serial chain of J hinges from the world to the hand."""
+@inlined
+def transform(rotation: Float, origin: Float, link: int, point: Float) -> Vector:
+    """Return the world position of a point of a link, [m]; the frames are those of :func:`link_frames`."""
+    x, y, z = point[0], point[1], point[2]
+    return (
+        origin[link, 0] + rotation[link, 0, 0] * x + rotation[link, 0, 1] * y + rotation[link, 0, 2] * z,
+        origin[link, 1] + rotation[link, 1, 0] * x + rotation[link, 1, 1] * y + rotation[link, 1, 2] * z,
+        origin[link, 2] + rotation[link, 2, 0] * x + rotation[link, 2, 1] * y + rotation[link, 2, 2] * z,
+    )
 
-    hinges: tuple[Hinge, ...]
 
-    def frames(self, joints: Array) -> list[Frame]:
-        """Return the world frame of every joint at angles of shape (..., J), [rad]."""
-        frames: list[Frame] = []
-        cosines, sines = self._cosines_and_sines(joints)
-        units = np.eye(3, dtype=joints.dtype).reshape(3, 3, *[1] * (joints.ndim - 1))
-        previous = Frame(units[0], units[1], units[2], np.zeros_like(units[0]))
-        for hinge, cosine, sine in zip(self.hinges, cosines, sines, strict=True):
-            x, y, z = (previous.rotate(axis) for axis in hinge.turn)
-            origin = previous.transform(hinge.offset)
-            previous = Frame(cosine * x + sine * y, cosine * y - sine * x, z, origin)
-            frames.append(previous)
-        return frames
-
-    def points(self, joints: Array, places: tuple[tuple[int, Constants], ...]) -> Array:
-        """Return the world positions of P points in frames of joints (index, point), shape (..., P, 3), [m]."""
-        frames = self.frames(joints)
-        placed = [frames[index].transform(point) for index, point in places]
-        # Each component is contiguous in memory: callers mostly read one component after the other.
-        shape = (3, *joints.shape[:-1])
-        whole = [part if part.shape == shape else np.broadcast_to(part, shape) for part in placed]
-        return np.moveaxis(np.stack(whole, axis=0), (0, 1), (-2, -1))
-
-    def torques(self, joints: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
-        """Return the torques of the motion without gravity, and those against gravity, shape (..., J) each, [N m].
-
-        Recursive Newton-Euler algorithm in joint frames: J. Y. S. Luh, M. W. Walker and R. P. C. Paul, On-line
-        computational scheme for mechanical manipulators, 1980. With f and n the force and the moment that act on a link
-        from its predecessor, p the offset of the next frame and R its rotation, the inward recursion is
-
-            f_i = F_i + R f_{i+1},   n_i = N_i + R n_{i+1} + p x R f_{i+1},   torque_i = (n_i)_z.
-
-        Gravity needs no recursion of forces: the torque is that of the weight of all links further out, from their
-        first moments of mass.
-
-        Args:
-            joints: Angles, shape (..., J), [rad].
-            rates: Angular velocities, shape (..., J), [rad/s].
-            accelerations: Angular accelerations, shape (..., J), [rad/s^2].
-        """
-        turns = list(zip(*self._cosines_and_sines(joints), strict=True))
-        forces, moments, ups = self._inertial_forces(turns, rates, accelerations)
-        moving, holding = [], []
-        force, moment, lever, mass = forces[-1], moments[-1], list(self.hinges[-1].first_moments), 0.0
-        for index in reversed(range(len(self.hinges))):
-            hinge, up = self.hinges[index], ups[index]
-            moving.append(moment[2])
-            holding.append(GRAVITY * (lever[0] * up[1] - lever[1] * up[0]))  # z component of lever x up
-            if index:
-                previous = self.hinges[index - 1]
-                mass += hinge.mass
-                force, moment, lever = (
-                    hinge.to_previous_frame(part, *turns[index]) for part in (force, moment, lever)
-                )
-                moment = _add(_add(moment, _cross(hinge.offset, force)), moments[index - 1])
-                force = _add(force, forces[index - 1])
-                lever = [
-                    a + mass * b + c
-                    for a, b, c in zip(lever, hinge.offset, previous.first_moments, strict=True)
-                ]
-        return np.stack(moving[::-1], axis=-1), np.stack(holding[::-1], axis=-1)
-
-    def _inertial_forces(
-        self, turns: list[tuple[Array, Array]], rates: Array, accelerations: Array
-    ) -> tuple[list[Vector], list[Vector], list[Vector]]:
-        """Return each link's inertial force F, its moment N about the joint, and the vertical, in joint frames.
-
-        Outward recursion of the Newton-Euler algorithm. With angular velocity w, the acceleration of a point r of a
-        link is a + A r, A = [w]x [w]x + [dw/dt]x. Integrated over the mass, with its first moments s,
-
-            F = m a + A s,   N = s x a + integral of r x (A r) dm,
-
-        in which the second moments S of the mass give the last term, e.g. along x: A_z . S_y - A_y . S_z (rows).
-        """
-        spin, turn, acceleration, up = [0.0] * 3, [0.0] * 3, [0.0] * 3, [0.0, 0.0, 1.0]
-        rows: list[Vector] = [[0.0] * 3] * 3  # of A, in the previous frame
-        forces, moments, ups = [], [], []
-        for index, hinge in enumerate(self.hinges):
-            acceleration = [
-                a + _combine(row, hinge.offset) for a, row in zip(acceleration, rows, strict=True)
-            ]
-            spin, turn, acceleration, up = (
-                hinge.to_joint_frame(part, *turns[index]) for part in (spin, turn, acceleration, up)
+@kernel
+def tool_frame(
+    chain: Chain, rotation: Float, origin: Float, tool_rotation: Float, tool_origin: Float
+) -> None:
+    """Fill the world frame of the tool, shapes (3, 3) and (3,), from the frames of the links."""
+    last = chain.origin.shape[0]
+    tool_origin[0], tool_origin[1], tool_origin[2] = transform(rotation, origin, last, chain.tool_origin)
+    for row in range(3):
+        for column in range(3):
+            tool_rotation[row, column] = (
+                rotation[last, row, 0] * chain.tool_rotation[0, column]
+                + rotation[last, row, 1] * chain.tool_rotation[1, column]
+                + rotation[last, row, 2] * chain.tool_rotation[2, column]
             )
-            rate = rates[..., index]
-            # The joint adds rate z to the angular velocity w, and its derivative, in which z turns with w.
-            turn = [turn[0] + rate * spin[1], turn[1] - rate * spin[0], turn[2] + accelerations[..., index]]
-            spin = [spin[0], spin[1], spin[2] + rate]
-            rows = _acceleration_rows(spin, turn)
-            forces.append(
-                [
-                    hinge.mass * a + _combine(row, hinge.first_moments)
-                    for a, row in zip(acceleration, rows, strict=True)
-                ]
-            )
-            (a, b, c), (x, y, z) = rows, hinge.second_moments
-            pairs = ((c, y, b, z), (a, z, c, x), (b, x, a, y))
-            spinning = [_combine(p, u) - _combine(q, v) for p, u, q, v in pairs]
-            moments.append(_add(_cross(hinge.first_moments, acceleration), spinning))
-            ups.append(up)
-        return forces, moments, ups
-
-    def _cosines_and_sines(self, joints: Array) -> tuple[Array, Array]:
-        """Return cosine and sine of every angle, with the joints along the first axis."""
-        angles = [joints[..., index] for index in range(len(self.hinges))]
-        return cosine_and_sine(np.stack(angles, axis=0))
 
 
-def _acceleration_rows(spin: Vector, turn: Vector) -> list[Vector]:
-    """Return the rows of A = [w]x [w]x + [dw/dt]x for the angular velocity w and its derivative."""
-    (x, y, z), (u, v, w) = spin, turn
-    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
-    return [[-yy - zz, xy - w, xz + v], [xy + w, -xx - zz, yz - u], [xz - v, yz + u, -xx - yy]]
+@kernel
+def tool_position(chain: Chain, joints: Float, rotation: Float, origin: Float) -> Vector:
+    """Return the world position of the tool, [m], and fill the frames of the links."""
+    link_frames(chain, joints, rotation, origin)
+    return transform(rotation, origin, chain.origin.shape[0], chain.tool_origin)
 
 
-def _combine(axes: Any, weights: Constants) -> Any:
-    """Return the sum of axes, or components, times constant weights; weights of 0 and 1 cost no product."""
-    used = [(axis, weight) for axis, weight in zip(axes, weights, strict=True) if weight != 0.0]
-    parts = [axis if weight == 1.0 else weight * axis for axis, weight in used] or [0.0 * axes[0]]
-    return functools.reduce(operator.add, parts)
+@kernel
+def point_jacobian(
+    chain: Chain, rotation: Float, origin: Float, link: int, x: float, y: float, z: float, jacobian: Float
+) -> None:
+    """Fill the derivative of the world position of a point (x, y, z) of a link by the joints, shape (3, J) or more."""
+    for j in range(chain.origin.shape[0]):
+        jacobian[0, j] = 0.0
+        jacobian[1, j] = 0.0
+        jacobian[2, j] = 0.0
+    for j in range(link):
+        u, v, w = rotation[j + 1, 0, 2], rotation[j + 1, 1, 2], rotation[j + 1, 2, 2]
+        if not chain.sliding[j]:
+            arm = (x - origin[j + 1, 0], y - origin[j + 1, 1], z - origin[j + 1, 2])
+            u, v, w = _cross((u, v, w), arm)
+        jacobian[0, j] = u
+        jacobian[1, j] = v
+        jacobian[2, j] = w
 
 
+@kernel
+def tool_jacobian(
+    chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float
+) -> None:
+    """Fill the derivative of the tool's position and of its rotation vector by the joints, in world axes, shape (6, J)."""
+    n_joints = chain.origin.shape[0]
+    x, y, z = tool_origin[0], tool_origin[1], tool_origin[2]
+    point_jacobian(chain, rotation, origin, n_joints, x, y, z, jacobian)
+    for j in range(n_joints):
+        turns = 0.0 if chain.sliding[j] else 1.0
+        for row in range(3):
+            jacobian[3 + row, j] = turns * rotation[j + 1, row, 2]
+
+
+@kernel
+def _cross(first: Vector, second: Vector) -> Vector:
+    a, b, c = first
+    x, y, z = second
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@kernel
 def _add(first: Vector, second: Vector) -> Vector:
-    return [a + b for a, b in zip(first, second, strict=True)]
+    return first[0] + second[0], first[1] + second[1], first[2] + second[2]
 
 
-def _cross(constant: Constants, vector: Vector) -> Vector:
-    """Return the cross product of a constant vector and a vector."""
-    x, y, z = constant
-    return [_combine(vector, weights) for weights in ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))]
+@kernel
+def _row(array: Float, index: int) -> Vector:
+    return array[index, 0], array[index, 1], array[index, 2]
+
+
+@kernel
+def _to_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
+    """Return a vector of the frame of link j in the frame of link j + 1."""
+    a, b, c = vector
+    x = fixed[j, 0, 0] * a + fixed[j, 1, 0] * b + fixed[j, 2, 0] * c
+    y = fixed[j, 0, 1] * a + fixed[j, 1, 1] * b + fixed[j, 2, 1] * c
+    z = fixed[j, 0, 2] * a + fixed[j, 1, 2] * b + fixed[j, 2, 2] * c
+    return cosine * x + sine * y, cosine * y - sine * x, z
+
+
+@kernel
+def _from_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
+    """Return a vector of the frame of link j + 1 in the frame of link j."""
+    x = cosine * vector[0] - sine * vector[1]
+    y = sine * vector[0] + cosine * vector[1]
+    z = vector[2]
+    return (
+        fixed[j, 0, 0] * x + fixed[j, 0, 1] * y + fixed[j, 0, 2] * z,
+        fixed[j, 1, 0] * x + fixed[j, 1, 1] * y + fixed[j, 1, 2] * z,
+        fixed[j, 2, 0] * x + fixed[j, 2, 1] * y + fixed[j, 2, 2] * z,
+    )
+
+
+@kernel
+def _rigid_acceleration(linear: Vector, spin: Vector, turn: Vector, point: Vector) -> Vector:
+    """Return the acceleration of a point of a body with the acceleration `linear` of its origin.
+
+    The angular velocity is `spin`, and its derivative `turn`.
+    """
+    centripetal = _cross(spin, _cross(spin, point))
+    return _add(linear, _add(_cross(turn, point), centripetal))
+
+
+@compiled
+def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+    """Fill the torques or forces that move the joints as given, shape (J,), [N m] or [N].
+
+    Recursive Newton-Euler algorithm in the frames of the links (J. Y. S. Luh, M. W. Walker and R. P. C. Paul, On-line
+    computational scheme for mechanical manipulators, 1980), with gravity as an acceleration of the base, and with the
+    inertia of the motors and viscous friction.
+
+    Args:
+        chain: Chain of J joints.
+        q: Configuration, shape (J,), [rad] or [m].
+        v: Velocities, shape (J,).
+        a: Accelerations, shape (J,).
+        torque: Result, shape (J,).
+    """
+    n_joints = q.shape[0]
+    fixed = chain.rotation
+    # For each link: force, moment about the frame's origin, origin in the frame of the link before, cosine and sine.
+    work = np.empty((n_joints, 11))
+    spin = (0.0, 0.0, 0.0)
+    turn = (0.0, 0.0, 0.0)
+    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])
+    for j in range(n_joints):
+        slides = chain.sliding[j]
+        cosine, sine = 1.0, 0.0
+        origin = _row(chain.origin, j)
+        if slides:
+            shift = (q[j] * fixed[j, 0, 2], q[j] * fixed[j, 1, 2], q[j] * fixed[j, 2, 2])
+            origin = _add(origin, shift)
+        else:
+            cosine, sine = math.cos(q[j]), math.sin(q[j])
+        linear = _rigid_acceleration(linear, spin, turn, origin)
+        linear = _to_link(fixed, j, cosine, sine, linear)
+        spin = _to_link(fixed, j, cosine, sine, spin)
+        turn = _to_link(fixed, j, cosine, sine, turn)
+        if slides:
+            # A sliding joint adds its acceleration and that of Coriolis, 2 spin x v z.
+            linear = (linear[0] + 2.0 * v[j] * spin[1], linear[1] - 2.0 * v[j] * spin[0], linear[2] + a[j])
+        else:
+            # The axis z turns with the body: the derivative of v z is a z + v spin x z.
+            turn = (turn[0] + v[j] * spin[1], turn[1] - v[j] * spin[0], turn[2] + a[j])
+            spin = (spin[0], spin[1], spin[2] + v[j])
+        centre = _row(chain.centre, j)
+        x, y, z = _rigid_acceleration(linear, spin, turn, centre)
+        force = (chain.mass[j] * x, chain.mass[j] * y, chain.mass[j] * z)
+        inertia = chain.inertia[j]
+        momentum = _product(inertia, spin)
+        moment = _add(_product(inertia, turn), _cross(spin, momentum))
+        moment = _add(moment, _cross(centre, force))
+        work[j, 0], work[j, 1], work[j, 2] = force
+        work[j, 3], work[j, 4], work[j, 5] = moment
+        work[j, 6], work[j, 7], work[j, 8] = origin
+        work[j, 9], work[j, 10] = cosine, sine
+    force = (0.0, 0.0, 0.0)
+    moment = (0.0, 0.0, 0.0)
+    for j in range(n_joints - 1, -1, -1):
+        force = _add(force, (work[j, 0], work[j, 1], work[j, 2]))
+        moment = _add(moment, (work[j, 3], work[j, 4], work[j, 5]))
+        effort = force[2] if chain.sliding[j] else moment[2]
+        torque[j] = effort + chain.armature[j] * a[j] + chain.damping[j] * v[j]
+        # Force and moment that the link before must bear.
+        force = _from_link(fixed, j, work[j, 9], work[j, 10], force)
+        moment = _from_link(fixed, j, work[j, 9], work[j, 10], moment)
+        moment = _add(moment, _cross((work[j, 6], work[j, 7], work[j, 8]), force))
+
+
+@kernel
+def _product(matrix: Float, vector: Vector) -> Vector:
+    x, y, z = vector
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
+
+
+@compiled
+def _all_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation[n], origin[n])
+
+
+@compiled
+def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        tool_frame(chain, rotation, origin, tool_rotation[n], tool_origin[n])
+
+
+@compiled
+def _all_jacobians(chain: Chain, joints: Float, jacobian: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    tool_rotation, tool_origin = np.empty((3, 3)), np.empty(3)
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        tool_frame(chain, rotation, origin, tool_rotation, tool_origin)
+        tool_jacobian(chain, rotation, origin, tool_origin, jacobian[n])
+
+
+@compiled
+def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+    for n in range(q.shape[0]):
+        inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
+
+
+@compiled
+def _all_centres(chain: Chain, spheres: Spheres, joints: Float, centre: Float) -> None:
+    n_joints = joints.shape[1]
+    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
+    for n in range(joints.shape[0]):
+        link_frames(chain, joints[n], rotation, origin)
+        for group in range(spheres.link.shape[0]):
+            link = spheres.link[group]
+            for s in range(spheres.first[group], spheres.first[group + 1]):
+                x, y, z = transform(rotation, origin, link, spheres.centre[s])
+                centre[n, s, 0], centre[n, s, 1], centre[n, s, 2] = x, y, z
+
+
+def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...]]:
+    """Return checked configurations as (N, J), contiguous, and the leading axes."""
+    array = finite_array(name, joints, (..., len(chain.mass)))
+    return np.ascontiguousarray(array.reshape(-1, len(chain.mass))), array.shape[:-1]
+
+
+def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the pose of the tool.
+
+    Args:
+        chain: Chain of J joints.
+        joints: Configurations, shape (..., J), [rad] or [m].
+
+    Returns:
+        Position of the tool, shape (..., 3), [m], and its axes as the columns of a matrix, shape (..., 3, 3).
+    """
+    flat, batch = _flat("joints", chain, joints)
+    position, rotation = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
+    _all_tools(chain, flat, rotation, position)
+    return position.reshape(*batch, 3), rotation.reshape(*batch, 3, 3)
+
+
+def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the world frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins, (..., J + 1, 3), [m]."""
+    flat, batch = _flat("joints", chain, joints)
+    links = len(chain.mass) + 1
+    rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
+    _all_frames(chain, flat, rotation, origin)
+    return rotation.reshape(*batch, links, 3, 3), origin.reshape(*batch, links, 3)
+
+
+def jacobians(chain: Chain, joints: Float) -> Float:
+    """Return the derivatives of the tool's position and rotation vector by the joints, shape (..., 6, J), world axes."""
+    flat, batch = _flat("joints", chain, joints)
+    jacobian = np.empty((len(flat), 6, flat.shape[1]))
+    _all_jacobians(chain, flat, jacobian)
+    return jacobian.reshape(*batch, 6, flat.shape[1])
+
+
+def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
+    """Return the torques or forces of a motion by inverse dynamics, shape (..., J), [N m] or [N].
+
+    Args:
+        chain: Chain of J joints.
+        q: Configurations, shape (..., J), [rad] or [m].
+        v: Velocities of the same shape.
+        a: Accelerations of the same shape.
+    """
+    flat, batch = _flat("q", chain, q)
+    rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
+    accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))
+    torque = np.empty_like(flat)
+    _all_torques(chain, flat, rates, accelerations, torque)
+    return torque.reshape(*batch, flat.shape[1])
+
+
+def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:
+    """Return the world positions of all S spheres, shape (..., S, 3), [m]."""
+    flat, batch = _flat("joints", chain, joints)
+    centre = np.empty((len(flat), len(spheres.radius), 3))
+    _all_centres(chain, spheres, flat, centre)
+    return centre.reshape(*batch, len(spheres.radius), 3)

@@ -1,1 +1,1 @@
-"""Distances between arms and obstacles."""
+"""Obstacles: shapes, packed arrays, signed distances and clearance."""

@@ -1,142 +1,636 @@
-"""Table of all obstacle shapes, lists of obstacles as dictionaries and JSON, and distances from lists of obstacles."""
+"""Shapes of obstacles as users write them, with one compiled function each: the signed distance of a point.
+
+A new shape needs a few lines in this module, and its name in the table KINDS. An ellipsoid, for example:
+
+1. KINDS: its name at the end, so that the numbers of the others stay, and a constant ELLIPSOID.
+2. A function `ellipsoid_distance(a, b, c, x, y, z)` with a line in :func:`local_distance`. It takes the sizes and a
+   point in the frame of the shape, and returns the signed distance and the three components of its gradient.
+3. A class `Ellipsoid(Shape)` like :class:`Box`, with parameters, MuJoCo's geom and bounding box, and a place in SHAPES.
+
+Everything else follows: dictionaries, JSON, packed obstacles, rows of observations, geoms, and checks of movements.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields
-from typing import Any
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, ClassVar, Self
 
-import mujoco
 import numpy as np
 
+from viapoint.envs.common.arrays import frame_axes, frozen, quaternion_to
+from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import finite_array, is_number
-from viapoint.envs.geometry.box import Box
-from viapoint.envs.geometry.convex_mesh import ConvexMesh, NamedMesh
-from viapoint.envs.geometry.cylinder import Cylinder
-from viapoint.envs.geometry.half_space import HalfSpace
-from viapoint.envs.geometry.point_cloud import PointCloud
-from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-from viapoint.envs.geometry.shape import Shape, checked_radius
-from viapoint.primitives.array_api import broadcast_batch
+from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
+from viapoint.envs.geometry.clouds import Cloud, Clouds, build_cloud, cloud_distance, join_clouds
+from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.meshes import (
+    Mesh,
+    Meshes,
+    build_mesh,
+    convex_hull,
+    join_meshes,
+    mesh_distance,
+)
 
-SHAPES: dict[str, type[Shape]] = {
-    shape.kind: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
-}
-"""Shapes by their names in dictionaries."""
+KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud")
+"""Kinds of obstacles; the number of a kind is its place in this table."""
+SPHERE, CAPSULE, CYLINDER, BOX, HALF_SPACE, MESH, POINT_CLOUD = range(len(KINDS))
+ABSENT = -1
+"""Kind of a row that holds no obstacle."""
+UNIT_TOLERANCE = 1e-3
+"""Greatest error of a quaternion's length; smaller ones are corrected."""
+LEAST_SPACING = 1e-6
+"""Least edge of the cubes of :meth:`PointCloud.covering`, [m]."""
+TINY = 1e-12
+"""Length below which a vector has no direction, [m]."""
+FAR = 1e6
+"""Distance of absent obstacles, and limit of distances that are exact, [m]."""
+
+Matrix = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
+Distance = tuple[float, float, float, float]
+"""Signed distance, [m], and the components of its gradient."""
 
 
-MESH_HINT = "register_mesh names a convex mesh of your own"
-"""Hint of error messages about unknown shapes."""
-LISTS = "a list of shapes, dictionaries or rows of numbers"
-"""Allowed obstacles, for error messages."""
+@kernel
+def sphere_distance(radius: float, x: float, y: float, z: float) -> Distance:
+    """Return the signed distance of a point from a sphere around the origin, and its gradient."""
+    length = math.sqrt(x * x + y * y + z * z)
+    if length < TINY:
+        return -radius, 0.0, 0.0, 1.0
+    return length - radius, x / length, y / length, z / length
 
 
-def register_mesh(name: str, mesh: ConvexMesh) -> None:
-    """Register a convex mesh under a name, so that scenes of arms in space may contain it.
+@kernel
+def capsule_distance(radius: float, half_length: float, x: float, y: float, z: float) -> Distance:
+    """Return the signed distance of a point from a capsule along the z axis, and its gradient."""
+    beyond = z - min(max(z, -half_length), half_length)
+    length = math.sqrt(x * x + y * y + beyond * beyond)
+    if length < TINY:
+        return -radius, 1.0, 0.0, 0.0
+    return length - radius, x / length, y / length, beyond / length
 
-    The name is then a shape: environments take it in `shapes`, dictionaries as `shape`, and `reset` also takes a
-    `ConvexMesh` with the same vertices. Random scenes do not contain it. Files and specs store the name only: register
-    the mesh before you load one of them. Registering the same mesh again changes nothing.
 
-    Raises:
-        TypeError: The mesh is no `ConvexMesh`.
-        ValueError: The name is taken by another shape, or is no identifier, or the mesh has a pose.
+@kernel
+def cylinder_distance(radius: float, half_length: float, x: float, y: float, z: float) -> Distance:
+    """Return the signed distance of a point from a cylinder along the z axis, and its gradient."""
+    from_axis = math.sqrt(x * x + y * y)
+    side, end = from_axis - radius, abs(z) - half_length
+    beside, beyond = max(side, 0.0), max(end, 0.0)
+    outside = math.sqrt(beside * beside + beyond * beyond)
+    distance = outside + min(max(side, end), 0.0)
+    if outside < TINY:
+        # Inside, the nearest point is on the side or on an end.
+        outside = 1.0
+        beside = 1.0 if side > end else 0.0
+        beyond = 1.0 - beside
+    upward = math.copysign(beyond / outside, z)
+    if from_axis < TINY:
+        return distance, beside / outside, 0.0, upward
+    share = beside / (outside * from_axis)
+    return distance, share * x, share * y, upward
+
+
+@kernel
+def box_distance(a: float, b: float, c: float, x: float, y: float, z: float) -> Distance:
+    """Return the signed distance of a point from a box with half lengths a, b and c, and its gradient."""
+    over_x, over_y, over_z = abs(x) - a, abs(y) - b, abs(z) - c
+    nearest = max(over_x, over_y, over_z)
+    nx, ny, nz = max(over_x, 0.0), max(over_y, 0.0), max(over_z, 0.0)
+    outside = math.sqrt(nx * nx + ny * ny + nz * nz)
+    distance = outside + min(nearest, 0.0)
+    if outside < TINY:
+        # Inside, the nearest point is on one of the faces.
+        outside = 1.0
+        nx = 1.0 if over_x == nearest else 0.0
+        ny = 1.0 if nx == 0.0 and over_y == nearest else 0.0
+        nz = 1.0 - nx - ny
+    nx, ny, nz = nx / outside, ny / outside, nz / outside
+    return distance, math.copysign(nx, x), math.copysign(ny, y), math.copysign(nz, z)
+
+
+@inlined
+def local_distance(
+    kind: int,
+    a: float,
+    b: float,
+    c: float,
+    meshes: Meshes,
+    clouds: Clouds,
+    x: float,
+    y: float,
+    z: float,
+    limit: float,
+) -> Distance:
+    """Return the signed distance of a point in the frame of a shape, and its gradient.
+
+    Args:
+        kind: Number of the kind.
+        a: First size, see :attr:`Shape.packed_size`, [m].
+        b: Second size, [m].
+        c: Third size, [m].
+        meshes: Meshes of the scene.
+        clouds: Point clouds of the scene.
+        x: First coordinate of the point, [m].
+        y: Second coordinate, [m].
+        z: Third coordinate, [m].
+        limit: Distance beyond which any number between `limit` and the distance may be returned, [m].
+    """
+    if kind == SPHERE:
+        found = sphere_distance(a, x, y, z)
+    elif kind == CAPSULE:
+        found = capsule_distance(a, b, x, y, z)
+    elif kind == CYLINDER:
+        found = cylinder_distance(a, b, x, y, z)
+    elif kind == BOX:
+        found = box_distance(a, b, c, x, y, z)
+    elif kind == HALF_SPACE:
+        found = z, 0.0, 0.0, 1.0
+    elif kind == MESH:
+        found = mesh_distance(meshes, int(a), b, x, y, z, limit)
+    elif kind == POINT_CLOUD:
+        found = cloud_distance(clouds, int(a), x, y, z, limit)
+    else:
+        found = FAR, 0.0, 0.0, 1.0
+    return found
+
+
+@kernel
+def _distances(
+    kind: int, size: Float, rotation: Float, position: Float, meshes: Meshes, clouds: Clouds,
+    points: Float, found: Float,
+) -> None:  # fmt: skip
+    """Fill in the signed distances of points, shape (M, 3), from one shape."""
+    for i in range(len(points)):
+        dx, dy, dz = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+        x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
+        y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
+        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+        found[i] = local_distance(kind, size[0], size[1], size[2], meshes, clouds, x, y, z, FAR)[0]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shape:
+    """Obstacle of some shape at some pose, which may move with a constant velocity.
+
+    Numbers are checked, and kept in double precision. Arrays are read-only.
+    """
+
+    number: ClassVar[int]
+    """Number of the kind."""
+    geom: ClassVar[mujoco.mjtGeom]
+    """MuJoCo's geom of the shape."""
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {}
+    """Names of the positive parameters with the shapes of their values, in the order of MuJoCo's sizes."""
+    box: ClassVar[Matrix] = (0, 0, 0), (0, 0, 0), (0, 0, 0)
+    """Matrix M of the half lengths of the bounding box, which are `packed_size @ M`."""
+
+    position: Any = (0.0, 0.0, 0.0)
+    """Origin of the shape's frame in the world at time 0, shape (3,), [m]."""
+    quaternion: Any = (1.0, 0.0, 0.0, 0.0)
+    """Orientation (w, x, y, z), shape (4,); its length is 1."""
+    velocity: Any = (0.0, 0.0, 0.0)
+    """Shape (3,), [m/s]."""
+    name: str = ""
+    """Name for messages."""
+    mesh: Mesh | None = field(init=False, repr=False, default=None)
+    """Triangles of a mesh."""
+    cloud: Cloud | None = field(init=False, repr=False, default=None)
+    """Point cloud with its tree."""
+
+    def __post_init__(self) -> None:
+        """Convert and check the parameters."""
+        if not isinstance(self.name, str):
+            raise ValueError(f"{self.kind}: name must be a string, got {self.name!r:.60}")
+        try:
+            for name, shape in self.sizes.items():
+                values = finite_array(name, getattr(self, name), shape)
+                if not (values > 0.0).all():
+                    raise ValueError(f"{name} must be greater than 0, got {getattr(self, name)!r}")
+                self._set(name, values if shape else float(values))
+            self._set("position", finite_array("position", self.position, (3,)))
+            self._set("velocity", finite_array("velocity", self.velocity, (3,)))
+            self._set("quaternion", _unit(finite_array("quaternion", self.quaternion, (4,))))
+            self._complete()
+        except ValueError as error:
+            named = f"{self.kind} {self.name!r}" if self.name else self.kind
+            raise ValueError(f"{named}: {error}") from None
+
+    def __eq__(self, other: object) -> bool:
+        """Return True for a shape of the same kind with the same parameters and name."""
+        return type(self) is type(other) and all(
+            np.array_equal(getattr(self, name), getattr(other, name)) for name in self.parameters()
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def kind(self) -> str:
+        """Name of the kind in dictionaries."""
+        return KINDS[self.number]
+
+    @classmethod
+    def parameters(cls) -> list[str]:
+        """Return the names of the parameters, those of all shapes last."""
+        return [each.name for each in sorted(fields(cls), key=lambda each: bool(each.kw_only)) if each.init]
+
+    @property
+    def rotation(self) -> Float:
+        """Axes of the shape's frame as columns, shape (3, 3)."""
+        return np.array(frame_axes(self.quaternion)).T.copy()
+
+    def distance(self, points: Any, radius: Any = 0.0) -> Any:
+        """Return the signed distance of points, or of spheres around them, at time 0, shape (...,), [m].
+
+        Args:
+            points: Shape (..., 3), [m].
+            radius: Radius of the spheres, [m].
+        """
+        points = finite_array("points", points, (..., 3))
+        radius = finite_array("radius", radius)
+        if (radius < 0.0).any():
+            raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
+        flat = np.array(points.reshape(-1, 3))
+        found = np.empty(len(flat))
+        meshes = join_meshes([] if self.mesh is None else [self.mesh])
+        clouds = join_clouds([] if self.cloud is None else [self.cloud])
+        _distances(
+            self.number, self.packed_size, self.rotation, np.array(self.position), meshes, clouds, flat, found
+        )
+        return found.reshape(points.shape[:-1]) - radius
+
+    @property
+    def packed_size(self) -> Float:
+        """Sizes in MuJoCo's convention, shape (3,), [m]; missing ones are 0, see also :class:`Obstacles`."""
+        given = [value for name in self.sizes for value in np.ravel(getattr(self, name))]
+        return np.array([*given, 0.0, 0.0, 0.0][:3])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameters as plain numbers and lists, with the kind as `shape`."""
+        values: dict[str, Any] = {"shape": self.kind}
+        for each in self.parameters():
+            value = getattr(self, each)
+            if each in ("name", "velocity", "faces") and not np.any(value):
+                continue
+            values[each] = value.tolist() if isinstance(value, np.ndarray) else value
+        return values
+
+    def _complete(self) -> None:
+        """Check and derive what belongs to one kind of shape."""
+
+    def _set(self, name: str, value: Any) -> None:
+        """Set an attribute of the record while it is made; arrays are read-only copies."""
+        object.__setattr__(self, name, frozen(value.copy()) if isinstance(value, np.ndarray) else value)
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Shape):
+    """Sphere around its position.
 
     Example:
-        >>> import gymnasium as gym
-        >>> import numpy as np
-        >>> from viapoint.envs import ConvexMesh, register_mesh
-        >>> wedge = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 1), (0, 1, 1)]) / 10
-        >>> register_mesh("wedge", ConvexMesh(wedge))
-        >>> env = gym.make("viapoint/PandaObstacles-v0", shapes=("capsule", "wedge"))
-        >>> _ = env.reset(options={"obstacles": [{"shape": "wedge", "position": (0.4, 0.0, 0.2)}]})
+        >>> from viapoint.envs.geometry.shapes import Sphere
+        >>> ball = Sphere(0.05, position=(0.4, 0.0, 0.3))
+        >>> ball.distance([0.4, 0.0, 0.5], radius=0.03).round(3).item()  # of a sphere of 3 cm, [m]
+        0.12
     """
-    if not isinstance(mesh, ConvexMesh):
-        raise TypeError(
-            f"mesh must be a ConvexMesh, such as ConvexMesh.hull(points), got {type(mesh).__name__}"
-        )
-    if mesh != ConvexMesh(mesh.vertices, name=mesh.name):
-        raise ValueError(
-            f"mesh {name!r} must have no position and no quaternion of its own; obstacles have them"
-        )
+
+    number: ClassVar[int] = SPHERE
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_SPHERE
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
+    box: ClassVar[Matrix] = (1, 1, 1), (0, 0, 0), (0, 0, 0)
+
+    radius: Any
+    """[m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule(Shape):
+    """Capsule around a part of its z axis: all points within a radius of the segment.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import Capsule
+        >>> bar = Capsule.between((0.2, -0.1, 0.3), (0.2, 0.1, 0.3), radius=0.02)
+        >>> bar.distance([0.5, 0.0, 0.3]).round(3).item()
+        0.28
+    """
+
+    number: ClassVar[int] = CAPSULE
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_CAPSULE
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
+    box: ClassVar[Matrix] = (1, 1, 1), (0, 0, 1), (0, 0, 0)
+
+    radius: Any
+    """[m]."""
+    half_length: Any
+    """Half length of the segment, [m]."""
+
+    @classmethod
+    def between(cls, first: Any, second: Any, radius: Any, **others: Any) -> Self:
+        """Return the capsule around the segment between two points, shape (3,) each, [m].
+
+        `others` are the velocity and the name.
+        """
+        first = finite_array("first", first, (3,))
+        second = finite_array("second", second, (3,))
+        half = 0.5 * (second - first)
+        length = float(np.linalg.norm(half))
+        if not 0.0 < length < np.inf:
+            raise ValueError(
+                f"ends of a capsule must be different, got {first.tolist()} and {second.tolist()}"
+            )
+        return cls(radius, length, position=first + half, quaternion=quaternion_to(half / length), **others)
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder(Shape):
+    """Solid cylinder around a part of its z axis, with flat ends.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import Cylinder
+        >>> can = Cylinder(0.03, 0.06, position=(0.5, 0.1, 0.06))  # 12 cm high
+        >>> can.distance([[0.5, 0.1, 0.2], [0.5, 0.1, 0.06]]).round(3).tolist()
+        [0.08, -0.03]
+    """
+
+    number: ClassVar[int] = CYLINDER
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_CYLINDER
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": (), "half_length": ()}
+    box: ClassVar[Matrix] = (1, 1, 0), (0, 0, 1), (0, 0, 0)
+
+    radius: Any
+    """[m]."""
+    half_length: Any
+    """Half length along the z axis, [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Shape):
+    """Box around its position, with faces along the axes of its frame.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import Box
+        >>> table = Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2), name="table")  # 0.8 m x 1.2 m x 4 cm
+        >>> table.distance([[0.5, 0.0, 0.3], [0.5, 0.1, 0.21]]).round(3).tolist()
+        [0.08, -0.01]
+    """
+
+    number: ClassVar[int] = BOX
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_BOX
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"size": (3,)}
+    box: ClassVar[Matrix] = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+
+    size: Any
+    """Half lengths along the axes of the frame, shape (3,), [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace(Shape):
+    """Solid below the plane through its position; the z axis of its frame is the outward normal.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import HalfSpace
+        >>> floor = HalfSpace(position=(0.0, 0.0, -0.1))
+        >>> wall = HalfSpace.facing((-1.0, 0.0, 0.0), position=(0.8, 0.0, 0.0))  # all points with x > 0.8
+        >>> point = [0.5, 0.0, 0.4]
+        >>> floor.distance(point).item(), wall.distance(point).round(3).item()
+        (0.5, 0.3)
+    """
+
+    number: ClassVar[int] = HALF_SPACE
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_PLANE
+
+    @classmethod
+    def facing(cls, normal: Any, position: Any = (0.0, 0.0, 0.0), **others: Any) -> Self:
+        """Return the half-space of an outward normal, shape (3,), of any length.
+
+        `position` is a point of the surface, shape (3,), [m]; `others` are the velocity and the name.
+        """
+        outward = finite_array("normal", normal, (3,))
+        longest = np.abs(outward).max()
+        if longest == 0.0:
+            raise ValueError(f"normal must not be zero, got {outward.tolist()}")
+        return cls(position=position, quaternion=quaternion_to(outward / longest), **others)
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexMesh(Shape):
+    """Convex mesh in the shape's frame.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs.geometry.shapes import ConvexMesh
+        >>> wedge = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 1), (0, 1, 1)]) / 10
+        >>> mesh = ConvexMesh(wedge, position=(0.4, 0.0, 0.2))
+        >>> mesh.distance([[0.5, 0.05, 0.3], [0.45, 0.05, 0.24]]).round(4).tolist()
+        [0.0707, -0.0071]
+        >>> ConvexMesh.hull([*wedge, (0.02, 0.05, 0.05)]).vertices.shape  # without the point inside
+        (6, 3)
+    """
+
+    number: ClassVar[int] = MESH
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_MESH
+
+    vertices: Any
+    """Shape (V, 3), [m]."""
+    faces: Any = None
+    """Triangles as indices of vertices, shape (F, 3), which are checked; None for those of the convex hull."""
+
+    @classmethod
+    def hull(cls, points: Any, **others: Any) -> Self:
+        """Return the convex hull of points, shape (K, 3), [m]; `others` are the pose, the velocity and the name."""
+        vertices = finite_array("points", points, (None, 3))
+        return cls(vertices[convex_hull(vertices).vertices], **others)
+
+    @property
+    def packed_size(self) -> Float:
+        """Index in a table of one mesh, and radius of its bounding sphere, shape (3,)."""
+        return np.array([0.0, np.linalg.norm(self.vertices, axis=1).max(), 0.0])
+
+    def _complete(self) -> None:
+        self._set("vertices", finite_array("vertices", self.vertices, (None, 3)))
+        if self.faces is not None:
+            faces = as_real_array(self.faces)
+            last = len(self.vertices) - 1
+            if faces is None or faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3:
+                raise ValueError(f"faces must be whole numbers of shape (F, 3), got {self.faces!r:.60}")
+            if not len(faces) or faces.min() < 0 or faces.max() > last:
+                raise ValueError(f"faces must be indices of vertices, from 0 to {last}")
+            self._set("faces", faces.astype(np.int64))
+        self._set("mesh", build_mesh(np.array(self.vertices), self.faces))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud(Shape):
+    """Spheres of one radius around points, as a depth camera sees them.
+
+    The signed distance is that of the nearest sphere. Inside overlapping spheres this is at most the depth below the
+    surface of their union.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import PointCloud
+        >>> cloud = PointCloud([(0.4, 0.0, 0.2), (0.4, 0.02, 0.2), (0.42, 0.0, 0.21)], radius=0.01)
+        >>> cloud.distance([0.4, 0.0, 0.3]).round(4).item()
+        0.0822
+        >>> len(PointCloud.covering(cloud.points, spacing=0.05).points)  # fewer and larger spheres
+        1
+    """
+
+    number: ClassVar[int] = POINT_CLOUD
+    geom: ClassVar[mujoco.mjtGeom] = mujoco.mjtGeom.mjGEOM_SPHERE
+    sizes: ClassVar[dict[str, tuple[int, ...]]] = {"radius": ()}
+
+    points: Any
+    """Shape (K, 3), [m]."""
+    radius: Any = 0.01
+    """Radius of the spheres, [m]."""
+
+    @classmethod
+    def covering(cls, points: Any, spacing: float, radius: float = 0.0, **others: Any) -> Self:
+        """Return a cloud of fewer points whose spheres contain those around the given points.
+
+        The space is divided into cubes; one sphere encloses each cube that holds a point.
+
+        Args:
+            points: Shape (K, 3), [m].
+            spacing: Edge of the cubes, [m].
+            radius: Radius of the spheres around the given points, [m].
+            **others: Pose, velocity and name.
+        """
+        number_of_at_least("spacing", spacing, LEAST_SPACING)
+        number_of_at_least("radius", radius, 0.0)
+        given = finite_array("points", points, (None, 3))
+        cubes = np.unique(np.floor(given / spacing), axis=0)
+        return cls((cubes + 0.5) * spacing, radius=0.5 * np.sqrt(3.0) * spacing + radius, **others)
+
+    @property
+    def packed_size(self) -> Float:
+        """Index in a table of one cloud, and radius of its bounding sphere, shape (3,)."""
+        return np.array([0.0, np.linalg.norm(self.points, axis=1).max() + self.radius, 0.0])
+
+    def _complete(self) -> None:
+        self._set("points", finite_array("points", self.points, (None, 3)))
+        self._set("cloud", build_cloud(np.array(self.points), self.radius))
+
+
+SHAPES: tuple[type[Shape], ...] = (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
+"""Classes of the kinds, in the order of KINDS."""
+REGISTERED_MESHES: dict[str, ConvexMesh] = {}
+"""Meshes that have a name of their own, see :func:`register_mesh`."""
+
+
+def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
+    """Register a convex mesh under a name, so that scenes and observations may contain it.
+
+    The name is then a shape: dictionaries take it as `shape`, environments in `shapes`. Registering the same mesh again
+    changes nothing.
+
+    Args:
+        name: Identifier, which no other shape has.
+        vertices: Vertices, or anything else of :class:`ConvexMesh`, shape (V, 3), [m].
+        faces: Triangles, shape (F, 3); None for those of the convex hull.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import as_obstacle, register_mesh
+        >>> wedge = [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0.1, 0.1, 0), (0, 0, 0.1), (0, 0.1, 0.1)]
+        >>> register_mesh("wedge", wedge)
+        >>> as_obstacle({"shape": "wedge", "position": (0.4, 0.0, 0.2)}).distance([0.5, 0.05, 0.3]).round(4).item()
+        0.0707
+    """
     if not (isinstance(name, str) and name.isidentifier()):
         raise ValueError(f"the name of a mesh must be an identifier such as 'rock', got {name!r}")
-    found = SHAPES.setdefault(name, NamedMesh.named(name, mesh))
-    if not (issubclass(found, NamedMesh) and np.array_equal(found.mesh.vertices, mesh.vertices)):
-        raise ValueError(f"another shape is registered as {name!r}; give this mesh another name")
+    mesh = ConvexMesh(vertices, faces)
+    known = REGISTERED_MESHES.get(name)
+    if name in KINDS or (known is not None and not np.array_equal(known.vertices, mesh.vertices)):
+        raise ValueError(f"another shape has the name {name!r}; give this mesh another one")
+    REGISTERED_MESHES[name] = mesh
 
 
 def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
     """Return a shape from its dictionary; a shape is returned as it is.
 
     Args:
-        value: Shape, or a mapping with its kind as `shape`, its parameters, and optionally `position`, `quaternion` and
-            `name`.
+        value: Shape, or a mapping with its kind as `shape` and its parameters.
 
     Raises:
-        ValueError: The shape or a parameter is unknown or missing, or a value is not allowed.
+        ValueError: The kind or a parameter is unknown or missing, or a value is not allowed.
 
     Example:
-        >>> from viapoint.envs import as_obstacle
+        >>> from viapoint.envs.geometry.shapes import as_obstacle
         >>> box = as_obstacle({"shape": "box", "size": (0.1, 0.2, 0.02), "position": (0.5, 0.0, 0.3)})
         >>> box.distance([0.5, 0.0, 0.5]).round(3).item()
         0.18
         >>> as_obstacle({"shape": "box", "sizes": (0.1, 0.2, 0.02)})
         Traceback (most recent call last):
-        ValueError: box: parameters are size, position, quaternion, name; unknown are ['sizes'], missing are ['size']
+        ValueError: box: parameters are size, position, quaternion, velocity, name; unknown is sizes, missing is size
     """
     if isinstance(value, Shape):
         return value
     if not isinstance(value, Mapping):
-        raise ValueError(f"an obstacle must be a shape of viapoint.envs or a dictionary, got {value!r:.80}")
+        raise ValueError(f"an obstacle must be a shape or a dictionary, got {value!r:.80}")
     values = dict(value)
     kind = values.pop("shape", None)
-    shape = SHAPES.get(kind) if isinstance(kind, str) else None
-    if shape is None:
-        raise ValueError(f"shape must be one of {', '.join(SHAPES)}, got {kind!r}; {MESH_HINT}")
+    (name,) = check_kinds([kind])
+    if name in REGISTERED_MESHES:
+        values["vertices"] = REGISTERED_MESHES[name].vertices
+        name = KINDS[MESH]
+    shape = SHAPES[KINDS.index(name)]
     allowed = shape.parameters()
-    unknown = [name for name in values if name not in allowed]
     needed = [each.name for each in fields(shape) if each.init and each.default is MISSING]
-    missing = [name for name in needed if name not in values]
+    unknown = ", ".join(str(each) for each in values if each not in allowed)
+    missing = ", ".join(each for each in needed if each not in values)
     if unknown or missing:
         raise ValueError(
-            f"{kind}: parameters are {', '.join(allowed)}; unknown are {unknown}, missing are {missing}"
+            f"{kind}: parameters are {', '.join(allowed)}; unknown is {unknown or 'none'}, "
+            f"missing is {missing or 'none'}"
         )
     return shape(**values)
 
 
-def as_obstacles(values: Iterable[Shape | Mapping[str, Any]], *, single: bool = False) -> list[Shape]:
+def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
     """Return shapes from a list of shapes and dictionaries; an error names the index of the obstacle.
 
-    Batches of shapes are refused if each must be a `single` one.
-
     Example:
-        >>> from viapoint.envs import as_obstacles
+        >>> from viapoint.envs.geometry.shapes import as_obstacles
         >>> as_obstacles([{"shape": "sphere", "radius": 0.1}, {"shape": "sphere", "radius": -1.0}])
         Traceback (most recent call last):
         ValueError: obstacle 1: sphere: radius must be greater than 0, got -1.0
     """
-    refuse_single(values)
-    if not isinstance(values, Iterable):
-        raise ValueError(f"obstacles must be {LISTS}, got {values!r:.80}")
+    if isinstance(values, Shape | Mapping | str) or not isinstance(values, Iterable):
+        raise ValueError(f"obstacles must be a list of shapes or dictionaries, got {values!r:.80}")
     found = []
     for i, value in enumerate(values):
         try:
             found.append(as_obstacle(value))
-            if single:
-                found[-1].require_single()
         except ValueError as error:
             raise ValueError(f"obstacle {i}: {error}") from None
     return found
+
+
+def check_kinds(names: Iterable[Any]) -> tuple[str, ...]:
+    """Return names of kinds or registered meshes.
+
+    Raises:
+        ValueError: A name is unknown or repeated.
+    """
+    names = (names,) if isinstance(names, str) else tuple(names)
+    for name in names:
+        if not isinstance(name, str) or (name not in KINDS and name not in REGISTERED_MESHES):
+            known = ", ".join((*KINDS, *REGISTERED_MESHES))
+            raise ValueError(
+                f"shape must be one of {known}, got {name!r}; register_mesh names a convex mesh of your own"
+            )
+    if len(set(names)) < len(names):
+        raise ValueError(f"shapes must not be repeated, got {', '.join(names)}")
+    return names
 
 
 def obstacles_to_json(obstacles: Iterable[Shape | Mapping[str, Any]]) -> str:
     """Return obstacles as JSON.
 
     Example:
-        >>> from viapoint.envs import Sphere, obstacles_from_json, obstacles_to_json
+        >>> from viapoint.envs.geometry.shapes import Sphere, obstacles_from_json, obstacles_to_json
         >>> text = obstacles_to_json([Sphere(0.1, position=(0.5, 0.0, 0.3))])
         >>> text
         '[{"shape": "sphere", "radius": 0.1, "position": [0.5, 0.0, 0.3], "quaternion": [1.0, 0.0, 0.0, 0.0]}]'
@@ -153,7 +647,7 @@ def obstacles_from_json(text: str) -> list[Shape]:
         ValueError: The text is not JSON, not a list, or an obstacle is not allowed.
 
     Example:
-        >>> from viapoint.envs import obstacles_from_json
+        >>> from viapoint.envs.geometry.shapes import obstacles_from_json
         >>> [table] = obstacles_from_json('[{"shape": "box", "size": [0.4, 0.6, 0.02], "name": "table"}]')
         >>> table.name, table.size.tolist()
         ('table', [0.4, 0.6, 0.02])
@@ -167,143 +661,13 @@ def obstacles_from_json(text: str) -> list[Shape]:
     return as_obstacles(values)
 
 
-def refuse_single(obstacles: Any) -> None:
-    """Raise ValueError for one shape or dictionary that is in no list."""
-    if isinstance(obstacles, Shape | Mapping):
-        raise ValueError(f"obstacles must be {LISTS}; put a single obstacle in a list, got {obstacles!r:.80}")
-
-
-def signed_distances(
-    obstacles: Sequence[Shape | Mapping[str, Any]], first: Any, second: Any = None, radius: Any = 0.0
-) -> Float:
-    """Return the signed distance of spheres or capsules from each of n obstacles, shape (..., n), [m].
-
-    Args:
-        obstacles: n shapes or dictionaries.
-        first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
-        second: The other end; None for spheres.
-        radius: Radius, [m].
-
-    Example:
-        >>> from viapoint.envs import Box, Sphere, signed_distances
-        >>> scene = [Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2)), Sphere(0.05, position=(0.5, 0.2, 0.27))]
-        >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
-        [0.02, 0.12]
-    """
-    obstacles = as_obstacles(obstacles)
-    ends = _checked_ends(first, second)
-    if not obstacles:
-        return np.zeros((*ends[0].shape[:-1], 0))
-    each = [_distance(obstacle, ends, radius) for obstacle in obstacles]
-    return np.stack(np.broadcast_arrays(*each), axis=-1)
-
-
-def _checked_ends(first: Any, second: Any) -> list[Float]:
-    """Return the ends of segments, or points alone where there is no second end."""
-    ends = [finite_array("first", first, (..., 3))]
-    if second is not None:
-        ends.append(finite_array("second", second, (..., 3)))
-    return ends
-
-
-def _distance(obstacle: Shape, ends: Sequence[Float], radius: Any) -> Any:
-    """Return the distance of spheres or capsules from one obstacle."""
-    if len(ends) == 1:
-        return obstacle.distance(ends[0], radius)
-    return obstacle.segment_distance(ends[0], ends[1], radius)
-
-
-def nearest_distance(
-    obstacles: Sequence[Shape | Mapping[str, Any]],
-    first: Any,
-    second: Any = None,
-    radius: Any = 0.0,
-    most: float = np.inf,
-) -> Any:
-    """Return the least signed distance of spheres or capsules from all obstacles, shape (...,), at most `most`, [m].
-
-    Broad phase: bounding spheres bound every distance from below. Narrow phase: obstacles in the order of their bounds;
-    distances are only computed where the bound is below the least distance so far.
-
-    Args:
-        obstacles: Shapes or dictionaries.
-        first: Centres of spheres, or one end of capsules' axes, shape (..., 3), [m].
-        second: The other end; None for spheres.
-        radius: Radius, which broadcasts with the leading axes, [m].
-        most: Greatest distance of interest, [m].
-
-    Example:
-        >>> from viapoint.envs import HalfSpace, Sphere, nearest_distance
-        >>> nearest_distance([HalfSpace(), Sphere(0.1, position=(0.5, 0.0, 0.3))], [0.5, 0.0, 0.6], most=1.0).round(3)
-        np.float64(0.2)
-    """
-    obstacles = as_obstacles(obstacles, single=True)
-    if not is_number(most) or np.isnan(most):
-        raise ValueError(f"most must be a number, got {most!r:.60}")
-    ends, radius = _checked_ends(first, second), checked_radius(radius)
-    leading = {f"end {i}": end.shape[:-1] for i, end in enumerate(ends)}
-    shape = broadcast_batch(**leading, radius=np.shape(radius))
-    flat = [np.broadcast_to(end, (*shape, 3)).reshape(-1, 3) for end in ends]
-    size = np.broadcast_to(radius, shape).reshape(-1)
-    middle = 0.5 * (flat[0] + flat[-1])
-    reach = size + _length(flat[-1] - middle)
-    least = np.full(len(middle), float(most))
-    if not obstacles or not len(middle):
-        return least.reshape(shape)
-    spheres = [each.bounding_sphere for each in obstacles]
-    bounds = np.stack([_length(middle - centre) - wide - reach for centre, wide in spheres])
-    for which in np.argsort(bounds.min(axis=1), kind="stable"):
-        some = np.flatnonzero(bounds[which] < least)
-        if some.size:
-            found = _distance(obstacles[which], [end[some] for end in flat], size[some])
-            least[some] = np.minimum(least[some], found)
-    return least.reshape(shape)
-
-
-def add_to_model(
-    spec: mujoco.MjSpec, obstacles: Sequence[Shape | Mapping[str, Any]], body: Any = None, **attributes: Any
-) -> list[list[str]]:
-    """Add the geoms of obstacles to a MuJoCo model, and return their names, one list for each obstacle.
-
-    Args:
-        spec: Model.
-        obstacles: Shapes or dictionaries, with different names.
-        body: Body of the geoms; the world by default.
-        **attributes: Attributes of all geoms, such as `contype` or `rgba`.
-
-    Example:
-        >>> import mujoco
-        >>> from viapoint.envs import Box, Capsule, add_to_model
-        >>> spec = mujoco.MjSpec()
-        >>> add_to_model(spec, [Box((0.1, 0.1, 0.1)), Capsule(0.02, 0.1, position=(0.0, 0.0, 0.2), name="post")])
-        [['obstacle_0_0'], ['post_0']]
-        >>> spec.compile().ngeom
-        2
-    """
-    body = spec.worldbody if body is None else body
-    obstacles = as_obstacles(obstacles)
-    named = [each.name or f"obstacle_{i}" for i, each in enumerate(obstacles)]
-    for i, name in enumerate(named):
-        if named.index(name) < i:
-            raise ValueError(f"obstacle {i}: obstacle {named.index(name)} has the name {name!r}, too")
-    names: list[list[str]] = []
-    for i, each in enumerate(obstacles):
-        names.append([])
-        for j, geom in enumerate(each.geoms()):
-            name = f"{named[i]}_{j}"
-            mesh = {}
-            if geom.vertices is not None:
-                mesh = {"meshname": name}
-                spec.add_mesh(
-                    name=name, uservert=geom.vertices.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-                )  # fmt: skip
-            body.add_geom(
-                name=name, type=geom.type, size=geom.size, pos=geom.position, quat=geom.quaternion,
-                **mesh, **attributes,
-            )  # fmt: skip
-            names[-1].append(name)
-    return names
-
-
-def _length(vectors: Float) -> Any:
-    return np.sqrt((vectors * vectors) @ np.ones(3))
+def _unit(quaternion: Float) -> Float:
+    """Return a quaternion with the length 1."""
+    length = float(np.linalg.norm(quaternion))
+    off = abs(length - 1.0)
+    if off > UNIT_TOLERANCE:
+        raise ValueError(
+            f"quaternion must have length 1 (within {UNIT_TOLERANCE:g}), got length {length:.6g}"
+        )
+    # A quaternion that was normalised before stays as it is, so that reading what was written changes nothing.
+    return quaternion if off <= 8.0 * np.finfo(np.float64).eps else quaternion / length

@@ -1,1 +1,1 @@
-"""Scenes and their samplers."""
+"""Scenes: starts, goals and obstacles, and how they are drawn."""

@@ -1,180 +1,305 @@
-"""Scenes and their changes that are given to `reset` as options."""
+"""Scenes that are given to `reset` as options, and files of scenes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.rows import (
-    CAPSULES,
-    dimension_of,
-    has_shapes,
-    is_shape_list,
-    obstacle_names,
-    obstacle_rows,
-    row_size,
-    shape_number,
-    widened,
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints
+from viapoint.envs.arms.kinematics import sphere_centres
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
+from viapoint.envs.geometry.shapes import (
+    REGISTERED_MESHES,
+    ConvexMesh,
+    Shape,
+    as_obstacles,
+    obstacles_from_json,
 )
-from viapoint.envs.geometry.shape import UNIT_TOLERANCE
-from viapoint.envs.geometry.shapes import MESH_HINT, SHAPES, as_obstacle, as_obstacles, refuse_single
-from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS
-from viapoint.envs.scenes.families import MOST_OBSTACLES
-from viapoint.envs.scenes.sampler import SceneSampler
-from viapoint.envs.scenes.scene import Scenes, check_scenes, problems
+from viapoint.envs.plans import SpaceName
+from viapoint.envs.scenes.sampler import Given, SceneSampler
+from viapoint.envs.scenes.scene import (
+    ENDS,
+    MOST_JUMPS,
+    NEVER,
+    Scenes,
+    check_scenes,
+    resting,
+    row_clearances,
+)
 
-GIVEN = ("start", "goal", "obstacles")
-"""Options that give a scene, or a part of one."""
-CHANGES = ("jumps", "courses")
-"""Options that give the changes of a scene."""
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns")
+"""Options of `reset` that give a scene, or a part of one."""
 FORMAT = "viapoint-scene"
 """Value of the key `format` of a scene file."""
-ATTEMPTS = 50
-"""Attempts to draw start and goal such that given obstacles leave room for them."""
+REACHED = 1e-6
+"""Greatest distance of the hand from a given place, [m]."""
+
+
+class Pose(NamedTuple):
+    """Pose of the tool.
+
+    Example:
+        >>> from viapoint.envs.scenes.options import Pose
+        >>> Pose(position=(0.5, 0.1, 0.4), quaternion=(0.0, 1.0, 0.0, 0.0)).position  # pointing downwards
+        (0.5, 0.1, 0.4)
+    """
+
+    position: Any
+    """Shape (3,), [m]."""
+    quaternion: Any = None
+    """Orientation (w, x, y, z), shape (4,); None for any."""
 
 
 def draw_given(
-    options: Mapping[str, Any], sampler: SceneSampler, generators: Sequence[np.random.Generator], n_rows: int
+    options: Mapping[str, Any], sampler: SceneSampler, generators: Sequence[np.random.Generator]
 ) -> Scenes:
-    """Return N scenes with the parts that `options` gives; the other parts are sampled to fit.
+    """Return N scenes with the parts that `options` gives; the other parts are drawn to fit.
 
-    Sampled obstacles stand in the way of the given ends; with given obstacles, start and goal are only sampled clear of
-    them.
+    Drawn obstacles stand in the way of given ends; drawn ends are free of given obstacles.
 
     Args:
-        options: May hold `start` and `goal`, shape (D,) or (N, D), and `obstacles`, shape (n, 2 D + 1) or
-            (N, n, 2 D + 1), [m]; or a list of shapes, or of their dictionaries, for all scenes, or N such lists.
+        options: May hold `start` and `goal`: in hand space positions of the hand, shape (2,), (3,) or N of them, [m];
+            in joint space joint positions, shape (J,) or (N, J), or a :class:`Pose` or its dictionary, or N of them.
+            `obstacles`: a list of shapes or dictionaries, or their JSON, for all scenes, or N such lists. `jumps`: rows
+            (time [s], target), and `turns`: rows (time [s], velocity [m/s]) for each given obstacle, of zeros for none;
+            shape (n, .) for all scenes or (N, n, .).
         sampler: Sampler of the task's scenes.
         generators: N random generators.
-        n_rows: Greatest number of obstacles in a scene.
 
     Raises:
-        ValueError: An array is not finite or has another shape, a name is unknown, or a scene is impossible.
+        ValueError: A part has another shape or is not finite, a name is unknown, or a scene is impossible.
     """
-    refuse_unknown_options(options, GIVEN)
-    collision_model, shapes, number = sampler.collision_model, sampler.distribution.shapes, len(generators)
-    dimension = collision_model.arm.dimension
-    point = (number, dimension)
-    sizes = {"start": point, "goal": point, "obstacles": (number, n_rows, row_size(dimension, shapes))}
-    parts = {}
-    for name, value in options.items():
-        rows = _rows_of(value, dimension, shapes) if name == "obstacles" else value
-        parts[name] = _parse(name, rows, sizes[name])
-    names = obstacle_names(options.get("obstacles", []))
-    nowhere = np.full(point, np.nan)
-    given = Scenes(nowhere, nowhere, np.zeros(sizes["obstacles"]))._replace(**parts)
-    if has_shapes(given.obstacles):
-        given = given._replace(obstacles=_with_unit_quaternions(given.obstacles))
-    with np.errstate(invalid="ignore"):
-        # Parts that are not given are NaN: comparisons with them are false.
-        check_scenes(given, collision_model, names)
-    if set(parts) >= set(GIVEN):
-        return given
-
-    def sample(rows: Int) -> Scenes:
-        some = given.take(rows)
-        try:
-            sampled = sampler([generators[int(i)] for i in rows], (some.start, some.goal))
-        except RuntimeError as error:
-            raise ValueError(
-                f"{error}; give the obstacles too, or ends farther inside the arm's reach"
-            ) from None
-        return sampled._replace(**{name: getattr(some, name) for name in parts})
-
-    scenes = sample(np.arange(number))
-    for _ in range(ATTEMPTS):
-        wrong = np.zeros(number, dtype=bool)
-        for these, _ in problems(scenes, collision_model):
-            wrong |= these
-        if not wrong.any() or "obstacles" not in parts:
-            break
-        again = np.flatnonzero(wrong)
-        scenes.put(again, sample(again))
-    check_scenes(scenes, collision_model, names)
-    return scenes
-
-
-def _rows_of(obstacles: Any, dimension: int, shapes: Sequence[str]) -> Any:
-    """Return given obstacles as rows of scenes that may have some shapes."""
+    _refuse_unknown(options)
+    if not options:
+        return sampler(generators)
+    number, arm = len(generators), sampler.arm
+    shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
+    obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
+    names = [[shape.name for shape in each] for each in shapes or ()]
+    ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
+    home = np.tile(arm.home, (number, 1))
+    scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
+    if "jumps" in options:
+        scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, number))
+    if "turns" in options:
+        if shapes is None:
+            raise ValueError("options['turns'] are those of options['obstacles'], which must be given, too")
+        turns = _rows("turns", options["turns"], (number, sampler.rows, 4))
+        given = (turns != 0.0).any(axis=-1)
+        scenes.turn_time[given] = turns[given][:, 0]
+        scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
+    # What is wrong with the given parts is said before others are drawn around them.
+    check_scenes(scenes, arm, names, tuple(ends))
+    parts = Given(
+        start=ends.get("start"),
+        goal=ends.get("goal"),
+        obstacles=None if shapes is None else obstacles,
+        jumps=scenes.jumps if "jumps" in options else None,
+        turns=(scenes.turn_time, scenes.turn_velocity) if "turns" in options else None,
+    )
     try:
-        rows = obstacle_rows(obstacles, dimension, shapes)
+        drawn = sampler(generators, parts)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    check_scenes(drawn, arm, names)
+    return drawn
+
+
+def _refuse_unknown(names: Mapping[str, Any]) -> None:
+    """Check the names of options."""
+    unknown = ", ".join(repr(name) for name in names if name not in OPTIONS)
+    if unknown:
+        raise ValueError(f"options of reset are {', '.join(OPTIONS)} and reset_mask, got {unknown}")
+
+
+def _shapes(value: Any, sampler: SceneSampler, number: int) -> list[list[Shape]]:
+    """Return the given obstacles of N scenes."""
+    if isinstance(value, str):
+        value = obstacles_from_json(value)
+    several = (
+        isinstance(value, Sequence) and bool(value) and all(isinstance(each, list | tuple) for each in value)
+    )
+    if several and len(value) != number:
+        raise ValueError(f"options['obstacles'] must be one list, or {number} lists, got {len(value)}")
+    try:
+        lists = [as_obstacles(each) for each in value] if several else [as_obstacles(value)] * number
     except ValueError as error:
         raise ValueError(f"options['obstacles']: {error}") from None
-    if tuple(shapes) != CAPSULES and np.shape(rows)[-1:] == (row_size(dimension),):
-        rows = widened(_numbers("obstacles", rows))
-    return rows
+    for shapes in lists:
+        if len(shapes) > sampler.rows:
+            raise ValueError(
+                f"options['obstacles'] must be at most {sampler.rows}, got {len(shapes)}; make the environment with "
+                "a greater n_obstacles"
+            )
+        for row, shape in enumerate(shapes):
+            _check_shape(row, shape, sampler)
+    return lists
 
 
-def _with_unit_quaternions(rows: Float) -> Float:
-    """Return rows with shapes whose quaternions have length 1, if they nearly had."""
-    begin = 2 * dimension_of(rows) + 1
-    quaternion = rows[..., begin : begin + 4]
-    size = norm(quaternion)[..., None]
-    error = np.abs(size - 1.0)
-    # As in records, what has been normalised stays as it is.
-    inexact = (error > 8.0 * np.finfo(np.float64).eps) & (error <= UNIT_TOLERANCE)
-    again = rows.copy()
-    again[..., begin : begin + 4] = np.where(inexact, quaternion / np.where(inexact, size, 1.0), quaternion)
-    return again
+def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
+    """Check that a task has obstacles of a kind, and that one does not contain the base of the arm."""
+    kinds = {shape.kind}
+    if isinstance(shape, ConvexMesh):
+        for name, mesh in REGISTERED_MESHES.items():
+            if np.array_equal(mesh.vertices, shape.vertices):
+                kinds.add(name)
+    if not kinds & set(sampler.kinds):
+        allowed = ", ".join(sampler.kinds)
+        raise ValueError(f"obstacle {row} must be one of the shapes of the task, {allowed}, got {shape.kind}")
+    arm = sampler.arm
+    base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
+    centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
+    if base.any() and (shape.distance(centres) + arm.spheres.radius[base]).max() <= 0.0:
+        named = f" {shape.name!r}" if shape.name else ""
+        raise ValueError(f"obstacle {row}{named} may touch the base of the arm, but not contain all of it")
 
 
-def scene_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
-    """Return the options of `reset` that set up one scene as JSON, with all digits and the names of obstacles.
+def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> Float:
+    """Return the joint positions of a given end, shape (N, J)."""
+    number, joints = len(obstacles.kind), len(sampler.arm.home)
+    label = f"options[{name!r}]"
+    several = [value] * number if isinstance(value, Pose | Mapping) else value
+    if (
+        isinstance(several, Sequence)
+        and several
+        and all(isinstance(each, Pose | Mapping) for each in several)
+    ):
+        if len(several) != number:
+            raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
+        poses = [_pose(label, each) for each in several]
+        if sampler.space == "joints":
+            found = [_solution(label, pose, sampler.arm, obstacles.take([i])) for i, pose in enumerate(poses)]
+            return np.array(found)
+        value = [pose.position for pose in poses]
+    if sampler.space == "joints":
+        array = finite_array(label, value, (joints,), (number, joints))
+        return np.array(np.broadcast_to(array, (number, joints)), order="C")
+    array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
+    height = sampler.room.foot[2]
+    if array.shape[-1] == 3 and (np.abs(array[..., 2] - height) > REACHED).any():
+        raise ValueError(
+            f"{label} must have z = {height:g} m, which is the plane of the hand, got {array.tolist()}"
+        )
+    return _planar(label, sampler.arm, np.broadcast_to(array[..., :2], (number, 2)))
+
+
+def _planar(label: str, arm: Arm, hand: Float) -> Float:
+    """Return the joint positions for places of the hand in the plane, shape (..., 2)."""
+    joints = np.clip(planar_joints(arm, np.array(hand, order="C")), *arm.joint_range.T)
+    away = norm(arm.hand(joints)[..., :2] - hand)
+    if (away > REACHED).any():
+        where = hand[away > REACHED][0].tolist()
+        raise ValueError(
+            f"{label} must be within the arm's reach, got {where} m: the nearest place found is "
+            f"{1e3 * away.max():.1f} mm away"
+        )
+    return joints
+
+
+def _pose(label: str, value: Any) -> Pose:
+    """Return a pose from itself or a dictionary."""
+    if isinstance(value, Pose):
+        return value
+    if "position" not in value or not set(value) <= set(Pose._fields):
+        raise ValueError(f"{label} must have a position, and may have a quaternion, got {value!r:.80}")
+    return Pose(**value)
+
+
+def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles) -> Float:
+    """Return joint positions with the tool at a pose, the first that are free, shape (J,)."""
+    try:
+        found = inverse_kinematics(arm, pose.position, pose.quaternion)
+    except ValueError as error:
+        raise ValueError(f"{label}: {error}") from None
+    many = obstacles.take(np.zeros(len(found), np.int64))
+    rows, own = row_clearances(arm.chain, arm.spheres, found, many)
+    free = np.minimum(rows.min(axis=-1, initial=1.0), own) > 0.0
+    # If none is free, the check of the scene says why.
+    return np.asarray(found[int(free.argmax())])
+
+
+def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
+    """Return given jumps of N scenes in joint positions, the absent ones last."""
+    joints = len(sampler.arm.home)
+    size = 2 if sampler.space == "hand" else joints
+    given = _rows("jumps", value, (number, MOST_JUMPS, 1 + size))
+    present = (given != 0.0).any(axis=-1)
+    jumps = np.zeros((number, MOST_JUMPS, 1 + joints))
+    targets = given[present][:, 1:]
+    if sampler.space == "hand":
+        targets = _planar("target of options['jumps']", sampler.arm, targets)
+    jumps[present] = np.concatenate((given[present][:, :1], targets), axis=-1)
+    order = np.argsort(~present, axis=-1, kind="stable")
+    return np.take_along_axis(jumps, order[..., None], axis=1)
+
+
+def _rows(name: str, value: Any, shape: tuple[int, int, int]) -> Float:
+    """Return an option as rows of N scenes; rows of zeros stand behind the given ones."""
+    number, most, size = shape
+    array = finite_array(f"options[{name!r}]", value)
+    found = np.zeros(shape)
+    if array.size == 0:
+        return found
+    fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number)
+    if not fits or array.shape[-1] != size or array.shape[-2] > most:
+        raise ValueError(
+            f"options[{name!r}] must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
+            f"{array.shape}"
+        )
+    found[:, : array.shape[-2]] = array
+    return found
+
+
+def scene_to_json(
+    scenes: Scenes, arm: Arm, space: SpaceName | None = None, *, scene: int = 0, env_id: str = ""
+) -> str:
+    """Return a scene as JSON, which :func:`scene_from_json` reads as options of `reset`.
 
     Args:
-        options: Some of `start`, `goal`, `obstacles`, `jumps` and `courses`, also of a batch of one scene.
+        scenes: N scenes.
+        arm: Arm.
+        space: Space of the task; by default, that of the arm.
+        scene: Index of the scene.
         env_id: Environment of the scene, for readers of the file.
-
-    Raises:
-        ValueError: An option is unknown, or does not hold real numbers, or obstacles, of one scene.
-
-    Example:
-        >>> from viapoint.envs import Sphere, scene_from_json, scene_to_json
-        >>> ball = Sphere(0.03, position=(0.5, 0.0, 0.4), name="ball")
-        >>> text = scene_to_json({"start": (0.45, -0.33, 0.4), "goal": (0.45, 0.33, 0.4), "obstacles": [ball]})
-        >>> scene_from_json(text)["obstacles"] == [ball]
-        True
     """
-    if not isinstance(options, Mapping):
-        raise ValueError(f"options must be those of reset, a dictionary, got {options!r:.60}")
-    refuse_unknown_options(options, (*GIVEN, *CHANGES))
-    record: dict[str, Any] = {"format": FORMAT, **({"env": env_id} if env_id else {})}
-    for name, value in options.items():
-        if name == "obstacles":
-            refuse_single(value)
-            one = isinstance(value, list | tuple) and len(value) == 1 and is_shape_list(value[0])
-            value = value[0] if one else value
-        if name == "obstacles" and is_shape_list(value):
-            record[name] = [each.to_dict() for each in as_obstacles(value)]
-        else:
-            array = _numbers(name, value)
-            batched = array.ndim == (2 if name in ("start", "goal") else 3)
-            if batched and len(array) != 1:
-                raise ValueError(f"options[{name!r}] must be those of one scene, got {len(array)} scenes")
-            array = array[0] if batched else array
-            if name == "obstacles" and array.ndim == 2 and has_shapes(array):
-                # Rows hold indices into this table, which is another one where other meshes are registered.
-                record["shapes"] = list(SHAPES)
-            record[name] = array.tolist()
+    of_hand = (arm.space if space is None else space) == "hand"
+
+    def coordinates(joints: Float) -> list[Any]:
+        return (arm.hand(joints)[..., :2] if of_hand else joints).tolist()  # type: ignore[no-any-return]
+
+    record: dict[str, Any] = {"format": FORMAT}
+    if env_id:
+        record["env"] = env_id
+    record["start"] = coordinates(scenes.start[scene])
+    record["goal"] = coordinates(scenes.goal[scene])
+    record["obstacles"] = [shape.to_dict() for shape in unpack(scenes.obstacles, scene)]
+    times = scenes.jump_times[scene]
+    jumps = scenes.jumps[scene][times < NEVER]
+    if len(jumps):
+        record["jumps"] = [[float(row[0]), *coordinates(row[1:])] for row in jumps]
+    present = scenes.obstacles.present[scene]
+    turn_time = scenes.turn_time[scene][present]
+    if (turn_time < NEVER).any():
+        turns = np.column_stack((turn_time, scenes.turn_velocity[scene][present]))
+        record["turns"] = np.where(turn_time[:, None] < NEVER, turns, 0.0).tolist()
     return json.dumps(record, indent=1) + "\n"
 
 
 def scene_from_json(text: str | bytes) -> dict[str, Any]:
-    """Return the options of `reset` from the JSON of :func:`scene_to_json` or a file of the live page.
-
-    Obstacles are shapes, or rows of numbers if they were written as such. Numbers are checked by `reset`.
+    """Return the options of `reset` from the JSON of :func:`scene_to_json`; numbers are checked by `reset`.
 
     Raises:
         ValueError: The text is no scene file, or an obstacle is not allowed.
 
     Example:
-        >>> from viapoint.envs import scene_from_json
+        >>> from viapoint.envs.scenes.options import scene_from_json
         >>> scene_from_json('{"format": "viapoint-scene", "goal": [0.1, 0.4]}')
         {'goal': [0.1, 0.4]}
     """
@@ -184,131 +309,8 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
         raise ValueError(f"the scene file is not JSON: {error}") from None
     if not isinstance(record, Mapping) or record.get("format") != FORMAT:
         raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
-    refuse_unknown_options(
-        {name: None for name in record if name not in ("format", "env", "shapes")}, (*GIVEN, *CHANGES)
-    )
-    options = {name: record[name] for name in (*GIVEN, *CHANGES) if name in record}
-    obstacles = options.get("obstacles", [])
-    if not isinstance(obstacles, list):
-        raise ValueError(f"obstacles of the scene file must be a list, got {obstacles!r:.60}")
-    if obstacles and not all(isinstance(each, list) for each in obstacles):
-        options |= _obstacles_of_file(obstacles)
-    elif "shapes" in record:
-        options["obstacles"] = _rows_of_file(obstacles, record["shapes"])
+    options = {name: value for name, value in record.items() if name not in ("format", "env")}
+    _refuse_unknown(options)
+    if "obstacles" in options:
+        options["obstacles"] = as_obstacles(options["obstacles"])
     return options
-
-
-def _rows_of_file(rows: Sequence[Any], shapes: Any) -> list[list[float]]:
-    """Return rows with shapes, whose numbers of shapes are indices into `shapes`, as rows of this process.
-
-    Raises:
-        ValueError: A shape is unknown here, or the rows are none with shapes.
-    """
-    array = _numbers("obstacles", rows)
-    if not (isinstance(shapes, list) and array.ndim == 2 and has_shapes(array)):
-        raise ValueError(
-            "shapes of the scene file must be a list of names, and its obstacles rows with shapes"
-        )
-    column = array[:, 2 * dimension_of(array)]
-    for i, number in enumerate(column):
-        name = shapes[int(number)] if 0.0 <= number < len(shapes) and number == int(number) else number
-        if not isinstance(name, str) or name not in SHAPES:
-            raise ValueError(
-                f"obstacle {i} of the scene file: unknown shape {name!r}. Shapes are {', '.join(SHAPES)}; {MESH_HINT}"
-            )
-        column[i] = shape_number(name)
-    return array.tolist()  # type: ignore[no-any-return]
-
-
-def _obstacles_of_file(records: Sequence[Any]) -> dict[str, Any]:
-    """Return the obstacles of a file, and their courses if it has them beside the shapes, as older files do."""
-    found, courses = [], []
-    for i, each in enumerate(records):
-        one = dict(each) if isinstance(each, Mapping) else each
-        courses.append(one.pop("course", None) if isinstance(one, dict) else None)
-        try:
-            found.append(as_obstacle(one))
-        except ValueError as error:
-            raise ValueError(f"obstacle {i} of the scene file: {error}") from None
-    given = [each for each in courses if each is not None]
-    if not given:
-        return {"obstacles": found}
-    rest = np.zeros(np.shape(given[0])).tolist()
-    return {"obstacles": found, "courses": [rest if each is None else each for each in courses]}
-
-
-def refuse_unknown_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Check the names of options.
-
-    Raises:
-        ValueError: A name is unknown; the message lists the known ones.
-    """
-    unknown = sorted(repr(name) for name in options if name not in known)
-    if unknown:
-        raise ValueError(f"reset options know {', '.join(known)} and reset_mask, not {', '.join(unknown)}")
-
-
-def given_changes(
-    options: Mapping[str, Any], number: int, dimension: int, n_rows: int
-) -> tuple[Float | None, Float | None]:
-    """Return given jumps and courses of N scenes; None where not given.
-
-    Args:
-        options: May hold `jumps`, rows (time, target D), and `courses`, rows (velocity D, time, velocity D), one
-            for each given obstacle; shape (n, .) for all scenes, or (N, n, .).
-        number: Number of scenes, N.
-        dimension: D.
-        n_rows: Greatest number of obstacles in a scene, n.
-
-    Returns:
-        Jumps, shape (N, MOST_JUMPS, D + 1), and courses, shape (N, n, 2 D + 1).
-
-    Raises:
-        ValueError: An array is not finite or has another shape, or a name is unknown.
-    """
-    refuse_unknown_options(options, (*GIVEN, *CHANGES))
-    jumps, courses = None, None
-    if "jumps" in options:
-        jumps = _parse("jumps", options["jumps"], (number, MOST_JUMPS, dimension + 1))
-        absent_last = np.argsort((jumps == 0.0).all(axis=-1), axis=-1, kind="stable")
-        jumps = np.take_along_axis(jumps, absent_last[..., None], axis=1)
-    if "courses" in options:
-        if "obstacles" not in options:
-            raise ValueError("options['courses'] are those of options['obstacles'], which must be given, too")
-        courses = _parse("courses", options["courses"], (number, n_rows, 2 * dimension + 1))
-    elif "obstacles" in options:
-        courses = np.zeros((number, n_rows, 2 * dimension + 1))
-    return jumps, courses
-
-
-def _parse(name: str, value: Any, shape: tuple[int, ...]) -> Float:
-    """Return an option as an array of a shape: (N, D), or (N, n, .) with rows of zeros behind the given ones.
-
-    The option may be one for all scenes.
-    """
-    array = _numbers(name, value)
-    result, (number, *most, size) = np.zeros(shape), shape
-    if not most:
-        if array.shape not in (shape, shape[1:], (1, size)):
-            raise ValueError(f"options[{name!r}] must have shape {shape} or {shape[1:]}, got {array.shape}")
-        result[:] = array
-        return result
-    if array.shape in ((0,), (number, 0)):
-        return result
-    one, several = array.ndim == 2, array.ndim == 3 and len(array) in (1, number)
-    if array.shape[-1:] != (size,) or not (one or several):
-        raise ValueError(
-            f"options[{name!r}] must have shape (n, {size}) or ({number}, n, {size}), got {array.shape}"
-        )
-    if array.shape[-2] > most[0]:
-        hint = ""
-        if name == "obstacles":
-            hint = f"; make the environment with n_obstacles=(0, n) and n up to {MOST_OBSTACLES}"
-        raise ValueError(f"options[{name!r}] must have at most {most[0]} {name}, got {array.shape[-2]}{hint}")
-    result[:, : array.shape[-2]] = array
-    return result
-
-
-def _numbers(name: str, value: Any) -> Float:
-    """Return an option as finite real numbers."""
-    return finite_array(f"options[{name!r}]", value)

@@ -1,375 +1,314 @@
-"""Rejection sampling of scenes, in the plane and in space.
+"""Rejection sampling of scenes.
 
-In a scene, the straight movement hits an obstacle and the feasible path does not. An attempt at a scene takes the next
-numbers of a random generator, and the first good attempt is the scene. Numbers are drawn in groups of attempts; the
-next scene of a generator begins after the group of the good attempt. So scenes do not depend on how many attempts are
-computed at once, or with which others: those at many scenes are computed together.
+A layout is drawn, then several pairs of start and goal for it. A scene is accepted if both ends are free and the
+straight movement between them is not. A scene depends on its own random generator only, whatever the batch.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-from collections.abc import Mapping, Sequence
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.base import CollisionModel
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Index, Int
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-from viapoint.envs.geometry.rows import CAPSULES, has_shapes, row_size, shape_columns, shape_number
-from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.draws import (
-    IN_THE_WAY,
-    RESHAPE_NUMBERS,
-    ObstacleSampler,
-    Uniforms,
-    reshaped,
-    rotate,
-    whole_between,
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.validation import fewest_and_most
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.inverse_kinematics import planar_joints
+from viapoint.envs.arms.kinematics import link_poses, sphere_centres
+from viapoint.envs.geometry.clearance import memory
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.plans import SpaceName
+from viapoint.envs.scenes import families_plane, families_space
+from viapoint.envs.scenes.ends import PAIRS, Attempts, Draft, Mover, draw_ends, numbers_of_end
+from viapoint.envs.scenes.families_registry import Build, check_families, scene_families
+from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, most_rows
+from viapoint.envs.scenes.motions import (
+    CANDIDATES,
+    COURSE_NUMBERS,
+    Changes,
+    draw_courses,
+    draw_jumps,
+    numbers_of_jumps,
 )
-from viapoint.envs.scenes.families import MOST_DRAWN
-from viapoint.envs.scenes.feasible_path import DRAW_ORDER, DrawOrder, Ends, sample_ends, sample_paths
-from viapoint.envs.scenes.planar_obstacles import HandObstacles, WholeArmObstacles, draw_shapes
-from viapoint.envs.scenes.scene import FARTHEST_CENTRE, LARGEST_HALF_AXIS, Scenes, rest_clearance
-from viapoint.envs.scenes.spatial_families import draw_obstacles
-from viapoint.envs.scenes.spatial_obstacles import SpatialObstacles
+from viapoint.envs.scenes.scene import MOST_JUMPS, Scenes, resting
 
-Distribution = SceneDistribution | SpaceDistribution
+LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
+"""Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
+PLANE_MARGIN, SPACE_MARGIN = 0.025, 0.02
+"""Least clearance of starts and goals from obstacles, [m]."""
+LIMIT_MARGIN = 0.02
+"""Least distance of ends from the joint limits, [rad] or [m]; at most a tenth of the range."""
+LEAST_WAY = 0.5
+"""Least length of the way from start to goal in joint space, [rad]."""
+PLANE_REACH, SPACE_REACH = 0.6755, 0.947
+"""Reaches of the tools of the reference arms, measured from joint 2, [m]."""
+SHOULDER = 0.333
+"""Height of joint 2 of the reference arm in space, [m]."""
+REACH_SAMPLES = 2000
+"""Configurations among which the reach of an arm is looked for."""
+MOST_DRAWN = 32
+"""Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given."""
+ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
+"""Layouts that are drawn for a scene at most, and layouts after which another family is tried."""
 
-TOGETHER = 1024
-"""Attempts that are computed at once: more take as much time each."""
-MOST = 24
-"""Attempts at one scene for which further groups are begun: those after the first good one are in vain."""
-SHARED_GROUPS = 8
-"""Groups of attempts at a scene that share the number :attr:`SceneSampler.fixed`."""
-UNIFORM_GROUPS = (4, 8, *[16] * 400)
-"""Attempts at a uniform scene that are drawn one after the other."""
-DRAWN = 3
-"""Obstacles of a uniform scene that are drawn for each row; the first ones that leave start and goal free are taken."""
-UNIFORM_NUMBERS = {2: 6, 3: 9}
-"""Uniform numbers that make one obstacle of a uniform scene, by the dimension."""
-N_TIMES = 24
-"""Positions along the straight line at which its clearance and reach are computed."""
+
+class Given(NamedTuple):
+    """Parts of N scenes that are given and not drawn; None for those that are drawn."""
+
+    start: Float | None = None
+    """Joint positions, shape (N, J)."""
+    goal: Float | None = None
+    """Joint positions, shape (N, J)."""
+    obstacles: Obstacles | None = None
+    """Obstacles, with as many rows as the sampler's scenes."""
+    jumps: Float | None = None
+    """Jumps of the target, shape (N, MOST_JUMPS, J + 1)."""
+    turns: tuple[Float, Float] | None = None
+    """Times and velocities of changes of course, shape (N, n) and (N, n, 3)."""
 
 
 class SceneSampler:
-    """Rejection sampler of scenes for an arm.
+    """Sampler of scenes for an arm.
 
     Args:
-        collision_model: Arm that moves, and the bodies that must clear the obstacles.
-        distribution: Distribution of scenes, of the same dimension.
-        obstacles: Sampler of obstacles; by default that of the distribution.
-        order: Amounts of random numbers; by default those of the dimension.
+        arm: Arm.
+        space: Space in which the straight movement is straight: `hand` or `joints`.
+        n_obstacles: Fewest and most obstacles; furniture has as many as it needs.
+        kinds: Kinds that obstacles may have.
+        families: Names of families, drawn with equal chances; a repeated name is drawn more often.
+        rows: Rows for obstacles in the scenes, at least as many as are drawn.
+        tall: True if obstacles in the plane are in the way of the links, too.
+        jumps: Fewest and most jumps of the target.
+        moving: True if obstacles move.
+        durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
+            duration of the straight movement that the velocity limits of the joints allow.
+
+    Raises:
+        ValueError: A number or name is not allowed.
     """
 
     def __init__(
         self,
-        collision_model: CollisionModel,
-        distribution: Distribution,
+        arm: Arm,
         *,
-        obstacles: ObstacleSampler | None = None,
-        order: DrawOrder | None = None,
+        space: SpaceName,
+        n_obstacles: tuple[int, int],
+        kinds: tuple[str, ...],
+        families: tuple[str, ...],
+        rows: int,
+        tall: bool = False,
+        jumps: tuple[int, int] = (0, 0),
+        moving: bool = False,
+        durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
     ) -> None:
-        self.collision_model, self.arm, self.distribution = collision_model, collision_model.arm, distribution
-        drawn = _drawn(distribution)
-        self._spare = 0 if obstacles else distribution.n_obstacles[1] - drawn.n_obstacles[1]
-        if obstacles is None and isinstance(drawn, SpaceDistribution):
-            obstacles = SpatialObstacles(collision_model, drawn)
-        planar = WholeArmObstacles if collision_model.whole_arm else HandObstacles
-        self._obstacles: ObstacleSampler = obstacles or planar(collision_model, drawn)  # type: ignore[arg-type]
-        self.order = order or DRAW_ORDER[self.arm.dimension]
+        fewest, most = fewest_and_most("n_obstacles", n_obstacles, rows, rows)
+        jumps = fewest_and_most("jumps", jumps, MOST_JUMPS, MOST_JUMPS)
+        self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
+        self.plane = is_planar(arm)
+        self.families = check_families(families, self.plane, kinds, most)
+        most = min(most, max(fewest, MOST_DRAWN))
+        self.room = room_of(arm, kinds, (fewest, most), tall)
+        self.changes = Changes(*jumps, moving, *durations)
+        self._mover = mover_of(arm, space, self.plane)
+        self._builds = [scene_families(self.plane)[name].build for name in self.families]
+        self._bare = families_plane.clutter if self.plane else families_space.clutter
+        self._width = max(most_rows(most), rows)
+        self._memories = [memory(arm.chain, arm.spheres) for _ in range(3)]
 
-    def __call__(self, generators: Sequence[np.random.Generator], ends: Ends = None) -> Scenes:
-        """Sample one scene from each generator.
+    def __call__(self, generators: Sequence[np.random.Generator], given: Given | None = None) -> Scenes:
+        """Draw one scene from each of N random generators.
 
         Args:
             generators: N random generators.
-            ends: Given starts and goals, shape (N, D) each, NaN where they are sampled, [m].
+            given: Parts of the scenes that are not drawn.
 
         Raises:
-            RuntimeError: No scene was found in many attempts, for example with given ends at the border of the reach.
+            RuntimeError: No scene was found in many attempts.
         """
-        number = len(generators)
-        start, goal = np.zeros((2, number, self.arm.dimension))
-        scenes = Scenes(start, goal, np.zeros((number, self._obstacles.rows, self._row_size)))
-        pending = np.arange(number)
-        attempts = [Attempts(self, each) for each in generators]
-        apart = len({id(each.bit_generator) for each in generators}) == number
-        while len(pending):
-            left = np.ones(len(pending), dtype=bool)
-            for begin in range(0, len(pending), TOGETHER):
-                some = pending[begin : begin + TOGETHER]
-                given = None if ends is None else (ends[0][some], ends[1][some])
-                which, found = next_attempts([attempts[k] for k in some], given, apart=apart)
-                scenes.put(some[which], found)
-                left[begin + which] = False
-            pending = pending[left]
-        if not self._spare:
-            return scenes
-        # Empty rows for given obstacles, of which there may be more than are drawn.
-        return scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, self._spare), (0, 0))))
-
-    def not_found(self, attempts: int, ends: Ends) -> str:
-        """Return the message for a scene, with given ends or not, of which no attempt was good."""
-        where = (
-            f"between start {ends[0]} and goal {ends[1]}"
-            if ends is not None
-            else f"in the workspace {self.arm.workspace} m of {self.arm.name}; an arm of your own may need a larger "
-            "one, or fewer obstacles (n_obstacles)"
+        given = given or Given()
+        draft = self._draft(len(generators), given)
+        rooms = self._rooms(len(generators), given)
+        bare = self.room.most == 0 or given.obstacles is not None
+        builds = [self._bare if bare else self._any_family(rng) for rng in generators]
+        pending = np.arange(len(generators))
+        for attempt in range(ATTEMPTS):
+            for i in map(int, pending):
+                rng = generators[i]
+                if attempt and attempt % FAMILY_ATTEMPTS == 0 and not bare:
+                    builds[i] = self._any_family(rng)
+                self._write(draft.attempts, i, builds[i](rng, rooms[i]), given)
+                rng.random(out=draft.attempts.numbers[i])
+            found = draw_ends(draft, pending)
+            found[found] = self._change(draft, pending[found], generators, given)
+            pending = pending[~found]
+            if not len(pending):
+                return self._finished(draft)
+        raise RuntimeError(
+            f"no scene of the families {', '.join(self.families)} with {self.room.fewest} to {self.room.most} "
+            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.arm.name!r}; allow fewer obstacles or "
+            "other families, or give other ends"
         )
-        n_obstacles = self.distribution.n_obstacles
-        return f"no scene with {n_obstacles} obstacles was found in {attempts} attempts {where}"
 
-    @functools.cached_property
-    def size(self) -> int:
-        """Uniform numbers of one attempt."""
-        ends = 2 * self.arm.dimension * self.order.n_ends
-        return ends + 3 * self.order.n_paths + self._obstacles.size + self._reshape_size
+    def _draft(self, number: int, given: Given) -> Draft:
+        """Return N scenes with the given parts."""
+        width, joints = self._width, len(self.arm.home)
+        attempts = Attempts(
+            rows=np.zeros((number, width, ROW)),
+            n_rows=np.zeros(number, np.int64),
+            keep=np.zeros(number, np.int64),
+            places=np.zeros((number, 2, MOST_PLACES, PLACE)),
+            n_places=np.zeros((number, 2), np.int64),
+            fixed=np.zeros((number, 2), np.bool_),
+            numbers=np.zeros((number, PAIRS, 2, numbers_of_end(joints))),
+        )
+        ends = np.zeros((number, 2, joints))
+        for end, configurations in enumerate((given.start, given.goal)):
+            if configurations is not None:
+                ends[:, end] = configurations
+                attempts.fixed[:, end] = True
+        if given.obstacles is not None:
+            attempts.n_rows[:] = -1
+        obstacles = no_obstacles(number, width) if given.obstacles is None else given.obstacles
+        scenes = resting(ends[:, 0], ends[:, 1], obstacles)
+        if given.jumps is not None:
+            scenes.jumps[:] = given.jumps
+        if given.turns is not None:
+            scenes.turn_time[:], scenes.turn_velocity[:] = given.turns
+        changes = scenes.turn_time, scenes.turn_velocity, scenes.jumps
+        return Draft(self._mover, attempts, ends, obstacles, *changes, *self._memories)
 
-    @functools.cached_property
-    def fixed(self) -> int | None:
-        """Index of the number that attempts of the first groups share; None for none."""
-        fixed = self._obstacles.fixed
-        return None if fixed is None else self.size - self._reshape_size - self._obstacles.size + fixed
+    def _finished(self, draft: Draft) -> Scenes:
+        """Return drawn scenes, without the rows for obstacles that were left out."""
+        rows = slice(0, self.rows)
+        given = draft.obstacles
+        obstacles = given._replace(
+            kind=given.kind[:, rows].copy(),
+            centre=given.centre[:, rows].copy(),
+            rotation=given.rotation[:, rows].copy(),
+            size=given.size[:, rows].copy(),
+            velocity=given.velocity[:, rows].copy(),
+        )
+        absent = ~obstacles.present
+        for part in (obstacles.centre, obstacles.size, obstacles.velocity):
+            part[absent] = 0.0
+        obstacles.rotation[absent] = np.eye(3)
+        return Scenes(
+            start=draft.ends[:, 0].copy(),
+            goal=draft.ends[:, 1].copy(),
+            obstacles=obstacles,
+            jumps=draft.jumps,
+            turn_time=draft.turn_time[:, rows].copy(),
+            turn_velocity=draft.turn_velocity[:, rows].copy(),
+        )
 
-    @property
-    def _row_size(self) -> int:
-        """Number of values of an obstacle."""
-        return row_size(self.arm.dimension, self.distribution.shapes)
+    def _any_family(self, rng: np.random.Generator) -> Build:
+        """Return the function of a random family."""
+        return self._builds[int(len(self._builds) * rng.random())]
 
-    @property
-    def _reshape_size(self) -> int:
-        """Uniform numbers that decide the shapes of obstacles."""
-        shaped = self.distribution.shapes != CAPSULES
-        return RESHAPE_NUMBERS * self._obstacles.rows if shaped else 0
+    def _rooms(self, number: int, given: Given) -> list[Room]:
+        """Return the room of each scene; in the plane it tells the ends that are given."""
+        room = self.room if given.obstacles is None else self.room._replace(fewest=0, most=0)
+        if not self.plane or (given.start is None and given.goal is None):
+            return [room] * number
+        ends: list[list[Any]] = []
+        for joints in (given.start, given.goal):
+            if joints is None:
+                ends.append([None] * number)
+                continue
+            hand = (self.arm.hand(joints) - np.array(room.foot)) / room.scale
+            ends.append([(float(x), float(y)) for x, y, _ in hand])
+        return [room._replace(start=start, goal=goal) for start, goal in zip(*ends, strict=True)]
 
-    def attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
-        """Return the indices of good attempts and their scenes; each stage looks at the rows that are left."""
-        d, order, arm = self.distribution, self.order, self.arm
-        u = uniforms.take_table(order.n_ends, 2 * arm.dimension, by_column=order.by_column)
-        start, goal, good = sample_ends(u, arm, d.distance, d.steepness, d.reach_margin, ends)
-        rows = np.flatnonzero(good)
-        if len(rows) < len(good):
-            uniforms, start, goal = uniforms.at(rows), start[rows], goal[rows]
-        u = uniforms.take_table(order.n_paths, self._obstacles.path_numbers, by_column=order.by_column)
-        steered = self._obstacles.steered(uniforms, len(rows))
-        feasible, good = sample_paths(u, arm, start, goal, d.reach_margin, steered)
-        if not good.all():
-            some = np.flatnonzero(good)
-            uniforms, rows, feasible = uniforms.at(some), rows[some], feasible.take(some)
-        obstacles = np.zeros((0, self._obstacles.rows, self._row_size))
-        if len(rows):
-            obstacles, good = self._obstacles(uniforms, feasible)
-            some = np.flatnonzero(good)
-            rows, feasible, obstacles = rows[some], feasible.take(some), obstacles[some]
-            uniforms = uniforms.at(some)
-        return self._reshaped(uniforms, rows, Scenes(feasible.start, feasible.goal, obstacles))
+    def _write(self, attempts: Attempts, scene: int, layout: Layout, given: Given) -> None:
+        """Write a layout into the tables of attempts."""
+        rows, starts, goals, keep = layout.rows, layout.starts, layout.goals, layout.keep
+        attempts.keep[scene] = keep
+        if given.obstacles is None:
+            attempts.n_rows[scene] = len(rows) // ROW
+            attempts.rows[scene].reshape(-1)[: len(rows)] = rows
+        for end, places in enumerate((starts, goals)):
+            attempts.places[scene, end].reshape(-1)[: len(places)] = places
+            attempts.n_places[scene, end] = len(places) // PLACE
 
-    def _reshaped(self, uniforms: Uniforms, rows: Index, scenes: Scenes) -> tuple[Index, Scenes]:
-        """Return the good attempts and their scenes with obstacles of the distribution's shapes.
+    def _change(
+        self, draft: Draft, which: Int, generators: Sequence[np.random.Generator], given: Given
+    ) -> Bool:
+        """Draw the changes of K scenes, and return True for those in which they fit, shape (K,)."""
 
-        What is inside a capsule may no longer be in the way of the straight movement; such attempts fail. Boxes are
-        parts of structures of boxes, which stay as they are and in the way.
-        """
-        if not self._reshape_size:
-            return rows, scenes
-        u = uniforms.take_table(self._obstacles.rows, RESHAPE_NUMBERS)
-        boxes = _has_boxes(scenes.obstacles)
-        scenes = scenes._replace(obstacles=reshaped(scenes.obstacles, u, self.distribution.shapes))
-        good = boxes | ~scenes.present.any(axis=-1)
-        rest = np.flatnonzero(~good)
-        good[rest] = blocks_straight_movement(self.collision_model, scenes.take(rest))
-        some = np.flatnonzero(good)
-        return rows[some], scenes.take(some)
+        def numbers(*shape: int) -> Float:
+            return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
 
-
-class UniformSampler(SceneSampler):
-    """Rejection sampler of scenes that are uniform in the workspace, without a feasible path to begin with.
-
-    Start and goal are uniform in the box :attr:`~viapoint.envs.arms.base.Arm.workspace`, `reach_margin` inside the
-    reach, and may have any distance from each other; the straight line between them is within reach. The number of
-    obstacles is uniform between its limits. Their centres are uniform in the same box, their directions are uniform in
-    the plane, and their kinds and sizes are those of the distribution's other scenes. Obstacles that come closer to the
-    resting arm at start or goal than `end_margin` are left out. A scene is good if the straight movement cuts into an
-    obstacle, or if it has none. A few of the scenes have no solution.
-    """
-
-    def __init__(self, collision_model: CollisionModel, distribution: Distribution) -> None:
-        order = DRAW_ORDER[distribution.dimension]._replace(groups=UNIFORM_GROUPS)
-        super().__init__(collision_model, distribution, order=order)
-        self._drawn = _drawn(distribution)
-        self._rows = self._drawn.n_obstacles[1]
-
-    @property
-    def size(self) -> int:
-        """See :attr:`SceneSampler.size`."""
-        dimension = self.arm.dimension
-        return 2 * dimension + 1 + DRAWN * self._rows * UNIFORM_NUMBERS[dimension] + self._reshape_size
-
-    def attempt(self, uniforms: Uniforms, ends: Ends) -> tuple[Index, Scenes]:
-        """See :meth:`SceneSampler.attempt`."""
-        start, goal, good = self._ends(uniforms, ends)
-        count = whole_between(self._drawn.n_obstacles, uniforms.take(1)[:, 0])
-        rows = np.flatnonzero(good)
-        start, goal, count = start[rows], goal[rows], count[rows]
-        drawn = Scenes(start, goal, self._draw_obstacles(uniforms.at(rows), len(rows)))
-        obstacles, enough = self._first(drawn, self._free(drawn), count)
-        some = np.flatnonzero(enough)
-        rows, scenes = rows[some], Scenes(start[some], goal[some], obstacles[some])
-        blocked = blocks_straight_movement(self.collision_model, scenes)
-        some = np.flatnonzero(blocked | (count[some] == 0))
-        rows, scenes = rows[some], scenes.take(some)
-        return self._reshaped(uniforms.at(rows), rows, scenes)
-
-    def _ends(self, uniforms: Uniforms, ends: Ends) -> tuple[Float, Float, Bool]:
-        """Return starts and goals, shape (N, D), [m], and which are apart and joined within reach, shape (N,)."""
-        arm = self.arm
-        low, high = (np.array(corner) for corner in arm.workspace)
-        u = uniforms.take(2 * arm.dimension).reshape(-1, 2, arm.dimension)
-        points = low + (high - low) * u
-        if ends is not None:
-            given = np.stack(ends, axis=1)
-            points = np.where(np.isnan(given), points, given)
-        inside = np.asarray(arm.reach_margin(points)) > self._drawn.reach_margin
-        if ends is not None:
-            inside |= np.isfinite(given[..., 0])
-        start, goal = points[:, 0], points[:, 1]
-        good = np.asarray(inside.all(axis=-1) & (norm(goal - start) >= MIN_GOAL_DISTANCE))
-        good[good] = np.asarray(arm.reach_margin(_lines(start[good], goal[good]))).min(axis=-1) > 0.0
-        return start, goal, good
-
-    def _draw_obstacles(self, uniforms: Uniforms, n_scenes: int) -> Float:
-        """Return obstacles anywhere in the workspace, shape (N, DRAWN rows, 2 D + 1), [m]."""
-        arm, distribution, number = self.arm, self._drawn, DRAWN * self._rows
-        if not number:
-            return np.zeros((n_scenes, 0, 2 * arm.dimension + 1))
-        low, high = (np.array(corner) for corner in arm.workspace)
-        centre = low + (high - low) * uniforms.take_table(number, arm.dimension)
-        if isinstance(distribution, SpaceDistribution):
-            return draw_obstacles(distribution, centre, uniforms.take_table(number, 6))
-        every_way = dataclasses.replace(distribution, bar_tilt=0.5 * np.pi)
-        half, radius, angle = draw_shapes(uniforms, every_way, number)
-        axis = half[..., None] * rotate(np.broadcast_to((1.0, 0.0), centre.shape), angle)
-        return np.concatenate((centre, axis, radius[..., None]), axis=-1)
-
-    def _free(self, scenes: Scenes) -> Bool:
-        """Return which obstacles leave room for the arm at start and goal and are within bounds, shape (N, n)."""
-        d = scenes.start.shape[-1]
-        free = np.abs(scenes.obstacles[..., :d]).max(axis=-1, initial=0.0) < FARTHEST_CENTRE
-        free &= norm(scenes.obstacles[..., d : 2 * d]) < LARGEST_HALF_AXIS
-        for point in (scenes.start, scenes.goal):
-            clearance = rest_clearance(scenes, point, self.collision_model)[:, : free.shape[1]]
-            free &= clearance > self._drawn.end_margin
-        return np.asarray(free)
-
-    def _first(self, scenes: Scenes, free: Bool, count: Float) -> tuple[Float, Bool]:
-        """Return the first `count` free obstacles of each scene, shape (N, rows, 2 D + 1), and which have as many."""
-        first = np.argsort(~free, axis=-1, kind="stable")[:, : self._rows]
-        chosen = np.take_along_axis(scenes.obstacles, first[..., None], axis=1)
-        chosen[np.arange(self._rows) >= count[:, None]] = 0.0
-        return chosen, free.sum(axis=-1) >= count
+        if self.changes.moving and given.obstacles is None:
+            draw_courses(draft, self.changes, which, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
+        if self.changes.most_jumps == 0 or given.jumps is not None:
+            return np.ones(len(which), bool)
+        return draw_jumps(draft, self.changes, which, numbers(numbers_of_jumps(len(self.arm.home))))
 
 
-class Attempts:
-    """Attempts at the next scene of one random generator, until one is good."""
-
-    def __init__(self, sampler: SceneSampler, generator: np.random.Generator) -> None:
-        self.generator, self.sampler = generator, sampler
-        self._shared = 0.0 if sampler.fixed is None else generator.random()
-        self.made = 0
-        """Attempts that were taken."""
-        self._rest = np.empty((0, sampler.size))
-        # Attempts up to the end of each group that was drawn, and the generator's state there.
-        self._groups: list[tuple[int, Mapping[str, Any]]] = []
-
-    def take(self, least: int, most: int) -> Float:
-        """Return the numbers of the next attempts, shape (n, size); n = 0 after the last.
-
-        Args:
-            least: Attempts for which further groups are begun.
-            most: Greatest number n.
-        """
-        groups, sampler = self._groups, self.sampler
-        while len(self._rest) < least and len(groups) < len(sampler.order.groups):
-            count = sampler.order.groups[len(groups)]
-            drawn = self.generator.random((count, sampler.size))
-            if sampler.fixed is not None and len(groups) < SHARED_GROUPS:
-                drawn[:, sampler.fixed] = self._shared
-            groups.append((count + (groups[-1][0] if groups else 0), self.generator.bit_generator.state))
-            self._rest = np.concatenate((self._rest, drawn)) if len(self._rest) else drawn
-        taken, self._rest = self._rest[:most], self._rest[most:]
-        self.made += len(taken)
-        return taken
-
-    def end(self, attempt: int) -> None:
-        """Set the generator back to the end of the group that holds an attempt."""
-        state = next(state for end, state in self._groups if attempt < end)
-        if state is not self._groups[-1][1]:
-            self.generator.bit_generator.state = state
+def is_planar(arm: Arm) -> bool:
+    """Return True for an arm of two hinges with vertical axes."""
+    if len(arm.home) != 2 or arm.chain.sliding.any():
+        return False
+    rotation, _ = link_poses(arm.chain, arm.home)
+    return bool((np.abs(rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
 
 
-def next_attempts(
-    attempts: Sequence[Attempts], ends: Ends = None, *, apart: bool = True
-) -> tuple[Int, Scenes]:
-    """Compute the next attempts at several scenes.
-
-    Args:
-        attempts: Attempts of one sampler at N scenes, at most TOGETHER.
-        ends: Starts and goals of the N scenes, see :meth:`SceneSampler.__call__`.
-        apart: False if scenes share a generator: whole groups are then drawn in turn.
-
-    Returns:
-        Indices of scenes with a good attempt, and the scenes; their generators are at the next scene.
-
-    Raises:
-        RuntimeError: There are no further attempts at a scene.
-    """
-    number, sampler = len(attempts), attempts[0].sampler
-    order = sampler.order
-    least = min(max(order.ahead // number, 1), MOST) if apart else 1
-    most = max(TOGETHER // number, least) if apart else max(order.groups)
-    taken = [each.take(least, most) for each in attempts]
-    for k, each in enumerate(attempts):
-        if not len(taken[k]):
-            given = None if ends is None else (ends[0][k], ends[1][k])
-            raise RuntimeError(sampler.not_found(each.made, given))
-    counts = np.array([len(each) for each in taken])
-    owner, begin = np.repeat(np.arange(number), counts), np.repeat(np.cumsum(counts) - counts, counts)
-    given = None if ends is None else (ends[0][owner], ends[1][owner])
-    found, scenes = sampler.attempt(Uniforms(np.concatenate(taken)), given)
-    first = np.flatnonzero(np.diff(owner[found], prepend=-1))
-    which, place = owner[found[first]], found[first] - begin[found[first]]
-    for k, at in zip(which, place, strict=True):
-        attempts[k].end(attempts[k].made - len(taken[k]) + int(at))
-    return which, scenes.take(first)
+def mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
+    """Return what compiled functions know of an arm."""
+    width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
+    margin = np.minimum(LIMIT_MARGIN, 0.1 * width)
+    away = arm.hand(arm.home) - arm.chain.origin[0]
+    return Mover(
+        chain=arm.chain,
+        spheres=arm.spheres,
+        joint_range=arm.joint_range,
+        inner_range=arm.joint_range + margin[:, None] * np.array([1.0, -1.0]),
+        velocity_limit=arm.velocity_limit,
+        home=arm.home,
+        bearing=math.atan2(away[1], away[0]),
+        plane=plane,
+        of_hand=space == "hand",
+        margin=PLANE_MARGIN if plane else SPACE_MARGIN,
+        least_way=0.0 if plane else LEAST_WAY,
+    )
 
 
-def _has_boxes(obstacles: Float) -> Bool:
-    """Return which of N scenes have a box, shape (N,), from rows of either kind."""
-    if not has_shapes(obstacles):
-        return np.zeros(len(obstacles), dtype=bool)
-    boxes = shape_columns(obstacles).kind == shape_number("box")
-    return np.asarray((boxes & (obstacles[..., -1] > 0.0)).any(axis=-1))
+def room_of(arm: Arm, kinds: tuple[str, ...], n_obstacles: tuple[int, int], tall: bool) -> Room:
+    """Return the room for layouts around an arm."""
+    plane = is_planar(arm)
+    low, high = arm.joint_range.T
+    joints = np.random.default_rng(0).uniform(low, high, (REACH_SAMPLES, len(low)))
+    foot = arm.chain.origin[0].copy()
+    if plane:
+        foot[2] = arm.hand(arm.home)[2]
+    reach = float(norm(arm.hand(joints) - foot).max())
+    scale = round(reach / (PLANE_REACH if plane else SPACE_REACH), 2)
+    height = TALL_HALF_HEIGHT if tall else LOW_HALF_HEIGHT
+    foot[2] -= 0.0 if plane else SHOULDER * scale
+    turns = not arm.chain.sliding[0] and high[0] - low[0] < 2.0 * np.pi
+    centres = sphere_centres(arm.chain, arm.spheres, arm.home)
+    low_enough = np.abs(centres[:, 2] - foot[2]) < height + arm.spheres.radius
+    passing = arm.spheres.radius[low_enough & (np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) > 1)]
+
+    return Room(
+        kinds,
+        *n_obstacles,
+        scale=scale,
+        foot=(float(foot[0]), float(foot[1]), float(foot[2])),
+        turn=(float(low[0]), float(high[0])) if turns else (-math.pi, math.pi),
+        height=height,
+        hand=float(passing.max(initial=0.0)) / scale,
+        links=_links(arm, scale) if plane else (0.0, 0.0),
+    )
 
 
-def _drawn(distribution: Distribution) -> Distribution:
-    """Return a distribution without the room for given obstacles beyond those that are drawn."""
-    fewest, most = distribution.n_obstacles
-    return dataclasses.replace(distribution, n_obstacles=(fewest, min(most, MOST_DRAWN)))
-
-
-def blocks_straight_movement(collision_model: CollisionModel, scenes: Scenes) -> Bool:
-    """Return in which of N scenes the straight movement cuts into an obstacle, shape (N,)."""
-    if not scenes.obstacles.size:
-        return np.zeros(len(scenes.start), dtype=bool)
-    lines = _lines(scenes.start, scenes.goal)
-    least = collision_model.least_clearance(lines, scenes.obstacles, scenes.present, floor=-IN_THE_WAY)
-    return np.asarray(least < -IN_THE_WAY)
-
-
-def _lines(start: Float, goal: Float) -> Float:
-    """Return positions along straight lines, shape (N, N_TIMES, D), [m]."""
-    return np.asarray(start[:, None] + (goal - start)[:, None] * np.linspace(0.0, 1.0, N_TIMES)[:, None])
+def _links(arm: Arm, scale: float) -> tuple[float, float]:
+    """Return the lengths of the links of an arm in the plane, see :class:`Room`."""
+    _, origin = link_poses(arm.chain, planar_joints(arm, arm.hand(arm.home)[:2]))
+    upper, fore = origin[2] - origin[1], arm.hand(arm.home) - origin[2]
+    left = upper[0] * fore[1] - upper[1] * fore[0] < 0.0
+    lengths = float(norm(upper[:2])) / scale, float(norm(fore[:2])) / scale
+    return -lengths[0] if left else lengths[0], lengths[1]

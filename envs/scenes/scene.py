@@ -1,265 +1,299 @@
-"""Scenes: start, goal and obstacles of a movement, and checks of them."""
+"""Scenes: start, goal and obstacles of movements, their changes, and checks of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-from viapoint.envs.geometry.distance import arm_clearance, hand_clearance
-from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
-from viapoint.envs.geometry.rows import (
-    has_shapes,
-    pair_distance,
-    rotation_axes,
-    shape_columns,
-    shape_number,
-    shape_rows,
-    widened,
-)
-from viapoint.envs.geometry.shape import UNIT_TOLERANCE
-from viapoint.envs.geometry.shapes import SHAPES
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import point_distance
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
 
-if TYPE_CHECKING:
-    from viapoint.envs.arms.base import CollisionModel
-
-LARGEST_HALF_AXIS = 0.3
-"""Greatest half length of a bar, [m]."""
-LARGEST_RADIUS = 0.1
-"""Greatest radius of an obstacle, [m]."""
+MOST_JUMPS = 4
+"""Greatest number of jumps of the target in an episode."""
+ENDS = ("start", "goal")
+"""Names of the ends of a movement."""
+NEVER = 1e9
+"""Time of a change that does not happen, [s]."""
+ROUNDING = 1e-9
+"""Rounding error of times, [s], and joint positions, [rad]."""
+LEAST_APART = 0.02
+"""Least difference of start and goal in the joint that moves most, [rad] or [m]."""
+FARTHEST = 2.0
+"""Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none."""
 FASTEST = 1.0
 """Greatest speed of an obstacle, [m/s]."""
-FARTHEST_CENTRE = 1.0
-"""Greatest coordinate of an obstacle's centre, [m]."""
-LARGEST_HALF_LENGTH, FARTHEST_SHAPE = 1.0, 2.0
-"""Greatest half length and coordinate of the box of an obstacle where obstacles may have any shape, [m]."""
-FARTHEST_SURFACE = FARTHEST_SHAPE - EXTENT
-"""Greatest distance of a half-space's surface from the origin, [m]; its observed cube is then not too far."""
-ROUNDING = 1e-9
-"""Rounding error of distances, [m]."""
-
-TARGETS = {
-    "T1": (-0.32, 0.42),
-    "T2": (-0.22, 0.27),
-    "T3": (-0.02, 0.27),
-    "T4": (0.08, 0.42),
-    "T5": (-0.02, 0.57),
-    "T6": (-0.22, 0.57),
-}
-"""The six targets of Flash & Hogan 1985, Fig. 2, [m], shoulder at the origin.
-
-The figure gives no coordinates. Its movements T1-T4, T2-T5 and T3-T6 (Figs. 1, 3 and 4) are the three diagonals of a
-hexagon here, 40, 36 and 36 cm long, in front of the right shoulder and within the reach of the arm.
-"""
 
 
 class Scenes(NamedTuple):
-    """N scenes of up to n obstacles each."""
+    """N scenes of up to n obstacles each, for an arm of J joints."""
 
     start: Float
-    """Shape (N, D), [m]."""
+    """Joint positions at the start, shape (N, J), [rad] or [m]."""
     goal: Float
-    """Shape (N, D), [m]."""
-    obstacles: Float
-    """Rows (centre D, half-axis D, radius), shape (N, n, 2 D + 1), [m], or rows with shapes, see
-    :mod:`viapoint.envs.geometry.rows`; absent rows are zero."""
+    """Joint positions of the first target, shape (N, J), [rad] or [m]."""
+    obstacles: Obstacles
+    """Obstacles at time 0."""
+    jumps: Float
+    """Jumps of the target in the order of time: rows (time [s], joint positions), shape (N, MOST_JUMPS, J + 1).
 
-    @property
-    def present(self) -> Bool:
-        """Rows that are obstacles, shape (N, n); absent ones have no radius."""
-        return self.obstacles[..., -1] > 0.0
+    Absent rows are zero.
+    """
+    turn_time: Float
+    """Times at which obstacles change their velocity, shape (N, n), [s]; NEVER where they do not."""
+    turn_velocity: Float
+    """Velocities after the change, shape (N, n, 3), [m/s]."""
 
     def take(self, rows: Any) -> Scenes:
-        """Return the scenes at `rows`, an index, slice or mask."""
-        return Scenes(self.start[rows], self.goal[rows], self.obstacles[rows])
+        """Return the scenes at `rows`, an index array, slice or mask."""
+        return Scenes(
+            self.start[rows],
+            self.goal[rows],
+            self.obstacles.take(rows),
+            self.jumps[rows],
+            self.turn_time[rows],
+            self.turn_velocity[rows],
+        )
 
-    def put(self, rows: Any, scenes: Scenes) -> None:
-        """Overwrite the scenes at `rows`."""
-        for mine, theirs in zip(self, scenes, strict=True):
-            mine[rows] = theirs
+    def put(self, rows: Any, scenes: Scenes) -> Scenes:
+        """Return the scenes after the ones at `rows` were overwritten in place; only tables of shapes are new."""
+        self.start[rows] = scenes.start
+        self.goal[rows] = scenes.goal
+        self.jumps[rows] = scenes.jumps
+        self.turn_time[rows] = scenes.turn_time
+        self.turn_velocity[rows] = scenes.turn_velocity
+        return self._replace(obstacles=self.obstacles.put(rows, scenes.obstacles))
 
-    def as_options(self) -> dict[str, Float]:
-        """Return the scenes as options of `reset`."""
-        return dict(self._asdict())
+    @classmethod
+    def together(cls, parts: Sequence[Scenes]) -> Scenes:
+        """Return the scenes of several records in one, which shares no memory with them."""
+        number = sum(len(part.start) for part in parts)
+        obstacles = no_obstacles(number, parts[0].obstacles.kind.shape[1])
+        first = 0
+        for part in parts:
+            last = first + len(part.start)
+            obstacles = obstacles.put(slice(first, last), part.obstacles)
+            first = last
+        return cls(
+            start=np.concatenate([part.start for part in parts]),
+            goal=np.concatenate([part.goal for part in parts]),
+            obstacles=obstacles,
+            jumps=np.concatenate([part.jumps for part in parts]),
+            turn_time=np.concatenate([part.turn_time for part in parts]),
+            turn_velocity=np.concatenate([part.turn_velocity for part in parts]),
+        )
+
+    @property
+    def jump_times(self) -> Float:
+        """Times of the jumps, shape (N, MOST_JUMPS), [s]; NEVER for none."""
+        return np.where((self.jumps != 0.0).any(axis=-1), self.jumps[..., 0], NEVER)
+
+    def goals(self, time: Float) -> Float:
+        """Return the targets, shape (N, J), at one time for each scene, shape (N,), [s]; a jump counts at once."""
+        number = (self.jump_times <= time[:, None] + ROUNDING).sum(axis=-1)
+        targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
+        return np.asarray(targets[np.arange(len(targets)), number])
+
+    def obstacles_at(self, time: Float) -> Obstacles:
+        """Return the obstacles with their places and velocities at one time for each scene, shape (N,), [s]."""
+        time = time[:, None]
+        before = np.minimum(time, self.turn_time)[..., None]
+        after = np.maximum(time - self.turn_time, 0.0)[..., None]
+        velocity = self.obstacles.velocity
+        centre = self.obstacles.centre + velocity * before + self.turn_velocity * after
+        turned = (self.turn_time <= time + ROUNDING)[..., None]
+        now = np.where(turned, self.turn_velocity, velocity)
+        return self.obstacles._replace(centre=centre, velocity=now)
 
 
-def rows_of_lights(length: float = 0.25, radius: float = 0.008) -> tuple[list[tuple[str, str]], Scenes]:
-    """Return the obstacle paradigm of Flash & Hogan 1985: a row of lights across the middle of each movement.
+def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
+    """Return scenes without jumps and changes of course."""
+    number, joints = start.shape
+    return Scenes(
+        start,
+        goal,
+        obstacles,
+        np.zeros((number, MOST_JUMPS, joints + 1)),
+        np.full(obstacles.kind.shape, NEVER),
+        np.zeros(obstacles.centre.shape),
+    )
 
-    Args:
-        length: Length of the row, [m]; the paper's rows were up to 25 cm long.
-        radius: Radius of the row, [m].
 
-    Returns:
-        Ordered pairs of targets, 0.3 m or more apart, and their scenes.
+@compiled
+def row_clearance(
+    spheres: Spheres,
+    placed: Placed,
+    obstacles: Obstacles,
+    scene: int,
+    row: int,
+    time: float,
+    least: float,
+    floor: float,
+    link: int,
+) -> float:
+    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
 
-    Example:
-        >>> from viapoint.envs import rows_of_lights
-        >>> pairs, scenes = rows_of_lights()
-        >>> pairs[0], scenes.obstacles.shape  # one capsule in each scene, [m]
-        (('T1', 'T3'), (14, 1, 5))
+    The search stops at the first clearance below `floor`; the exact value below it does not matter.
     """
-    pairs = [
-        (a, b) for a in TARGETS for b in TARGETS if np.hypot(*np.subtract(TARGETS[a], TARGETS[b])) >= 0.3
-    ]
-    start = np.array([TARGETS[a] for a, _ in pairs])
-    goal = np.array([TARGETS[b] for _, b in pairs])
-    along = (goal - start) / norm(goal - start)[..., None]
-    half = 0.5 * length * np.stack((-along[:, 1], along[:, 0]), axis=-1)
-    rows = np.concatenate(((start + goal) / 2.0, half, np.full((len(pairs), 1), radius)), axis=-1)
-    return pairs, Scenes(start, goal, rows[:, None, :])
+    if obstacles.kind[scene, row] == ABSENT:
+        return least
+    for group in range(len(spheres.link)):
+        if spheres.link[group] < link:
+            continue
+        ball = placed.ball[group]
+        size = spheres.ball_radius[group]
+        away = point_distance(obstacles, scene, row, ball[0], ball[1], ball[2], time, least + size)
+        if away - size >= least:
+            continue
+        place_group(spheres, group, placed)
+        for sphere in range(spheres.first[group], spheres.first[group + 1]):
+            here, radius = placed.centre[sphere], spheres.radius[sphere]
+            away = point_distance(obstacles, scene, row, here[0], here[1], here[2], time, least + radius)
+            least = min(least, away - radius)
+            if least < floor:
+                return least
+    return least
 
 
-Problem = tuple[Bool, Callable[[int], str]]
-"""Mask of the scenes that have a fault, shape (N,), and a function that describes it in one of them."""
-Names = Sequence[Sequence[str]]
-"""Names of obstacles, empty where there is none: one list for all scenes, or one for each."""
-
-
-def problem(
-    wrong: Any, why: str, values: Any = None, part: Callable[[int, int], str] | None = None
-) -> Problem:
-    """Return a fault of scenes.
+@compiled
+def row_clearances(
+    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles
+) -> tuple[Float, Float]:
+    """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
 
     Args:
-        wrong: True for scenes, shape (N,), or for parts of them, shape (N, n), that have the fault.
-        why: Description of the fault with what is allowed.
-        values: Wrong numbers, of the shape of `wrong`.
-        part: Function that names one of n parts of a scene.
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        joints: Joint positions, shape (N, J).
+        obstacles: Obstacles of N scenes.
     """
-    wrong = np.asarray(wrong)
+    placed = memory(chain, spheres)
+    number, rows = obstacles.kind.shape
+    found, own = np.empty((number, rows)), np.empty(number)
+    for scene in range(number):
+        place(chain, spheres, joints[scene], placed)
+        own[scene] = self_clearance(spheres, placed, FAR, -FAR)
+        for row in range(rows):
+            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, FAR, -FAR, 1)
+    return found, own
 
-    def reason(scene: int) -> str:
-        index = (scene,) if part is None else (scene, int(wrong[scene].argmax()))
-        got = "" if values is None else f", got {values[index]:.4g}"
-        return f"{why}{got}" if part is None else f"{part(*index)} {why}{got}"
 
-    return wrong if part is None else wrong.any(axis=-1), reason
-
-
-def check_scenes(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> None:
-    """Check that a movement can start and end in each scene.
+def check_scenes(
+    scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = (), ends: Sequence[str] = ENDS
+) -> None:
+    """Check that a movement can start and end in each scene, and its changes.
 
     Args:
-        scenes: N scenes.
-        collision_model: Arm and the parts of it that obstacles may not touch.
-        names: Names of the obstacles, for the message.
+        scenes: N scenes whose obstacles were made from shapes.
+        arm: Arm.
+        names: Names of the obstacles, for messages: one list for each scene.
+        ends: Ends that are looked at, `start` and `goal`; jumps are only checked together with both.
 
     Raises:
-        ValueError: A scene is impossible; the message names the scene, the fault and the allowed values.
+        ValueError: A scene is impossible; the message names the scene, the fault and what is allowed.
     """
-    refuse(problems(scenes, collision_model, names))
+    check = _Check(scenes, arm, names)
+    check.obstacles()
+    for name in ends:
+        check.end(name, getattr(scenes, name), scenes.obstacles)
+    if len(ends) == len(ENDS):
+        apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
+        allowed = f"start and goal must differ by {LEAST_APART} or more in a joint"
+        check.refuse(apart < LEAST_APART, allowed, apart)
+        check.jumps()
 
 
-def refuse(faults: Iterator[Problem]) -> None:
-    """Raise ValueError for the first of some faults that a scene has."""
-    for wrong, reason in faults:
+def check_jumps(scenes: Scenes, arm: Arm) -> None:
+    """Check the jumps of the target.
+
+    Raises:
+        ValueError: A jump is not later than the one before it, or its target is impossible.
+    """
+    _Check(scenes, arm, ()).jumps()
+
+
+class _Check:
+    """Checks of N scenes, which raise ValueError for the first scene that has a fault."""
+
+    def __init__(self, scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]]) -> None:
+        self.scenes, self.arm, self.names = scenes, arm, names
+
+    def obstacles(self) -> None:
+        """Check sizes, places and courses of obstacles."""
+        obstacles, turn_time = self.scenes.obstacles, self.scenes.turn_time
+        kind, present, size = obstacles.kind, obstacles.present, obstacles.size
+        # The first size of meshes and clouds is an index.
+        largest = np.where(kind >= MESH, size[..., 1], size.max(axis=-1))
+        self.refuse_row(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest)
+        away = np.abs(obstacles.centre).max(axis=-1)
+        far = present & (kind != HALF_SPACE) & (away > FARTHEST)
+        self.refuse_row(far, f"must be at most {FARTHEST:g} m from the origin along each axis", away)
+        for velocity in (obstacles.velocity, self.scenes.turn_velocity):
+            speed = norm(velocity)
+            self.refuse_row(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed)
+        self.refuse_row(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time)
+
+    def end(self, name: str, joints: Float, obstacles: Obstacles, where: Bool | None = None) -> None:
+        """Check an end: inside the joint limits, and free of the arm itself and of obstacles.
+
+        Args:
+            name: Name of the end.
+            joints: Joint positions, shape (N, J).
+            obstacles: Obstacles at the time of the end.
+            where: True for scenes that have this end, shape (N,); by default all have it.
+        """
+        there = np.ones(len(joints), bool) if where is None else where
+        for joint, (low, high) in enumerate(self.arm.joint_range):
+            position = joints[:, joint]
+            outside = (position < low - ROUNDING) | (position > high + ROUNDING)
+            allowed = f"must be from {low:.4g} to {high:.4g}"
+            self.refuse(there & outside, f"{name}: joint {self.arm.joint_names[joint]!r} {allowed}", position)
+        rows, own = row_clearances(self.arm.chain, self.arm.spheres, joints, obstacles)
+        touches = "the arm touches itself; its clearance must be over 0 m"
+        self.refuse(there & (own <= 0.0), f"{name}: {touches}", own)
+        touches = f"touches the arm at the {name}; its clearance must be over 0 m"
+        self.refuse_row(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows)
+
+    def jumps(self) -> None:
+        """Check the jumps of the target."""
+        scenes = self.scenes
+        before = np.zeros(len(scenes.start))
+        for jump in range(MOST_JUMPS):
+            time = scenes.jump_times[:, jump]
+            given = time < NEVER
+            if not given.any():
+                break
+            late = given & (time <= before)
+            self.refuse(late, f"jump {jump} must come after the one before it, and after 0 s", time)
+            obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
+            target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
+            self.end(f"target of jump {jump}", target, obstacles, given)
+            before = time
+
+    def refuse(self, wrong: Bool, message: str, values: Float) -> None:
+        """Raise ValueError for the first scene in which something is wrong, shape (N,)."""
         if wrong.any():
-            first = int(wrong.argmax())
-            raise ValueError(f"scene {first}: {reason(first)}")
+            scene = int(wrong.argmax())
+            raise ValueError(f"{self._scene(scene)}{message}, got {values[scene]:.4g}")
 
+    def refuse_row(self, wrong: Bool, message: str, values: Float) -> None:
+        """Raise ValueError for the first obstacle with which something is wrong, shape (N, n)."""
+        if wrong.any():
+            scene = int(wrong.any(axis=-1).argmax())
+            row = int(wrong[scene].argmax())
+            known = self.names[scene] if scene < len(self.names) else ()
+            name = f" {known[row]!r}" if row < len(known) and known[row] else ""
+            raise ValueError(
+                f"{self._scene(scene)}obstacle {row}{name} {message}, got {values[scene, row]:.4g}"
+            )
 
-def problems(scenes: Scenes, collision_model: CollisionModel, names: Names = ((),)) -> Iterator[Problem]:
-    """Yield the faults that N scenes can have; see :func:`check_scenes`."""
-    d = scenes.start.shape[-1]
-
-    def obstacle(scene: int, row: int) -> str:
-        known = names[scene if len(names) > 1 else 0]
-        name = f" {known[row]!r}" if row < len(known) and known[row] else ""
-        return f"obstacle {row}{name} at {scenes.obstacles[scene, row, :d].round(4).tolist()} m"
-
-    arm, ends = collision_model.arm, (("start", scenes.start), ("goal", scenes.goal))
-    apart = norm(scenes.goal - scenes.start)
-    yield problem(
-        apart < MIN_GOAL_DISTANCE, f"start and goal must be {MIN_GOAL_DISTANCE} m or more apart", apart
-    )
-    for name, point in ends:
-        margin = np.asarray(arm.reach_margin(point))
-        yield problem(
-            margin < 0.0, f"{name} must be within the arm's reach: its margin must be 0 m or more", margin
-        )
-    faults = _problems_of_shapes(scenes) if has_shapes(scenes.obstacles) else _problems_of_capsules(scenes)
-    for wrong, why in faults:
-        yield problem(wrong, why, part=obstacle)
-    if scenes.present.any() and (base := getattr(arm, "base", ())):
-        yield problem(
-            _contain(scenes, base), "may overlap the base of the arm, but not contain it", part=obstacle
-        )
-    for name, point in ends:
-        clearance = rest_clearance(scenes, point, collision_model)[:, :-1]
-        yield problem(
-            clearance <= 0.0,
-            f"touches the arm at the {name}: its clearance must be over 0 m",
-            clearance,
-            obstacle,
-        )
-
-
-def _contain(scenes: Scenes, base: Sequence[Any]) -> Bool:
-    """Return which obstacles contain all capsules of an arm's base, shape (N, n).
-
-    As obstacles are convex, they contain a capsule if they contain the balls around both ends of its axis.
-    """
-    rows = widened(scenes.obstacles)[scenes.present]
-    inside, contain = np.ones(len(rows), dtype=bool), np.zeros(scenes.present.shape, dtype=bool)
-    for capsule in base:
-        for end in capsule.ends:
-            place = np.broadcast_to(np.asarray(end, dtype=np.float64), (len(rows), 3))
-            inside &= pair_distance(rows, place) <= -capsule.radius
-    contain[scenes.present] = inside
-    return contain
-
-
-def _problems_of_capsules(scenes: Scenes) -> Iterator[tuple[Any, str]]:
-    """Yield the faults of single capsules: masks, shape (N, n), and what is wrong."""
-    dimension = scenes.start.shape[-1]
-    radius = scenes.obstacles[..., -1]
-    yield (scenes.obstacles != 0.0).any(axis=-1) & (radius <= 0.0), "has no positive radius"
-    yield radius > LARGEST_RADIUS, f"has a radius over {LARGEST_RADIUS} m"
-    half = norm(scenes.obstacles[..., dimension : 2 * dimension])
-    yield half > LARGEST_HALF_AXIS, f"has a half-axis over {LARGEST_HALF_AXIS} m"
-    far = np.abs(scenes.obstacles[..., :dimension]) > FARTHEST_CENTRE
-    yield far.any(axis=-1), "has its centre over 1 m from the origin"
-
-
-def _problems_of_shapes(scenes: Scenes) -> Iterator[tuple[Any, str]]:
-    """Yield the faults of single obstacles of any shape: masks, shape (N, n), and what is wrong."""
-    rows, (kind, centre, quaternion, half) = scenes.obstacles, shape_columns(scenes.obstacles)
-    again = rows.copy()
-    known = {number: name for number, (name, shape) in enumerate(SHAPES.items()) if shape.in_scenes}
-    strange = ~np.isin(kind, list(known)) | (np.abs(norm(quaternion) - 1.0) > UNIT_TOLERANCE)
-    for number in np.unique(kind[scenes.present & ~strange]):
-        some = scenes.present & (kind == number)
-        place = centre[some][:, : scenes.start.shape[-1]]
-        name = known[int(number)]
-        again[some] = shape_rows(name, place, quaternion[some], half[some])
-        shape, (x, y, z) = SHAPES[name], np.moveaxis(half[some], -1, 0)
-        strange[some] |= (half[some] <= 0.0).any(axis=-1) | (shape.round & (np.abs(x - y) > 1e-6))
-        if name in ("sphere", "capsule"):
-            strange[some] |= (z < x - 1e-6) | ((name == "sphere") & (z > x + 1e-6))
-        if (only := shape.only_half) is not None:
-            strange[some] |= (np.abs(half[some] - only) > 1e-6).any(axis=-1)
-    strange |= (np.abs(again - rows) > 1e-6).any(axis=-1)
-    yield (rows != 0.0).any(axis=-1) & (strange | ~scenes.present), "is no row of a shape"
-    yield (half > LARGEST_HALF_LENGTH).any(axis=-1), f"has a half length over {LARGEST_HALF_LENGTH:g} m"
-    apart = np.abs((centre * rotation_axes(quaternion)[2]).sum(axis=-1) + EXTENT)
-    away = (kind == shape_number(HalfSpace.kind)) & (apart > FARTHEST_SURFACE + ROUNDING)
-    yield away, f"has its surface over {FARTHEST_SURFACE:g} m from the origin"
-    far = np.abs(centre) > FARTHEST_SHAPE + ROUNDING
-    yield far.any(axis=-1), f"has its centre over {FARTHEST_SHAPE:g} m from the origin"
-
-
-def rest_clearance(scenes: Scenes, point: Float, collision_model: CollisionModel) -> Float:
-    """Return the clearance of an arm, its hand at (N, D), from n obstacles and one far away, shape (N, n + 1), [m]."""
-    arm = collision_model.arm
-    hand = hand_clearance(point[:, None], arm.hand_radius, scenes.obstacles, scenes.present)
-    if collision_model.whole_arm:
-        links = arm.links(arm.inverse_kinematics(point))[:, None]
-        hand = np.minimum(hand, arm_clearance(links, arm.link_radii, scenes.obstacles, scenes.present))
-    return np.concatenate(
-        (hand, np.ones_like(hand[:, :1]) if hand.size else np.ones((len(point), 1))), axis=-1
-    )
+    def _scene(self, scene: int) -> str:
+        """Return the beginning of a message: the scene, if there are several."""
+        return f"scene {scene}: " if len(self.scenes.start) > 1 else ""

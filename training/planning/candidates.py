@@ -10,7 +10,7 @@ import numpy as np
 from viapoint.envs.common.types import Single
 
 if TYPE_CHECKING:
-    from viapoint.envs.core.task import Task
+    from viapoint.envs.task import Task
 
 
 OBSERVED = "candidates"

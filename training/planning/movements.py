@@ -19,13 +19,13 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.core.arms.chain import Chain, Spheres
-from viapoint.envs.core.arms.inverse_kinematics import solve_planar
-from viapoint.envs.core.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
-from viapoint.envs.core.geometry.compiled import compiled
-from viapoint.envs.core.geometry.kernels import kernel
-from viapoint.envs.core.geometry.obstacles import Obstacles
-from viapoint.envs.core.plans import SHORTEST_DURATION
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.inverse_kinematics import solve_planar
+from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.plans import SHORTEST_DURATION
 
 INSTANTS = 64
 """Instants of a movement that are checked; a power of two."""

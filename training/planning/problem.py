@@ -9,12 +9,12 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.core.arms.chain import Spheres
-from viapoint.envs.core.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
-from viapoint.envs.core.outcome import SETTLING, straight_jerk_cost
-from viapoint.envs.core.replanning import NEARBY, revised_waypoints
-from viapoint.envs.core.scenes.scene import Scenes
-from viapoint.envs.core.task import Task
+from viapoint.envs.arms.chain import Spheres
+from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
+from viapoint.envs.outcome import SETTLING, straight_jerk_cost
+from viapoint.envs.replanning import NEARBY, revised_waypoints
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.task import Task
 from viapoint.training.planning.movements import (
     MovementTable,
     Setting,

@@ -10,14 +10,14 @@ import numpy as np
 
 from viapoint.envs.common.types import Float, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.core.geometry.clearance import memory
-from viapoint.envs.core.geometry.compiled import compiled
-from viapoint.envs.core.geometry.obstacles import Obstacles
-from viapoint.envs.core.plans import Plan
-from viapoint.envs.core.registration import check_registered
-from viapoint.envs.core.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.envs.core.scenes.options import draw_given
-from viapoint.envs.core.task import Task
+from viapoint.envs.geometry.clearance import memory
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.plans import Plan
+from viapoint.envs.registration import check_registered
+from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.movements import MovementTable, Setting, least_clearance
 from viapoint.training.planning.problem import Moves, Problem, moves_of, setting_of, table_of, worth_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from viapoint.envs.core.geometry.shapes import (
+from viapoint.envs.geometry.shapes import (
     Box,
     Capsule,
     ConvexMesh,

@@ -5,7 +5,7 @@ import itertools
 import mujoco
 import numpy as np
 
-from viapoint.envs.core.arms.kinematics import sphere_centres
+from viapoint.envs.arms.kinematics import sphere_centres
 
 
 def least_pair_distance(arm, joints):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from viapoint import primitives
-from viapoint.envs.core.arms.arm import arm_from_xml
-from viapoint.envs.core.arms.registry import arm_of, register_arm
+from viapoint.envs.arms.arm import arm_from_xml
+from viapoint.envs.arms.registry import arm_of, register_arm
 
 
 @pytest.mark.parametrize("name", ["planar", "panda"])

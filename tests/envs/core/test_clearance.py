@@ -4,17 +4,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs.core.arms.kinematics import sphere_centres
-from viapoint.envs.core.arms.registry import arm_of
-from viapoint.envs.core.geometry.clearance import (
+from viapoint.envs.arms.kinematics import sphere_centres
+from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.geometry.clearance import (
     FAR,
     clearance_profile,
     configuration_clearances,
     memory,
     movement_clearance,
 )
-from viapoint.envs.core.geometry.obstacles import pack
-from viapoint.envs.core.geometry.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 KINDS = ("sphere", "capsule", "cylinder", "box", "half_space")
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from viapoint.envs.core.geometry.compiled import compiled
-from viapoint.envs.core.geometry.distance import (
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import (
     point_distance,
     point_distance_and_normal,
     signed_distances,
 )
-from viapoint.envs.core.geometry.obstacles import KINDS, add_to_model, no_obstacles, pack
-from viapoint.envs.core.geometry.shapes import (
+from viapoint.envs.geometry.obstacles import KINDS, add_to_model, no_obstacles, pack
+from viapoint.envs.geometry.shapes import (
     Box,
     Capsule,
     ConvexMesh,

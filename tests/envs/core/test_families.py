@@ -5,20 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from viapoint.envs.core.arms.kinematics import link_poses
-from viapoint.envs.core.arms.registry import arm_of
-from viapoint.envs.core.geometry.obstacles import KINDS, no_obstacles, unpack
-from viapoint.envs.core.geometry.shapes import Box, ConvexMesh, Sphere
-from viapoint.envs.core.scenes import families_registry
-from viapoint.envs.core.scenes.families_registry import (
+from viapoint.envs.arms.kinematics import link_poses
+from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.geometry.obstacles import KINDS, no_obstacles, unpack
+from viapoint.envs.geometry.shapes import Box, ConvexMesh, Sphere
+from viapoint.envs.scenes import families_registry
+from viapoint.envs.scenes.families_registry import (
     FAMILIES,
     check_families,
     default_families,
     register_scene_family,
     scene_families,
 )
-from viapoint.envs.core.scenes.layout import MOST_PLACES, PLACE, ROW, Furniture, Layout, Place, Room, most_rows
-from viapoint.envs.core.scenes.sampler import SceneSampler, room_of
+from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Furniture, Layout, Place, Room, most_rows
+from viapoint.envs.scenes.sampler import SceneSampler, room_of
 
 ALL = KINDS[:5]
 NAMES = sorted(FAMILIES)

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs.core.arms.arm import arm_from_xml
-from viapoint.envs.core.arms.inverse_kinematics import inverse_kinematics, planar_joints, planar_motion
-from viapoint.envs.core.arms.kinematics import forward, jacobians, link_poses, sphere_centres, torques
-from viapoint.envs.core.arms.registry import arm_of
+from viapoint.envs.arms.arm import arm_from_xml
+from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints, planar_motion
+from viapoint.envs.arms.kinematics import forward, jacobians, link_poses, sphere_centres, torques
+from viapoint.envs.arms.registry import arm_of
 
 GANTRY = """
 <mujoco>

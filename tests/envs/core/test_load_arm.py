@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs.core.arms.kinematics import forward, sphere_centres, torques
-from viapoint.envs.core.arms.load import load_arm
+from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
+from viapoint.envs.arms.load import load_arm
 
 sys.path.append(str(Path(__file__).parent))
 from self_contact import check_contact_implies_overlap, least_pair_distance

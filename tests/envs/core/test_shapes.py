@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs.core.geometry.distance import signed_distances
-from viapoint.envs.core.geometry.obstacles import (
+from viapoint.envs.geometry.distance import signed_distances
+from viapoint.envs.geometry.obstacles import (
     ABSENT,
     KINDS,
     POSE_SIZE,
@@ -22,7 +22,7 @@ from viapoint.envs.core.geometry.obstacles import (
     pack,
     unpack,
 )
-from viapoint.envs.core.geometry.shapes import (
+from viapoint.envs.geometry.shapes import (
     REGISTERED_MESHES,
     SHAPES,
     Box,

@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs.core.arms import capsule_fit
-from viapoint.envs.core.arms.capsule_fit import cover_geom, cover_points, polytope_around
-from viapoint.envs.core.arms.registry import arm_of
-from viapoint.envs.core.arms.spheres import bounding_ball
-from viapoint.envs.core.geometry.shapes import ConvexMesh
+from viapoint.envs.arms import capsule_fit
+from viapoint.envs.arms.capsule_fit import cover_geom, cover_points, polytope_around
+from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.arms.spheres import bounding_ball
+from viapoint.envs.geometry.shapes import ConvexMesh
 
 sys.path.append(str(Path(__file__).parent))
 from self_contact import check_contact_implies_overlap, least_pair_distance

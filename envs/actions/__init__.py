@@ -1,1 +1,0 @@
-"""Decoding of actions into plans and references."""

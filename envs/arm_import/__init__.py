@@ -1,1 +1,0 @@
-"""Import of arms from MJCF files."""

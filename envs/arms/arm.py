@@ -1,0 +1,426 @@
+"""Arms as data: a chain of joints, spheres on its links, and the model that MuJoCo simulates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import forward, inverse_dynamics
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import add_to_model
+from viapoint.envs.geometry.shapes import as_obstacle
+from viapoint.envs.plans import SpaceName
+
+HIDDEN_GROUP = 5
+"""Group of geoms that MuJoCo does not draw."""
+SAMPLED = 64
+"""Configurations at which the greatest inertia of the joints is looked for."""
+OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)
+"""Colour of obstacles in pictures."""
+WAITING = (0.0, 0.0, -10.0)
+"""Place of obstacles that are absent, [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Arm:
+    """Arm that moves among obstacles.
+
+    Example:
+        >>> from viapoint.envs.arms.registry import arm_of
+        >>> arm = arm_of("panda")
+        >>> arm.hand(arm.home).round(3).tolist()  # [m]
+        [0.307, 0.0, 0.487]
+        >>> len(arm.joint_names), arm.space
+        (7, 'joints')
+    """
+
+    name: str
+    """Short name, different from that of every other arm."""
+    xml: str
+    """MJCF text of the arm and its surroundings."""
+    joint_names: tuple[str, ...]
+    """Names of the J joints from the base to the tool."""
+    joint_range: Float
+    """Lowest and highest position of each joint, shape (J, 2), [rad] or [m]."""
+    velocity_limit: Float
+    """Greatest velocities, shape (J,), [rad/s] or [m/s]; infinite for none."""
+    torque_limit: Float
+    """Greatest torques or forces, shape (J,), [N m] or [N]."""
+    home: Float
+    """Joint positions at home, shape (J,)."""
+    chain: Chain
+    """Kinematics and dynamics."""
+    spheres: Spheres
+    """Spheres that contain the collision geoms."""
+    group_names: tuple[str, ...]
+    """Names of the groups of spheres: bodies of the model."""
+    left_out: tuple[LeftOut, ...]
+    """Pairs of bodies that are not compared with one another, with the reason."""
+    excess: float
+    """Greatest distance by which a sphere sticks out of a collision geom, [m]."""
+    reach: Float
+    """Greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, shape (J,), [m]."""
+    stiffness: Float
+    """Stiffness of the joint servos, shape (J,), [N m/rad]."""
+    damping: Float
+    """Damping of the joint servos, shape (J,), [N m s/rad]."""
+    space: SpaceName
+    """Space in which movements are planned by default."""
+    timestep: float
+    """Length of a physics step, [s]."""
+
+    def __repr__(self) -> str:
+        """Return name, joints and size."""
+        return f"Arm({self.name!r}, joints={self.joint_names}, spheres={len(self.spheres.radius)})"
+
+    def hand(self, joints: Any) -> Float:
+        """Return places of the tool, shape (..., 3), [m], for joint positions of shape (..., J)."""
+        return forward(self.chain, joints)[0]
+
+    def compile(self, n_obstacles: int, meshes: Sequence[str] = ()) -> mujoco.MjModel:
+        """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, `obstacle_1`, ...
+
+        Args:
+            n_obstacles: Number of obstacles.
+            meshes: Names of registered meshes that obstacles may be.
+        """
+        spec = mujoco.MjSpec.from_string(self.xml)
+        _set_contacts(spec, self)
+        _add_actuators(spec, self)
+        if meshes:
+            store = spec.worldbody.add_body(name="meshes", pos=WAITING)
+            shapes = [as_obstacle({"shape": name, "name": f"mesh_{name}"}) for name in meshes]
+            add_to_model(spec, shapes, store, contype=0, conaffinity=0, group=HIDDEN_GROUP)
+        for row in range(n_obstacles):
+            name = f"obstacle_{row}"
+            body = spec.worldbody.add_body(name=name, mocap=True, pos=WAITING)
+            body.add_geom(
+                name=name,
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=(0.01, 0.0, 0.0),
+                contype=0,
+                conaffinity=2,
+                condim=1,
+                rgba=OBSTACLE_COLOUR,
+            )
+        return spec.compile()
+
+    def controls(self, position: Float, velocity: Float, acceleration: Float, stride: int = 1) -> Float:
+        """Return controls of the actuators that track motions of the joints, shape (N, T, J).
+
+        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the torque of
+        the motion, plus stiffness and damping times the references.
+
+        Args:
+            position: References of the joints at T physics steps, shape (N, T, J).
+            velocity: Their rates.
+            acceleration: Their accelerations.
+            stride: Steps between two computed torques; those in between are interpolated linearly.
+        """
+        out = np.empty(position.shape)
+        _controls(
+            self.chain,
+            self.stiffness,
+            self.damping,
+            np.ascontiguousarray(position),
+            np.ascontiguousarray(velocity),
+            np.ascontiguousarray(acceleration),
+            stride,
+            out,
+        )
+        return out
+
+
+def arm_from_xml(
+    name: str,
+    xml: str,
+    *,
+    joints: Sequence[str],
+    tool: str,
+    home: Any,
+    velocity_limit: Any,
+    torque_limit: Any,
+    space: SpaceName = "joints",
+    bandwidth: float = 50.0,
+    exclude: Sequence[tuple[str, str]] = (),
+) -> Arm:
+    """Return the arm of an MJCF text in which all collision geoms are capsules and spheres.
+
+    Args:
+        name: Name of the arm.
+        xml: MJCF text of the arm and its surroundings, without actuators.
+        joints: Names of its hinges and slides from the base to the tool; all other bodies move with one of them.
+        tool: Name of the site that is the tool.
+        home: Joint positions at home, shape (J,).
+        velocity_limit: Greatest velocities, shape (J,).
+        torque_limit: Greatest torques, shape (J,).
+        space: Space in which movements are planned.
+        bandwidth: Natural frequency of the critically damped joint servos, [rad/s].
+        exclude: Pairs of bodies that may pass through one another.
+
+    Raises:
+        ValueError: Bodies that are apart at home cannot be told apart.
+    """
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    chain, links = _chain(model, data, tuple(joints), tool)
+    home = np.array(home, dtype=np.float64)
+    data.qpos[model.jnt_qposadr[[model.joint(each).id for each in joints]]] = home
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
+    touching = touching_at_home(model, data, bodies)
+    capsules = _capsules(model, chain, tuple(joints), links)
+    covered = cover(chain, capsules, links, home, touching, {frozenset(pair) for pair in exclude})
+    ranges = np.array([model.joint(each).range for each in joints])
+    inertia = _greatest_inertia(model, data, tuple(joints))
+    stiffness = inertia * bandwidth**2
+    return Arm(
+        name=name,
+        xml=xml,
+        joint_names=tuple(joints),
+        joint_range=ranges,
+        velocity_limit=np.array(velocity_limit, dtype=np.float64),
+        torque_limit=np.array(torque_limit, dtype=np.float64),
+        home=home,
+        chain=chain,
+        spheres=covered.spheres,
+        group_names=covered.names,
+        left_out=covered.left_out,
+        excess=covered.excess,
+        reach=_reach(chain, covered.spheres, ranges),
+        stiffness=stiffness,
+        damping=np.maximum(2.0 * inertia * bandwidth - chain.damping, 0.0),
+        space=space,
+        timestep=float(model.opt.timestep),
+    )
+
+
+def asset(file: str) -> str:
+    """Return the text of a model file of the package."""
+    return (files("viapoint.envs") / "assets" / file).read_text(encoding="utf-8")
+
+
+@compiled
+def _controls(
+    chain: Chain,
+    stiffness: Float,
+    damping: Float,
+    position: Float,
+    velocity: Float,
+    acceleration: Float,
+    stride: int,
+    out: Float,
+) -> None:
+    """Fill in controls, see :meth:`Arm.controls`."""
+    number, steps, joints = position.shape
+    before = np.empty(joints)
+    after = np.empty(joints)
+    for i in range(number):
+        for first in range(0, steps, stride):
+            if first == 0:
+                inverse_dynamics(chain, position[i, 0], velocity[i, 0], acceleration[i, 0], before)
+            following = first + stride
+            if following < steps:
+                inverse_dynamics(
+                    chain, position[i, following], velocity[i, following], acceleration[i, following], after
+                )
+            else:
+                after[:] = before
+            for k in range(first, min(following, steps)):
+                share = (k - first) / stride
+                for j in range(joints):
+                    torque = before[j] + share * (after[j] - before[j])
+                    servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
+                    out[i, k, j] = torque + servo
+            before[:] = after
+
+
+def _chain(
+    model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...], tool: str
+) -> tuple[Chain, dict[str, int]]:
+    """Return the chain of some joints, and the link that each body of the arm moves with.
+
+    Bodies that are fixed to the world and have collision geoms are the base.
+    """
+    numbers = [model.joint(name).id for name in joints]
+    data.qpos[model.jnt_qposadr[numbers]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    frames = [(np.eye(3), np.zeros(3))]
+    for joint in numbers:
+        turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
+        frames.append((_with_last_axis(turn, data.xaxis[joint]), data.xanchor[joint].copy()))
+    links: dict[str, int] = {}
+    moved: list[list[int]] = [[] for _ in joints]
+    of_body = {int(model.jnt_bodyid[joint]): link + 1 for link, joint in enumerate(numbers)}
+    for body in range(1, model.nbody):
+        carrier = int(model.body_weldid[body])
+        if carrier in of_body:
+            links[model.body(body).name] = of_body[carrier]
+            moved[of_body[carrier] - 1].append(body)
+        elif carrier == 0 and _collides(model, body):
+            links[model.body(body).name] = 0
+    mass, centre, inertia = np.zeros(len(joints)), np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
+    for link, bodies in enumerate(moved):
+        turn, place = frames[link + 1]
+        mass[link] = model.body_mass[bodies].sum()
+        middle = (model.body_mass[bodies, None] * data.xipos[bodies]).sum(axis=0) / mass[link]
+        centre[link] = turn.T @ (middle - place)
+        inertia[link] = turn.T @ _inertia(model, data, bodies, middle) @ turn
+    origin, rotation = np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
+    for link, (turn, place) in enumerate(frames[1:]):
+        before, start = frames[link]
+        origin[link] = before.T @ (place - start)
+        rotation[link] = before.T @ turn
+    last, end = frames[-1]
+    site = model.site(tool).id
+    dofs = model.jnt_dofadr[numbers]
+    chain = Chain(
+        origin=_rounded(origin),
+        rotation=_rounded(rotation),
+        sliding=model.jnt_type[numbers] == mujoco.mjtJoint.mjJNT_SLIDE,
+        tool_origin=_rounded(last.T @ (data.site_xpos[site] - end)),
+        tool_rotation=_rounded(last.T @ data.site_xmat[site].reshape(3, 3)),
+        mass=mass,
+        centre=_rounded(centre),
+        inertia=inertia,
+        armature=model.dof_armature[dofs].copy(),
+        damping=model.dof_damping[dofs].reshape(len(joints), -1)[:, 0].copy(),
+        gravity=model.opt.gravity.copy(),
+    )
+    return chain, links
+
+
+def _capsules(
+    model: mujoco.MjModel, chain: Chain, joints: tuple[str, ...], links: dict[str, int]
+) -> list[Capsule]:
+    """Return the collision geoms of the arm in the frames of its links."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    rotation = [np.eye(3)]
+    origin = [np.zeros(3)]
+    for turn, shift in zip(chain.rotation, chain.origin, strict=True):
+        origin.append(origin[-1] + rotation[-1] @ shift)
+        rotation.append(rotation[-1] @ turn)
+    found = []
+    for geom in range(model.ngeom):
+        name = model.body(model.geom_bodyid[geom]).name
+        if name not in links or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
+        if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
+            raise ValueError(f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none")
+        half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+        axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
+        link = links[name]
+        ends = [rotation[link].T @ (data.geom_xpos[geom] + way * axis - origin[link]) for way in (-1.0, 1.0)]
+        found.append(Capsule(name, ends[0], ends[1], float(size[0])))
+    return found
+
+
+def _collides(model: mujoco.MjModel, body: int) -> Bool:
+    """Return True for a body with a geom that takes part in contacts."""
+    geoms = model.geom_bodyid == body
+    return bool((geoms & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))).any())
+
+
+def _set_contacts(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Let exactly the pairs of bodies collide that must not touch, and moving bodies with obstacles.
+
+    Bit 1 is for the arm with itself; moving bodies have bit 2, too, which is that of obstacles.
+    """
+    names = arm.group_names
+    compared = {frozenset((names[a], names[b])) for a, b in arm.spheres.pairs}
+    moving = {name for name, link in zip(names, arm.spheres.link, strict=True) if link > 0}
+    for body in spec.bodies:
+        for geom in body.geoms:
+            if body.name in names and (geom.contype or geom.conaffinity):
+                geom.contype = 3 if body.name in moving else 1
+                geom.conaffinity = 1
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            if frozenset((first, second)) not in compared:
+                spec.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Add a servo for each joint whose torque is control - stiffness * position - damping * velocity."""
+    for j, name in enumerate(arm.joint_names):
+        servo = spec.add_actuator(name=name)
+        servo.target = name
+        servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        servo.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+        servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        servo.gainprm[0] = 1.0
+        servo.biasprm[1:3] = -arm.stiffness[j], -arm.damping[j]
+        if arm.torque_limit[j] < 1e9:
+            servo.forcelimited = True
+            servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
+
+
+def _greatest_inertia(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...]) -> Float:
+    """Return the greatest inertia that each joint sees in some configurations, shape (J,), [kg m^2] or [kg]."""
+    numbers = [model.joint(name).id for name in joints]
+    low, high = model.jnt_range[numbers].T
+    rng = np.random.default_rng(0)
+    full = np.zeros((model.nv, model.nv))
+    greatest = np.zeros(len(joints))
+    for _ in range(SAMPLED):
+        data.qpos[model.jnt_qposadr[numbers]] = rng.uniform(low, high)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_crb(model, data)
+        mujoco.mj_fullM(model, data, full)
+        greatest = np.maximum(greatest, np.diag(full)[model.jnt_dofadr[numbers]])
+    return greatest
+
+
+def _reach(chain: Chain, spheres: Spheres, joint_range: Float) -> Float:
+    """Return the greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, (J,), [m]."""
+    number = len(chain.mass)
+    farthest = np.zeros(number + 2)
+    for link in range(number, 0, -1):
+        for group in np.flatnonzero(spheres.link == link):
+            some = slice(spheres.first[group], spheres.first[group + 1])
+            away = np.linalg.norm(spheres.centre[some], axis=1)
+            farthest[link] = max(farthest[link], float(away.max()))
+        if link < number:
+            slide = np.abs(joint_range[link]).max() if chain.sliding[link] else 0.0
+            step = float(np.linalg.norm(chain.origin[link])) + slide
+            farthest[link] = max(farthest[link], step + farthest[link + 1])
+    return np.where(chain.sliding, 1.0, farthest[1 : number + 1])
+
+
+def _inertia(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], centre: Float) -> Float:
+    """Return the rotational inertia of bodies together about a point, in world axes (parallel axis theorem)."""
+    total = np.zeros((3, 3))
+    for body in bodies:
+        axes = data.ximat[body].reshape(3, 3)
+        away = data.xipos[body] - centre
+        total += axes @ np.diag(model.body_inertia[body]) @ axes.T
+        total += model.body_mass[body] * (away @ away * np.eye(3) - np.outer(away, away))
+    return total
+
+
+def _with_last_axis(turn: Float, axis: Float) -> Float:
+    """Return the axes of a body, reordered and turned as little as possible, so that the last one is `axis`."""
+    nearest = int(np.abs(axis @ turn).argmax())
+    first = turn[:, (nearest + 1) % 3]
+    first = first - axis * (axis @ first)
+    first = first / np.linalg.norm(first)
+    return np.stack((first, np.cross(axis, first), axis), axis=-1)
+
+
+def _rounded(values: Float) -> Float:
+    """Return values without rounding errors, so that entries that should be 0 are 0."""
+    return np.round(values, 14) + 0.0

@@ -1,0 +1,281 @@
+"""Capsules and spheres that contain the collision geoms of a file.
+
+A capsule contains the convex hull of points if it contains the points. The point of a capsule that is farthest from a
+convex body K is on one of the balls at its ends; the signed distance d of K tells how far. So for ends a, b, radius R
+
+    excess = R + max(d(a), d(b)),   R = max over the points p of K of |p - segment(a, b)|.                        (1)
+
+The ends minimise the excess. Where it is over the tolerance, a plane cuts K into two convex pieces, and a capsule for
+each contains the piece; (1) still takes d from the whole of K.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.meshes import convex_hull
+from viapoint.envs.geometry.shapes import ConvexMesh
+
+Geom = mujoco.mjtGeom
+
+ROUNDING = 1e-6
+"""Added to the radius, so that rounding leaves nothing outside, [m]."""
+SHORTEST = 1e-3
+"""Length of the axis below which a capsule becomes a sphere, [m]."""
+RIM_POINTS = 24
+"""Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder."""
+CUTS = (0.35, 0.5, 0.65)
+"""Places of the planes that cut a body, as shares of its length along a principal axis."""
+LEAST_SHARE = 0.3
+"""Least length along an axis across which a body is cut, as a share of the greatest."""
+FIRST_STEP, LAST_STEP = 0.25, 5e-4
+"""First and last step of the search for the ends, as shares of the size of the body."""
+MOST_CAPSULES = 64
+"""Greatest number of capsules for one geom."""
+
+
+class FittedCapsule(NamedTuple):
+    """Capsule, or sphere, that contains a geom or a piece of it."""
+
+    ends: Float
+    """Ends of the axis, shape (2, 3), equal for a sphere, [m]."""
+    radius: float
+    """Radius, [m]."""
+    excess: float
+    """Greatest distance of a point of the capsule from the geom, [m]."""
+    corners: Float
+    """Corners of the piece of the geom that the capsule was fitted to, shape (n, 3), [m]; none if it is exact."""
+
+
+class Body(NamedTuple):
+    """Convex body."""
+
+    shape: ConvexMesh
+    """Shape that gives signed distances."""
+    normals: Float
+    """Outward normals of the faces, shape (F, 3)."""
+    offsets: Float
+    """Distances of the faces from the origin along their normals, shape (F,), [m]."""
+
+
+def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[FittedCapsule]:
+    """Return capsules and spheres that together contain a geom, in the geom's frame.
+
+    Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
+    covered so that no capsule reaches farther than `tolerance`, [m], from the geom.
+
+    Raises:
+        ValueError: The geom is of another type, needs more than MOST_CAPSULES capsules, or is flat.
+    """
+    size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
+    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
+        half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
+        ends = np.array([(0.0, 0.0, -half), (0.0, 0.0, half)])
+        return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)))]
+    try:
+        corners, larger = polytope_around(model, geom)
+        found = cover_points(corners, tolerance - larger)
+    except ValueError as error:
+        raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
+    return [each._replace(excess=each.excess + larger) for each in found]
+
+
+def split(model: mujoco.MjModel, geom: int, capsule: FittedCapsule) -> list[FittedCapsule]:
+    """Return two capsules with less excess that together contain what a capsule of :func:`cover_geom` contains."""
+    corners, larger = polytope_around(model, geom)
+    halves = _best_halves(capsule.corners, _body(corners), 0.5 * (capsule.excess - larger))
+    return [each._replace(excess=each.excess + larger) for each in halves]
+
+
+def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
+    """Return the corners of a polytope that contains a geom, in the geom's frame, shape (n, 3), and its excess, [m].
+
+    The excess is an upper bound of the distance of the corners from the geom. It is 0 for boxes and the convex hulls of
+    meshes.
+
+    Raises:
+        ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.
+    """
+    size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
+    if kind == Geom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        return np.asarray(vertices, np.float64), 0.0
+    if kind == Geom.mjGEOM_BOX:
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        return np.asarray(size * signs), 0.0
+    if kind == Geom.mjGEOM_CYLINDER:
+        rim = _rim(2 * RIM_POINTS)
+        rings = [size[0] * rim + (0.0, 0.0, side * size[1]) for side in (-1.0, 1.0)]
+        return np.concatenate(rings), float(size[0] * (rim[0, 0] - 1.0))
+    if kind == Geom.mjGEOM_ELLIPSOID:
+        rim = _rim(RIM_POINTS)
+        heights = np.sin(np.pi * (np.arange(1, RIM_POINTS // 2) / (RIM_POINTS // 2) - 0.5))
+        rings = [np.sqrt(1.0 - z * z) * rim + (0.0, 0.0, z) for z in heights]
+        poles = np.array([(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+        wide = rim[0, 0]
+        larger = float(size.max() * (wide**2 - 1.0))
+        return np.asarray(size * wide * np.concatenate((*rings, poles))), larger
+    raise ValueError(
+        "a link may have geoms of the types sphere, capsule, cylinder, ellipsoid, box and mesh, not "
+        f"{kind.name.removeprefix('mjGEOM_').lower()}"
+    )
+
+
+def _rim(number: int) -> Float:
+    """Return the corners of a regular polygon around the unit circle, shape (number, 3)."""
+    angle = 2.0 * np.pi * np.arange(number) / number
+    wide = 1.0 / np.cos(np.pi / number)
+    return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
+
+
+def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
+    """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
+
+    Raises:
+        ValueError: More than MOST_CAPSULES capsules are needed.
+    """
+    body = _body(points)
+    pieces = [fit_capsule(np.asarray(body.shape.vertices), body)]
+    found: list[FittedCapsule] = []
+    while pieces:
+        capsule = pieces.pop()
+        if capsule.excess <= tolerance:
+            found.append(capsule)
+            continue
+        if len(pieces) + len(found) + 2 > MOST_CAPSULES:
+            raise ValueError(
+                f"tolerance {tolerance:.2g} m takes more than {MOST_CAPSULES} capsules for one geom"
+            )
+        pieces += _best_halves(capsule.corners, body, tolerance)
+    return found
+
+
+def _body(points: Float) -> Body:
+    """Return the convex hull of points, shape (n, 3), [m]."""
+    shape = ConvexMesh.hull(points)
+    equations = convex_hull(shape.vertices).equations
+    return Body(shape, np.ascontiguousarray(equations[:, :3]), -equations[:, 3])
+
+
+def fit_capsule(corners: Float, body: Body) -> FittedCapsule:
+    """Return a capsule that contains points, shape (n, 3), [m], with little excess over a convex body around them."""
+    centre, axes, low, high = _principal_frame(corners)
+    size = high - low
+    best, least = np.empty((2, 3)), np.inf
+    for i in range(3):
+        # Along each principal axis, begin with ends that are half a width inside.
+        inset = 0.5 * min(float(np.delete(size, i).max()), float(size[i]))
+        ends = np.tile(0.5 * (low + high), (2, 1))
+        ends[:, i] = low[i] + inset, high[i] - inset
+        ends, excess = _refine(centre + ends @ axes.T, corners, body, float(size.max()))
+        if excess < least:
+            best, least = ends, excess
+    if np.linalg.norm(best[1] - best[0]) < SHORTEST:
+        best = np.tile(best.mean(axis=0), (2, 1))
+    radius = _radius(best, corners) + ROUNDING
+    return FittedCapsule(best, radius, radius + float(body.shape.distance(best).max()), corners)
+
+
+def _refine(ends: Float, corners: Float, body: Body, size: float) -> tuple[Float, float]:
+    """Return ends of the least excess (1) near some ends, by a compass search, and the excess without rounding."""
+    each_end = np.eye(6)
+    both_ends = np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))
+    moves = np.concatenate((each_end, both_ends, -each_end, -both_ends)).reshape(-1, 2, 3)
+    corners = np.ascontiguousarray(corners)
+    step, least = FIRST_STEP * size, _excess(ends, corners, body.normals, body.offsets)
+    while step > LAST_STEP * size:
+        best, where = least, ends
+        for move in moves:
+            probe = ends + step * move
+            value = _excess(probe, corners, body.normals, body.offsets)
+            if value < best:
+                best, where = value, probe
+        if best < least - 1e-9:
+            ends, least = where, best
+        else:
+            step *= 0.5
+    return ends, least
+
+
+@compiled
+def _excess(ends: Float, corners: Float, normals: Float, offsets: Float) -> float:
+    """Return the excess (1) of a capsule with some ends around points, shape (n, 3), [m].
+
+    The height above the highest face is d for ends inside the body, and less than d outside.
+    """
+    highest = -1e9
+    for end in range(2):
+        for face in range(len(offsets)):
+            height = -offsets[face]
+            for a in range(3):
+                height += normals[face, a] * ends[end, a]
+            highest = max(highest, height)
+    return highest + _radius(ends, corners)
+
+
+@compiled
+def _radius(ends: Float, corners: Float) -> float:
+    """Return the greatest distance of points, shape (n, 3), from a segment with the ends (2, 3), [m]."""
+    length = 1e-18
+    for a in range(3):
+        length += (ends[1, a] - ends[0, a]) ** 2
+    greatest = 0.0
+    for corner in range(len(corners)):
+        along = 0.0
+        for a in range(3):
+            along += (corners[corner, a] - ends[0, a]) * (ends[1, a] - ends[0, a])
+        share = min(max(along / length, 0.0), 1.0)
+        square = 0.0
+        for a in range(3):
+            square += (corners[corner, a] - ends[0, a] - share * (ends[1, a] - ends[0, a])) ** 2
+        greatest = max(greatest, square)
+    return float(np.sqrt(greatest))
+
+
+def _best_halves(corners: Float, body: Body, tolerance: float) -> list[FittedCapsule]:
+    """Return the capsules of two pieces of a polytope that is cut by the best of some planes."""
+    centre, axes, low, high = _principal_frame(corners)
+    hull, size = convex_hull(corners), high - low
+    best: list[FittedCapsule] = []
+    least = 2, np.inf
+    for i in np.flatnonzero(size >= LEAST_SHARE * size.max()):
+        for share in CUTS:
+            level = float(centre @ axes[:, i] + low[i] + share * size[i])
+            pieces = _cut(corners, hull.simplices, axes[:, i], level)
+            halves = [fit_capsule(piece, body) for piece in pieces]
+            excess = [capsule.excess for capsule in halves]
+            merit = sum(each > tolerance for each in excess), max(excess)
+            if not best or merit < least:
+                best, least = halves, merit
+    return best
+
+
+def _cut(corners: Float, triangles: Float, normal: Float, offset: float) -> tuple[Float, Float]:
+    """Return the corners of the two pieces of a polytope below and above the plane normal . x = offset."""
+    edges = np.concatenate((triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]))
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    height = corners @ normal - offset
+    first, second = height[edges[:, 0]], height[edges[:, 1]]
+    crosses = first * second < 0.0
+    share = first[crosses] / (first[crosses] - second[crosses])
+    start, end = corners[edges[crosses, 0]], corners[edges[crosses, 1]]
+    between = start + share[:, None] * (end - start)
+    # Corners on the plane belong to both pieces.
+    below, above = corners[height <= ROUNDING], corners[height >= -ROUNDING]
+    return np.concatenate((below, between)), np.concatenate((above, between))
+
+
+def _principal_frame(points: Float) -> tuple[Float, Float, Float, Float]:
+    """Return the mean of points, principal axes as columns, and the least and greatest coordinates along them."""
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2].T
+    local = (points - centre) @ axes
+    return centre, axes, local.min(axis=0), local.max(axis=0)

@@ -1,0 +1,339 @@
+"""Inverse kinematics: damped least squares for any chain, and a closed form for two hinges with vertical axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, whole_number
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.chain import Chain
+from viapoint.envs.arms.kinematics import forward, link_frames, tool_jacobian, transform
+from viapoint.envs.geometry.compiled import compiled
+
+ITERATIONS = 80
+"""Greatest number of iterations from one seed."""
+PLACE_TOLERANCE, ANGLE_TOLERANCE = 1e-6, 1e-5
+"""Greatest distance from the target, [m], and greatest angle, [rad], of a solution."""
+LONGEST_STEP = 0.5
+"""Greatest error that one iteration corrects, [m] and [rad] together."""
+DAMPING = 1e-2
+"""Damping for errors of 1; it falls with the error, so that the last iterations converge fast."""
+STALLED = 1e-9
+"""Greatest step of the joints that ends the iterations, [rad]."""
+SAME = 1e-3
+"""Greatest difference of joints in solutions that count as the same, [rad]."""
+REACHED = 1e-9
+"""Greatest distance of the hand from a target in the plane, [m]."""
+
+
+@compiled
+def _solve(matrix: Float, vector: Float, number: int) -> None:
+    """Replace a vector by the solution of a symmetric positive definite system, in place (Cholesky)."""
+    for j in range(number):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        matrix[j, j] = np.sqrt(matrix[j, j])
+        for i in range(j + 1, number):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+    for i in range(number):
+        for k in range(i):
+            vector[i] -= matrix[i, k] * vector[k]
+        vector[i] /= matrix[i, i]
+    for i in range(number - 1, -1, -1):
+        for k in range(i + 1, number):
+            vector[i] -= matrix[k, i] * vector[k]
+        vector[i] /= matrix[i, i]
+
+
+@compiled
+def _descend(
+    chain: Chain,
+    joint_range: Float,
+    position: Float,
+    axes: Float,
+    oriented: bool,
+    joints: Float,
+    rotation: Float,
+    origin: Float,
+) -> float:
+    """Move joints towards a target by damped least squares, and return the remaining error, 0 if it is reached.
+
+    The step is J^T (J J^T + d^2 I)^-1 e for the error e of place and orientation, cut off at the limits of the joints
+    (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986).
+
+    Args:
+        chain: Chain of the arm.
+        joint_range: Ranges of the joints, shape (J, 2).
+        position: Target place of the tool, shape (3,), [m].
+        axes: Target axes of the tool as columns, shape (3, 3).
+        oriented: True if the axes matter.
+        joints: Joint positions, which are changed.
+        rotation: Memory for the axes of the links.
+        origin: Memory for the origins of the links.
+    """
+    last = len(chain.mass)
+    rows = 6 if oriented else 3
+    jacobian = np.empty((6, last))
+    error = np.zeros(6)
+    tool = np.empty(3)
+    square = np.empty((6, 6))
+    away = 1e9
+    for _ in range(ITERATIONS):
+        link_frames(chain, joints, rotation, origin)
+        here = transform(rotation, origin, last, chain.tool_origin)
+        tool[0], tool[1], tool[2] = here
+        for a in range(3):
+            error[a] = position[a] - here[a]
+            error[3 + a] = 0.0
+        trace = -1.0
+        if oriented:
+            for column in range(3):
+                x, y, z = 0.0, 0.0, 0.0
+                for k in range(3):
+                    turn = chain.tool_rotation[k, column]
+                    x += rotation[last, 0, k] * turn
+                    y += rotation[last, 1, k] * turn
+                    z += rotation[last, 2, k] * turn
+                u, v, w = axes[0, column], axes[1, column], axes[2, column]
+                trace += x * u + y * v + z * w
+                error[3] += 0.5 * (y * w - z * v)
+                error[4] += 0.5 * (z * u - x * w)
+                error[5] += 0.5 * (x * v - y * u)
+        place = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
+        sine = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
+        angle = np.arctan2(sine, 0.5 * trace) if oriented else 0.0
+        away = place + angle
+        if place < PLACE_TOLERANCE and angle < ANGLE_TOLERANCE:
+            return 0.0
+        if oriented and sine > 1e-9:
+            for a in range(3):
+                error[3 + a] *= angle / sine
+        elif oriented and angle > 1.0:
+            error[3] = 0.5  # half a turn: any axis will do
+        scale = min(LONGEST_STEP / away, 1.0)
+        tool_jacobian(chain, rotation, origin, tool, jacobian)
+        damping = (DAMPING * min(away, 1.0)) ** 2 + 1e-12
+        for i in range(rows):
+            error[i] *= scale
+            for k in range(i + 1):
+                total = 0.0
+                for j in range(last):
+                    total += jacobian[i, j] * jacobian[k, j]
+                square[i, k] = total + (damping if i == k else 0.0)
+        _solve(square, error, rows)
+        moved = 0.0
+        for j in range(last):
+            step = 0.0
+            for i in range(rows):
+                step += jacobian[i, j] * error[i]
+            before = joints[j]
+            joints[j] = min(max(before + step, joint_range[j, 0]), joint_range[j, 1])
+            moved = max(moved, abs(joints[j] - before))
+        if moved < STALLED:
+            break
+    return away
+
+
+@compiled
+def solve_pose(
+    chain: Chain, joint_range: Float, position: Float, axes: Float, joints: Float, rotation: Float, origin: Float
+) -> bool:
+    """Move joints from where they are so that the tool has a place and axes; return False if that fails.
+
+    The arguments are those of :func:`_descend`.
+    """
+    return _descend(chain, joint_range, position, axes, True, joints, rotation, origin) == 0.0
+
+
+@compiled
+def solve_position(
+    chain: Chain, joint_range: Float, position: Float, joints: Float, rotation: Float, origin: Float
+) -> bool:
+    """Move joints from where they are so that the tool has a place; return False if that fails."""
+    return _descend(chain, joint_range, position, np.zeros((3, 3)), False, joints, rotation, origin) == 0.0
+
+
+@compiled
+def solve_planar(chain: Chain, joint_range: Float, x: float, y: float, joints: Float) -> bool:
+    """Find the joints of two hinges with vertical axes whose tool is at (x, y), [m], with the elbow on its side.
+
+    Out of reach, the elbow is as straight or as bent as it can be, and the result is False.
+    """
+    first, second, turn, base, upper, fore = _lengths(chain)
+    u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
+    # Law of cosines for the angle between the links.
+    cosine = (u * u + v * v - upper * upper - fore * fore) / (2.0 * upper * fore)
+    bend = np.arccos(min(max(cosine, -1.0), 1.0))
+    offset = turn + second - first
+    if joint_range[1, 0] + joint_range[1, 1] + 2.0 * offset < 0.0:
+        bend = -bend
+    joints[1] = min(max(bend - offset, joint_range[1, 0]), joint_range[1, 1])
+    bend = joints[1] + offset
+    # Angle from the upper arm to the tool, seen from the shoulder.
+    along, across = upper + fore * np.cos(bend), fore * np.sin(bend)
+    angle = np.arctan2(v, u) - np.arctan2(across, along) - base - first
+    middle = 0.5 * (joint_range[0, 0] + joint_range[0, 1])
+    joints[0] = angle - 2.0 * np.pi * np.round((angle - middle) / (2.0 * np.pi))
+    away = abs(np.sqrt(along * along + across * across) - np.sqrt(u * u + v * v))
+    return bool(away < REACHED and joint_range[0, 0] <= joints[0] <= joint_range[0, 1])
+
+
+@compiled
+def _lengths(chain: Chain) -> tuple[float, float, float, float, float, float]:
+    """Return angles and lengths of an arm in the plane.
+
+    Angles of upper arm and forearm in their frames, of the frame of the elbow in that of the shoulder, and of the
+    shoulder's frame in the world, [rad]; lengths of upper arm and forearm, [m].
+    """
+    first = np.arctan2(chain.origin[1, 1], chain.origin[1, 0])
+    second = np.arctan2(chain.tool_origin[1], chain.tool_origin[0])
+    turn = np.arctan2(chain.rotation[1, 1, 0], chain.rotation[1, 0, 0])
+    base = np.arctan2(chain.rotation[0, 1, 0], chain.rotation[0, 0, 0])
+    upper = np.sqrt(chain.origin[1, 0] ** 2 + chain.origin[1, 1] ** 2)
+    fore = np.sqrt(chain.tool_origin[0] ** 2 + chain.tool_origin[1] ** 2)
+    return first, second, turn, base, upper, fore
+
+
+@compiled
+def _planar_joints(chain: Chain, joint_range: Float, places: Float, out: Float) -> None:
+    """Fill in the joints for N places."""
+    for i in range(len(places)):
+        solve_planar(chain, joint_range, places[i, 0], places[i, 1], out[i])
+
+
+@compiled
+def _planar_motion(
+    chain: Chain,
+    joint_range: Float,
+    position: Float,
+    velocity: Float,
+    acceleration: Float,
+    out: tuple[Float, Float, Float],
+) -> None:
+    """Fill in joints, rates and accelerations for N states of the hand.
+
+    With unit vectors u along the links and n across them, the velocity is l1 a1' n1 + l2 a2' n2 for the angles a of the
+    links in the world, and n1 . u2 = sin(a2 - a1), so its components along u2 and u1 give the rates. Accelerations
+    follow alike after the centripetal terms are taken away.
+    """
+    first, second, turn, base, upper, fore = _lengths(chain)
+    joints, rates, changes = out
+    for i in range(len(position)):
+        solve_planar(chain, joint_range, position[i, 0], position[i, 1], joints[i])
+        one = base + joints[i, 0] + first
+        other = base + joints[i, 0] + turn + joints[i, 1] + second
+        c1, s1, c2, s2 = np.cos(one), np.sin(one), np.cos(other), np.sin(other)
+        sine = c1 * s2 - s1 * c2
+        sine = sine if abs(sine) > 1e-9 else 1e-9
+        x, y = velocity[i, 0], velocity[i, 1]
+        rate_1 = (x * c2 + y * s2) / (upper * sine)
+        rate_2 = -(x * c1 + y * s1) / (fore * sine)
+        x = acceleration[i, 0] + upper * rate_1 * rate_1 * c1 + fore * rate_2 * rate_2 * c2
+        y = acceleration[i, 1] + upper * rate_1 * rate_1 * s1 + fore * rate_2 * rate_2 * s2
+        change_1 = (x * c2 + y * s2) / (upper * sine)
+        change_2 = -(x * c1 + y * s1) / (fore * sine)
+        rates[i, 0], rates[i, 1] = rate_1, rate_2 - rate_1
+        changes[i, 0], changes[i, 1] = change_1, change_2 - change_1
+
+
+def planar_joints(arm: Arm, places: Any) -> Float:
+    """Return joint positions of an arm in the plane, shape (..., 2), for places of the hand of shape (..., 2), [m].
+
+    Out of reach, the elbow is as straight or as bent as it can be.
+    """
+    places = np.asarray(places, dtype=np.float64)
+    flat = places.reshape(-1, 2)
+    out = np.empty((len(flat), 2))
+    _planar_joints(arm.chain, arm.joint_range, flat, out)
+    return out.reshape(places.shape)
+
+
+def planar_motion(
+    arm: Arm, position: Float, velocity: Float, acceleration: Float
+) -> tuple[Float, Float, Float]:
+    """Return joint positions, rates and accelerations for motions of the hand in the plane, shape (..., 2) each."""
+    flat = [np.ascontiguousarray(part.reshape(-1, 2)) for part in (position, velocity, acceleration)]
+    out = (np.empty_like(flat[0]), np.empty_like(flat[0]), np.empty_like(flat[0]))
+    _planar_motion(arm.chain, arm.joint_range, flat[0], flat[1], flat[2], out)
+    shape = position.shape
+    return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
+
+
+def inverse_kinematics(
+    arm: Arm,
+    position: Any,
+    quaternion: Any = None,
+    *,
+    seed: Any = None,
+    rng: np.random.Generator | None = None,
+    n_seeds: int = 64,
+) -> Float:
+    """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
+
+    Args:
+        arm: Arm.
+        position: Place of the tool, shape (3,), [m].
+        quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
+        seed: Joint positions to begin with, shape (J,); home by default.
+        rng: Random generator of further seeds; one with a fixed seed by default.
+        n_seeds: Number of seeds.
+
+    Raises:
+        ValueError: No solution was found; the message tells the nearest distance.
+
+    Example:
+        >>> from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
+        >>> from viapoint.envs.arms.registry import arm_of
+        >>> arm = arm_of("panda")
+        >>> found = inverse_kinematics(arm, (0.5, 0.2, 0.4), (0.0, 1.0, 0.0, 0.0))
+        >>> arm.hand(found[0]).round(4).tolist()
+        [0.5, 0.2, 0.4]
+    """
+    position = finite_array("position", position, (3,))
+    axes = np.zeros(9)
+    if quaternion is not None:
+        quaternion = finite_array("quaternion", quaternion, (4,))
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > 1e-3:
+            raise ValueError(f"quaternion must have the length 1, got {quaternion.tolist()}")
+        mujoco.mju_quat2Mat(axes, quaternion / length)
+    number = whole_number("n_seeds", n_seeds, 1)
+    first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
+    rng = np.random.default_rng(0) if rng is None else rng
+    low, high = arm.joint_range.T
+    begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
+    joints = len(low)
+    rotation, origin = np.empty((joints + 1, 3, 3)), np.empty((joints + 1, 3))
+    found: list[Float] = []
+    nearest, where = np.inf, begin[0]
+    for configuration in begin:
+        error = _descend(
+            arm.chain,
+            arm.joint_range,
+            position,
+            axes.reshape(3, 3),
+            quaternion is not None,
+            configuration,
+            rotation,
+            origin,
+        )
+        if error == 0.0:
+            if all(np.abs(configuration - other).max() > SAME for other in found):
+                found.append(configuration)
+        elif error < nearest:
+            nearest, where = error, configuration
+    if not found:
+        away = float(np.linalg.norm(forward(arm.chain, where)[0] - position))
+        pose = "position" if quaternion is None else "pose"
+        raise ValueError(
+            f"the {pose} {position.tolist()} m cannot be reached: the nearest place found is {1e3 * away:.1f} mm away"
+            f"{'' if quaternion is None else ', and the orientation counts, too'}"
+        )
+    found.sort(key=lambda each: float(np.abs(each - first).max()))
+    return np.array(found)

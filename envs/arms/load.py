@@ -1,0 +1,634 @@
+"""Arms from MJCF files."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, number_of_at_least
+from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
+from viapoint.envs.arms.kinematics import torques
+
+DEFAULT_VELOCITY_LIMIT = 2.0
+"""Velocity limit of joints without one, [rad/s] or [m/s]."""
+MIN_JOINTS = 2
+"""Least number of joints."""
+MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
+"""Bounds of the tolerance of fitted capsules, [m]."""
+BASE_SHARE = 0.1
+"""Least tolerance of geoms of the base, as a share of their size: bases may be large."""
+LEFT_SHARE, LEFT_MOST = 0.25, 0.002
+"""Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]."""
+LEAST_EXCESS = 0.001
+"""Excess of capsules below which they are not split, [m]."""
+POSITION_TOLERANCE = 1e-6
+"""Greatest difference of positions and axes that count as equal, [m]."""
+MIN_INERTIA = 1e-12
+"""Least principal moment of inertia of a body, [kg m^2]."""
+INERTIA_MARGIN = 2e-5
+"""Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits."""
+JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""Transmissions of actuators that drive a joint directly."""
+JOINT_TYPES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+"""Types of joints that an arm may have."""
+RESERVED = ("", "world", "meshes")
+"""Names that bodies of the arm cannot have, beside those of obstacles."""
+
+
+class Parsed(NamedTuple):
+    """Arm in the form of its file."""
+
+    whole: mujoco.MjModel
+    """Model of the file."""
+    model: mujoco.MjModel
+    """Model with the arm's joints only; all other joints are fixed. Bodies and geoms have the same numbers."""
+    rest: mujoco.MjData
+    """Places with all joints at 0."""
+    joints: tuple[str, ...]
+    hand_site: str
+    links: dict[int, int]
+    """Link of each body of the arm, 0 for the base, in the order of the file."""
+    geoms: dict[int, list[int]]
+    """Geoms of each of these bodies that count for collisions; bodies without any are left out."""
+
+
+class Fit(NamedTuple):
+    """Capsule of a body, and the geom that it covers."""
+
+    geom: int
+    capsule: FittedCapsule
+
+
+def load_arm(
+    file: str | Path | mujoco.MjSpec,
+    *,
+    hand_site: str,
+    joints: Sequence[str],
+    name: str | None = None,
+    home: Any = None,
+    origin: Any = None,
+    joint_range: Any = None,
+    torque_limit: Any = None,
+    velocity_limit: Any = None,
+    tolerance: float = 0.025,
+) -> Arm:
+    """Load an arm from an MJCF file.
+
+    The arm keeps the file's joints, inertias, damping and limits, and the spheres and capsules of its bodies. Capsules
+    cover the other geoms: nothing sticks out of them. Other joints are fixed as in the file's first keyframe. The base
+    is what is fixed to the world and carries the arm; everything else is left out.
+
+    Args:
+        file: MJCF file, the text of one, or a specification.
+        hand_site: Site of the tool, which moves with the last joint.
+        joints: Names of the limited hinges and slides from the base to the tool, two or more.
+        name: Name of the arm; by default that of the file or the model.
+        home: Home configuration, shape (J,); by default the file's first keyframe, or else the middle of the ranges.
+        origin: Point of the file's world that becomes the origin, [m]; by default the point below the first joint with
+            z = 0.
+        joint_range: Lowest and highest position of each joint, shape (J, 2); by default those of the file.
+        torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators.
+        velocity_limit: Velocity limit of each joint or of all; by default the file's custom number of that name, or 2
+            with a warning.
+        tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m]; for
+            the base at least a tenth of the size of the geom.
+
+    Raises:
+        TypeError: The file is neither a name, nor text, nor a specification.
+        ValueError: An argument is invalid, the file lacks something, or the arm cannot hold its weight at home.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs.arms.load import load_arm
+        >>> arm = load_arm(
+        ...     "docs/ur5e.xml",
+        ...     hand_site="hand",
+        ...     joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
+        ...     home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
+        ...     velocity_limit=np.pi,
+        ... )
+        >>> arm.hand(arm.home).round(3).tolist()  # [m]
+        [0.48, -0.001, 0.198]
+    """
+    spec, own_name = _read(file)
+    tolerance = number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE)
+    name = own_name if name is None else name
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"name must be a string of one or more characters, got {name!r}")
+    try:
+        whole = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read the file: {error}") from None
+    names = _joint_names(joints)
+    _check_exist("site", [hand_site], [site.name for site in spec.sites])
+    _check_exist("joint", names, [joint.name for joint in spec.joints])
+    ranges = _ranges(whole, names, joint_range)
+    torque = (
+        _torques(whole, names) if torque_limit is None else _per_joint("torque_limit", torque_limit, names)
+    )
+    velocity = _velocities(whole, names, velocity_limit)
+    for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
+        if not (limit > 0.0).all():
+            raise ValueError(f"{what} must be positive, got {limit}")
+    home = _home(whole, names, ranges, home)
+    parsed = _parse(spec, whole, names, hand_site)
+    place = parsed.rest.xanchor[parsed.model.joint(names[0]).id]
+    zero = np.array((place[0], place[1], 0.0)) if origin is None else finite_array("origin", origin, (3,))
+    exclude = _excluded(parsed)
+    xml, excess = _fitted(parsed, ranges, zero, home, exclude, tolerance)
+    arm = arm_from_xml(
+        name,
+        xml,
+        joints=names,
+        tool="hand",
+        home=home,
+        velocity_limit=velocity,
+        torque_limit=torque,
+        exclude=exclude,
+    )
+    weak = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home)) > torque
+    if weak.any():
+        some = ", ".join(itertools.compress(names, weak))
+        raise ValueError(
+            f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
+        )
+    return replace(arm, excess=arm.excess + excess)
+
+
+def _read(file: Any) -> tuple[mujoco.MjSpec, str]:
+    """Return a specification that may be changed, and its name."""
+    if isinstance(file, mujoco.MjSpec):
+        return file.copy(), file.modelname
+    if not isinstance(file, str | os.PathLike) or isinstance(os.fspath(file), bytes):
+        raise TypeError(f"file must be the name or the text of an MJCF file, or an MjSpec, got {file!r:.60}")
+    text = os.fspath(file)
+    path = Path(text)
+    is_text = text.lstrip().startswith("<")
+    if not is_text and not path.is_file():
+        raise ValueError(f"there is no file {text!r}")
+    try:
+        spec = mujoco.MjSpec.from_string(text) if is_text else mujoco.MjSpec.from_file(text)
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF: {error}") from None
+    return spec, spec.modelname if is_text else path.stem
+
+
+def _joint_names(joints: Any) -> tuple[str, ...]:
+    """Return different names of joints."""
+    names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
+    are_strings = all(isinstance(each, str) for each in names)
+    if not are_strings or not MIN_JOINTS <= len(set(names)) == len(names):
+        raise ValueError(
+            f"joints must be {MIN_JOINTS} or more different names, in order from the base to the tool, got {joints!r}"
+        )
+    return names
+
+
+def _check_exist(kind: str, wanted: Sequence[str], there: Sequence[str]) -> None:
+    missing = [name for name in wanted if name not in there]
+    if missing:
+        named = ", ".join(filter(None, there)) or "none"
+        raise ValueError(
+            f"there is no {kind} {', '.join(map(repr, missing))} in the file; there are: {named}"
+        )
+
+
+def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
+    """Return one number for each joint, shape (J,); a single number applies to all."""
+    numbers = finite_array(name, values, (len(joints),), (1,), ())
+    return np.array(np.broadcast_to(numbers, (len(joints),)))
+
+
+def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
+    """Return the range of each joint, shape (J, 2)."""
+    for name in joints:
+        joint = model.joint(name).id
+        if not np.isin(model.jnt_type[joint], JOINT_TYPES):
+            raise ValueError(f"joint {name!r} is neither a hinge nor a slide; leave it out to fix it")
+        if given is None and not model.jnt_limited[joint]:
+            raise ValueError(
+                f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
+            )
+    if given is None:
+        return np.array([model.joint(name).range for name in joints])
+    ranges = finite_array("joint_range", given, (len(joints), 2))
+    if (ranges[:, 0] >= ranges[:, 1]).any():
+        raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
+    return ranges
+
+
+def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
+    """Return the torque limit of each joint: its own, or the greatest of the actuators that drive it."""
+    found = []
+    for name in joints:
+        joint = model.joint(name).id
+        if model.jnt_actfrclimited[joint]:
+            found.append(_symmetric_limit(model.jnt_actfrcrange[joint]))
+            continue
+        drives = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
+        limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(drives)]
+        found.append(max(limits, default=0.0))
+    missing = [name for name, torque in zip(joints, found, strict=True) if torque <= 0.0]
+    if missing:
+        raise ValueError(
+            f"no actuator with a force limited to a range about 0 drives {', '.join(missing)}; add one, or give "
+            "torque_limit"
+        )
+    return np.array(found)
+
+
+def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
+    """Return an actuator's limit: of its force, or of its control where force is gain * control; 0 for none."""
+    gear = abs(float(model.actuator_gear[index, 0]))
+    if model.actuator_forcelimited[index]:
+        return gear * _symmetric_limit(model.actuator_forcerange[index])
+    plain = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
+    if plain and model.actuator_ctrllimited[index]:
+        gain = abs(float(model.actuator_gainprm[index, 0]))
+        return gear * gain * _symmetric_limit(model.actuator_ctrlrange[index])
+    return 0.0
+
+
+def _symmetric_limit(limits: Float) -> float:
+    """Return the limit that a range leaves in both directions; 0 if it is one-sided."""
+    return max(min(-float(limits[0]), float(limits[1])), 0.0)
+
+
+def _velocities(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
+    """Return the velocity limit of each joint, shape (J,)."""
+    if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
+        given = model.numeric("velocity_limit").data
+    if given is None:
+        given = DEFAULT_VELOCITY_LIMIT
+        warnings.warn(
+            f"the file has no velocity limits, so all joints get {given:g} rad/s (slides {given:g} m/s); give "
+            "velocity_limit",
+            stacklevel=3,
+        )
+    return _per_joint("velocity_limit", given, joints)
+
+
+def _home(model: mujoco.MjModel, joints: tuple[str, ...], ranges: Float, given: Any) -> Float:
+    """Return the home configuration, shape (J,)."""
+    if given is None:
+        address = [int(model.joint(name).qposadr[0]) for name in joints]
+        given = model.key_qpos[0, address] if model.nkey else ranges.mean(axis=1)
+    home = _per_joint("home", given, joints)
+    outside = (home < ranges[:, 0]) | (home > ranges[:, 1])
+    if outside.any():
+        raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
+    return home
+
+
+def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> Parsed:
+    """Return the arm of a specification, which is changed."""
+    model = _isolate(spec, joints, whole)
+    _check_order(model, joints, hand_site)
+    rest = mujoco.MjData(model)
+    rest.qpos[:] = 0.0
+    mujoco.mj_kinematics(model, rest)
+    carriers = [int(model.joint(name).bodyid[0]) for name in joints]
+    root = int(model.body_rootid[carriers[0]])
+    links = {}
+    for body in range(model.nbody):
+        if model.body_weldid[body] in carriers:
+            links[body] = carriers.index(model.body_weldid[body]) + 1
+        elif model.body_weldid[body] == 0 and (body == 0 or model.body_rootid[body] == root):
+            links[body] = 0
+    geoms = _collision_geoms(model, links)
+    if not any(links[body] for body in geoms):
+        raise ValueError(f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide")
+    return Parsed(whole, model, rest, joints, hand_site, links, geoms)
+
+
+def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
+    """Return the geoms of each body: those that collide, or all of a link of which none does; planes are left out."""
+    collides = (model.geom_contype | model.geom_conaffinity) > 0
+    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    found = {}
+    for link in sorted(set(links.values())):
+        bodies = [body for body in links if links[body] == link]
+        used = solid & np.isin(model.geom_bodyid, bodies)
+        if (used & collides).any():
+            used &= collides
+        for body in bodies:
+            geoms = np.flatnonzero(used & (model.geom_bodyid == body)).tolist()
+            if geoms:
+                found[body] = geoms
+    return found
+
+
+def _isolate(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model without actuators, constraints and sensors, all other joints fixed as in the first keyframe."""
+    for part in (
+        *spec.actuators,
+        *spec.equalities,
+        *spec.sensors,
+        *spec.tendons,
+        *spec.keys,
+        *spec.excludes,
+        *spec.pairs,
+    ):
+        spec.delete(part)
+    others = [joint for joint in spec.joints if joint.name not in joints]
+    fixed = _keyframe_places(whole, joints) if whole.nkey else None
+    if fixed is not None:
+        # Numbers are read first, because `set_frame` takes those of all bodies away.
+        for number, body in {joint.parent.id: joint.parent for joint in others}.items():
+            _fix_body(number, body, whole, fixed)
+    for joint in others:
+        spec.delete(joint)
+    for body in spec.bodies:
+        body.mocap = False
+    model = spec.compile()
+    if fixed is not None:
+        _check_fixed(model, whole, fixed, joints)
+    return model
+
+
+def _keyframe_places(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
+    """Return the places of all parts with the arm's joints at rest and the others as in the first keyframe."""
+    data = mujoco.MjData(whole)
+    data.qpos[:] = whole.key_qpos[0]
+    for name in joints:
+        address = whole.joint(name).qposadr
+        data.qpos[address] = whole.qpos0[address]
+    mujoco.mj_kinematics(whole, data)
+    return data
+
+
+def _fix_body(number: int, body: Any, whole: mujoco.MjModel, fixed: mujoco.MjData) -> None:
+    """Write a body's pose into the model, in a frame of its own because the body may be inside another frame."""
+    parent = whole.body_parentid[number]
+    turn = fixed.xmat[parent].reshape(3, 3).T
+    body.set_frame(body.parent.add_frame())
+    body.pos = turn @ (fixed.xpos[number] - fixed.xpos[parent])
+    body.quat = _quaternion(turn @ fixed.xmat[number].reshape(3, 3))
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def _check_fixed(
+    model: mujoco.MjModel, whole: mujoco.MjModel, fixed: mujoco.MjData, joints: tuple[str, ...]
+) -> None:
+    """Check that the arm's joints and all bodies are still where the file has them."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    apart = [np.abs(data.xpos - fixed.xpos).max(), np.abs(data.xmat - fixed.xmat).max()]
+    for name in joints:
+        here, there = model.joint(name).id, whole.joint(name).id
+        apart.append(np.abs(data.xanchor[here] - fixed.xanchor[there]).max())
+        apart.append(np.abs(data.xaxis[here] - fixed.xaxis[there]).max())
+    if max(apart) > POSITION_TOLERANCE:
+        raise ValueError(
+            "joints that are left out cannot be fixed as in the file's keyframe, because that moves other parts; write "
+            "their positions into the file and remove the keyframe"
+        )
+
+
+def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> None:
+    """Check that each joint carries the next one, and the last one the tool."""
+    bodies = [int(model.joint(name).bodyid[0]) for name in joints]
+    for i in range(1, len(joints)):
+        first, second = joints[i - 1], joints[i]
+        if bodies[i - 1] == bodies[i]:
+            raise ValueError(
+                f"joints {first!r} and {second!r} belong to one body; leave one out to fix it, or give each a body of "
+                "its own in the file"
+            )
+        if bodies[i - 1] not in _ancestors(model, bodies[i]):
+            raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
+    last = int(model.site(hand_site).bodyid[0])
+    if model.body_weldid[last] != bodies[-1]:
+        raise ValueError(f"site {hand_site!r} does not move with the last joint, {joints[-1]!r}")
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+    found = []
+    while body:
+        body = int(model.body_parentid[body])
+        found.append(body)
+    return found
+
+
+def _body_name(parsed: Parsed, body: int) -> str:
+    """Return the name of a body of the arm in its model: that of the file, where it has one that is free."""
+    name = str(parsed.model.body(body).name)
+    if body == 0 or name in RESERVED or name.startswith("obstacle_"):
+        return f"base_{body}" if parsed.links[body] == 0 else f"body_{body}"
+    return name
+
+
+def _collide_in_file(parsed: Parsed, first: int, second: int) -> bool:
+    """Return True if MuJoCo would let geoms of two bodies collide: contact bits, excluded and explicit pairs."""
+    whole = parsed.whole
+    low, high = sorted((first, second))
+    if (low << 16) + high in whole.exclude_signature:
+        return False
+    explicit = {
+        frozenset(pair) for pair in zip(whole.pair_geom1.tolist(), whole.pair_geom2.tolist(), strict=True)
+    }
+    for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
+        bits = whole.geom_contype[a] & whole.geom_conaffinity[b]
+        bits |= whole.geom_contype[b] & whole.geom_conaffinity[a]
+        # Geoms that collide with nothing stand for a link that has no others.
+        silent = any(not (whole.geom_contype[geom] | whole.geom_conaffinity[geom]) for geom in (a, b))
+        if bits or silent or frozenset((a, b)) in explicit:
+            return True
+    return False
+
+
+def _distant_pairs(parsed: Parsed) -> Iterator[tuple[int, int]]:
+    """Return the pairs of bodies with geoms whose links are neither the same nor consecutive."""
+    for first, second in itertools.combinations(parsed.geoms, 2):
+        if abs(parsed.links[first] - parsed.links[second]) > 1:
+            yield first, second
+
+
+def _excluded(parsed: Parsed) -> list[tuple[str, str]]:
+    """Return the names of pairs of bodies that the file does not let collide."""
+    return [
+        (_body_name(parsed, first), _body_name(parsed, second))
+        for first, second in _distant_pairs(parsed)
+        if not _collide_in_file(parsed, first, second)
+    ]
+
+
+def _fitted(
+    parsed: Parsed,
+    ranges: Float,
+    origin: Float,
+    home: Float,
+    exclude: Sequence[tuple[str, str]],
+    tolerance: float,
+) -> tuple[str, float]:
+    """Return the text of the arm's model, and the greatest excess of its capsules, [m].
+
+    Capsules of bodies that are apart at home must be apart there, too: those that are not are split.
+
+    Raises:
+        ValueError: Bodies are too close for that.
+    """
+    distances = _home_distances(parsed, home, exclude)
+    fits: dict[int, list[Fit]] = {}
+    for body, geoms in parsed.geoms.items():
+        fits[body] = []
+        for geom in geoms:
+            least = 0.0 if parsed.links[body] else BASE_SHARE * 2.0 * float(parsed.model.geom_rbound[geom])
+            found = cover_geom(parsed.model, geom, max(tolerance, least))
+            fits[body] += [Fit(geom, capsule) for capsule in found]
+    while True:
+        xml = _write(parsed, ranges, origin, fits)
+        near = _near_capsules(parsed, xml, home, distances)
+        if not near:
+            break
+        coarse: set[tuple[int, int]] = set()
+        for (first, i), (second, j) in near:
+            excess = [fits[first][i].capsule.excess, fits[second][j].capsule.excess]
+            if max(excess) < LEAST_EXCESS:
+                names = f"{_body_name(parsed, first)!r} and {_body_name(parsed, second)!r}"
+                raise ValueError(
+                    f"the bodies {names} are {1e3 * distances[first, second]:.2g} mm apart at home, too close for the "
+                    "capsules around them: give another home, or exclude their contact in the file"
+                )
+            coarse.add((first, i) if excess[0] >= excess[1] else (second, j))
+        for body, index in sorted(coarse, reverse=True):
+            geom, capsule = fits[body].pop(index)
+            fits[body] += [Fit(geom, half) for half in split(parsed.model, geom, capsule)]
+    return xml, max(fit.capsule.excess for some in fits.values() for fit in some)
+
+
+def _home_distances(
+    parsed: Parsed, home: Float, exclude: Sequence[tuple[str, str]]
+) -> dict[tuple[int, int], float]:
+    """Return the distance at home of each pair of bodies that must stay apart, [m]; at most 0.1."""
+    data = _at(parsed.model, parsed.joints, home)
+    excluded = {frozenset(pair) for pair in exclude}
+    found = {}
+    for first, second in _distant_pairs(parsed):
+        if frozenset((_body_name(parsed, first), _body_name(parsed, second))) in excluded:
+            continue
+        pairs = itertools.product(parsed.geoms[first], parsed.geoms[second])
+        least = min(mujoco.mj_geomDistance(parsed.model, data, a, b, 0.1, None) for a, b in pairs)
+        if least > 0.0:
+            found[first, second] = least
+    return found
+
+
+def _near_capsules(
+    parsed: Parsed, xml: str, home: Float, distances: dict[tuple[int, int], float]
+) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = _at(model, parsed.joints, home)
+    first_geom = {body: int(model.body(_body_name(parsed, body)).geomadr[0]) for body in parsed.geoms}
+    number = {body: int(model.body(_body_name(parsed, body)).geomnum[0]) for body in parsed.geoms}
+    found = []
+    for (first, second), distance in distances.items():
+        least = min(LEFT_SHARE * distance, LEFT_MOST)
+        for i, j in itertools.product(range(number[first]), range(number[second])):
+            one, other = first_geom[first] + i, first_geom[second] + j
+            if mujoco.mj_geomDistance(model, data, one, other, 0.01, None) < least:
+                found.append(((first, i), (second, j)))
+    return found
+
+
+def _at(model: mujoco.MjModel, joints: tuple[str, ...], home: Float) -> mujoco.MjData:
+    """Return the places of all parts of a model at home."""
+    data = mujoco.MjData(model)
+    data.qpos[[int(model.joint(name).qposadr[0]) for name in joints]] = home
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fit]]) -> str:
+    """Return the text of the arm's model: its bodies on the stage, with capsules as geoms."""
+    model, rest = parsed.model, parsed.rest
+    spec = mujoco.MjSpec.from_string(asset("stage.xml"))
+    spec.option.gravity = model.opt.gravity
+    carriers = {int(model.joint(name).bodyid[0]): index for index, name in enumerate(parsed.joints)}
+    written: dict[int, Any] = {}
+    for body, link in parsed.links.items():
+        turn, place = rest.xmat[body].reshape(3, 3), rest.xpos[body]
+        parent, axes, start = spec.worldbody, np.eye(3), origin
+        # A body that is welded to another one hangs on the body with the joint, which comes before it in the file.
+        before = list(carriers)[link - 2] if body in carriers and link > 1 else int(model.body_weldid[body])
+        if link and before in written:
+            parent, axes, start = written[before], rest.xmat[before].reshape(3, 3), rest.xpos[before]
+        written[body] = parent.add_body(
+            name=_body_name(parsed, body), pos=axes.T @ (place - start), quat=_quaternion(axes.T @ turn)
+        )
+        if link:
+            _add_inertia(written[body], model, body)
+        if body in carriers:
+            _add_joint(written[body], parsed, carriers[body], ranges)
+        for geom, capsule in fits.get(body, []):
+            _add_capsule(written[body], model, geom, capsule)
+    site = model.site(parsed.hand_site)
+    written[int(site.bodyid[0])].add_site(
+        name="hand", pos=site.pos, quat=site.quat, size=(0.004, 0.0, 0.0), rgba=(0.0, 0.0, 0.0, 0.0)
+    )
+    spec.compile()
+    return str(spec.to_xml())
+
+
+def _add_inertia(written: Any, model: mujoco.MjModel, body: int) -> None:
+    """Give a body its mass and inertia.
+
+    No principal moment exceeds the sum of the others. Those of flat and tiny bodies are changed until this holds with a
+    margin, because the text has fewer digits.
+    """
+    moments = np.maximum(model.body_inertia[body], MIN_INERTIA)
+    largest = int(moments.argmax())
+    moments[largest] = min(moments[largest], (1.0 - INERTIA_MARGIN) * (moments.sum() - moments[largest]))
+    if model.body_mass[body] > 0.0:
+        written.mass, written.inertia, written.explicitinertial = model.body_mass[body], moments, True
+        written.ipos, written.iquat = model.body_ipos[body], model.body_iquat[body]
+
+
+def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:
+    """Add a joint of the arm to its body."""
+    model, name = parsed.model, parsed.joints[index]
+    joint = model.joint(name).id
+    dof = model.jnt_dofadr[joint]
+    # The joint's point and axis at 0 in the frame of the body, whatever its reference is.
+    turn = parsed.rest.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
+    place = parsed.rest.xanchor[joint] - parsed.rest.xpos[model.jnt_bodyid[joint]]
+    added = written.add_joint(
+        name=name,
+        type=mujoco.mjtJoint(int(model.jnt_type[joint])),
+        pos=turn.T @ place,
+        axis=turn.T @ parsed.rest.xaxis[joint],
+        range=ranges[index],
+        limited=True,
+        armature=model.dof_armature[dof],
+    )
+    added.damping[0] = model.dof_damping[dof].flat[0]
+
+
+def _add_capsule(written: Any, model: mujoco.MjModel, geom: int, capsule: FittedCapsule) -> None:
+    """Add a capsule that covers a geom, or a part of it, to the body."""
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    first, second = model.geom_pos[geom] + capsule.ends @ turn.reshape(3, 3).T
+    size = (capsule.radius, 0.0, 0.0)
+    if np.array_equal(capsule.ends[0], capsule.ends[1]):
+        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)
+    else:
+        written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)
+
+
+def _quaternion(matrix: Float) -> Float:
+    """Return the quaternion of a rotation matrix."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, matrix.flatten())
+    return quaternion

@@ -1,0 +1,84 @@
+"""Registry of arms by name: the built-in ones, and a user's own."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+
+REGISTER_HINT = "register_arm adds an arm of your own"
+"""Advice for names that are not known."""
+PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
+"""Joint positions at home, [rad]: Franka's ready pose."""
+
+
+@functools.cache
+def planar() -> Arm:
+    """Return the right arm of an adult in the horizontal plane, its shoulder at the origin."""
+    return arm_from_xml(
+        "planar",
+        asset("planar.xml"),
+        joints=("shoulder", "elbow"),
+        tool="hand",
+        home=(0.6, 1.5),
+        velocity_limit=(np.inf, np.inf),
+        torque_limit=(60.0, 45.0),
+        space="hand",
+        bandwidth=40.0,
+    )
+
+
+@functools.cache
+def panda() -> Arm:
+    """Return the Franka Emika Panda with its hand, its base at the origin."""
+    return arm_from_xml(
+        "panda",
+        asset("panda.xml"),
+        joints=tuple(f"joint{number}" for number in range(1, 8)),
+        tool="hand",
+        home=PANDA_HOME,
+        velocity_limit=(2.175,) * 4 + (2.61,) * 3,
+        torque_limit=(87.0,) * 4 + (12.0,) * 3,
+    )
+
+
+_BUILT_IN: dict[str, Callable[[], Arm]] = {"planar": planar, "panda": panda}
+_OWN: dict[str, Arm] = {}
+
+
+def arm_names() -> tuple[str, ...]:
+    """Return the names of all arms."""
+    return (*_BUILT_IN, *_OWN)
+
+
+def register_arm(arm: Arm) -> None:
+    """Register an arm under its name, so that tasks and models can refer to it; a process that loads them must, too.
+
+    Raises:
+        TypeError: It is no arm.
+        ValueError: The name is that of a built-in arm.
+    """
+    if not isinstance(arm, Arm):
+        raise TypeError(f"arm must be an Arm, as load_arm returns it, got {arm!r:.60}")
+    if arm.name in _BUILT_IN:
+        raise ValueError(f"there is a built-in arm of the name {arm.name!r}; give another one")
+    _OWN[arm.name] = arm
+
+
+def arm_of(arm: Any) -> Arm:
+    """Return an arm as it is, or the arm of a name.
+
+    Raises:
+        ValueError: There is no such arm.
+    """
+    if isinstance(arm, Arm):
+        return arm
+    if isinstance(arm, str) and arm in _BUILT_IN:
+        return _BUILT_IN[arm]()
+    if isinstance(arm, str) and arm in _OWN:
+        return _OWN[arm]
+    raise ValueError(f"arm must be an Arm or one of {', '.join(arm_names())}, got {arm!r:.60}; {REGISTER_HINT}")

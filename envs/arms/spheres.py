@@ -1,0 +1,214 @@
+"""Covering of an arm's collision geoms by spheres, and the pairs of bodies that must not touch one another."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import sphere_centres
+
+LARGEST_EXCESS = 0.005
+"""Greatest distance by which a sphere may stick out of a capsule, [m]."""
+SHRUNK = 0.5
+"""Factor on this distance for bodies whose spheres overlap at home although their geoms do not."""
+SHRINKING = 6
+"""Greatest number of times that it is applied."""
+ROUNDS = 2000
+"""Iterations for bounding balls."""
+
+
+class Capsule(NamedTuple):
+    """Collision geom of an arm: a capsule, or a sphere, which is one without a length."""
+
+    body: str
+    """Name of the body."""
+    first: Float
+    """One end of the axis in the frame of the link, shape (3,), [m]."""
+    second: Float
+    """The other end, shape (3,), [m]."""
+    radius: float
+    """Radius, [m]."""
+
+
+class LeftOut(NamedTuple):
+    """Pair of bodies that are not compared."""
+
+    first: str
+    second: str
+    reason: str
+
+
+class Cover(NamedTuple):
+    """Spheres of an arm."""
+
+    spheres: Spheres
+    names: tuple[str, ...]
+    """Names of the groups: bodies of the model."""
+    left_out: tuple[LeftOut, ...]
+    """Pairs that are not compared."""
+    excess: float
+    """Greatest distance by which a sphere sticks out of a geom, [m]."""
+
+
+def cover(
+    chain: Chain,
+    capsules: Sequence[Capsule],
+    links: dict[str, int],
+    home: Float,
+    touching: Collection[frozenset[str]],
+    exclude: Collection[frozenset[str]],
+) -> Cover:
+    """Return spheres that contain all capsules, and the pairs of bodies that must not touch one another.
+
+    Args:
+        chain: Chain of the arm.
+        capsules: Collision geoms.
+        links: Link that each body moves with.
+        home: Joint positions at home, shape (J,).
+        touching: Pairs of bodies whose geoms are in contact at home.
+        exclude: Pairs that may pass through one another.
+
+    Raises:
+        ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
+    """
+    names = tuple(dict.fromkeys(capsule.body for capsule in capsules))
+    pairs, left_out = _pairs(names, links, touching, exclude)
+    excess = dict.fromkeys(names, LARGEST_EXCESS)
+    for _ in range(SHRINKING):
+        spheres = _spheres(names, links, capsules, excess, pairs)
+        centres = sphere_centres(chain, spheres, home)
+        close = [
+            (names[a], names[b]) for a, b in pairs if _least_distance(spheres, centres, a, b) <= 0.0
+        ]
+        if not close:
+            return Cover(spheres, names, left_out, max(excess.values()))
+        for name in {name for pair in close for name in pair}:
+            excess[name] *= SHRUNK
+    raise ValueError(
+        f"the bodies {close[0][0]!r} and {close[0][1]!r} are so close at home that spheres on them overlap: give "
+        "another home"
+    )
+
+
+def touching_at_home(
+    model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]
+) -> set[frozenset[str]]:
+    """Return the pairs of bodies whose geoms are in contact in the present configuration."""
+    geoms = {name: _collision_geoms(model, name) for name in names}
+    found = set()
+    for first, second in itertools.combinations(names, 2):
+        for one, other in itertools.product(geoms[first], geoms[second]):
+            if mujoco.mj_geomDistance(model, data, one, other, 0.01, None) <= 0.0:
+                found.add(frozenset((first, second)))
+                break
+    return found
+
+
+def _collision_geoms(model: mujoco.MjModel, body: str) -> list[int]:
+    """Return the geoms of a body that take part in contacts."""
+    number = model.body(body).id
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] == number and (model.geom_contype[geom] or model.geom_conaffinity[geom])
+    ]
+
+
+def _pairs(
+    names: Sequence[str],
+    links: dict[str, int],
+    touching: Collection[frozenset[str]],
+    exclude: Collection[frozenset[str]],
+) -> tuple[list[tuple[int, int]], tuple[LeftOut, ...]]:
+    """Return the pairs of groups that are compared, and those of different links that are not."""
+    pairs, left_out = [], []
+    for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
+        apart = abs(links[first] - links[second])
+        pair = frozenset((first, second))
+        if apart == 0:
+            continue
+        if apart == 1:
+            left_out.append(LeftOut(first, second, "consecutive links"))
+        elif pair in exclude:
+            left_out.append(LeftOut(first, second, "excluded in the file"))
+        elif pair in touching:
+            left_out.append(LeftOut(first, second, "in contact at home"))
+        else:
+            pairs.append((i, j))
+    return pairs, tuple(left_out)
+
+
+def _spheres(
+    names: Sequence[str],
+    links: dict[str, int],
+    capsules: Sequence[Capsule],
+    excess: dict[str, float],
+    pairs: Sequence[tuple[int, int]],
+) -> Spheres:
+    """Return the spheres of all bodies."""
+    centres: list[Float] = []
+    radii: list[float] = []
+    first, balls = [0], []
+    for name in names:
+        for capsule in capsules:
+            if capsule.body == name:
+                points, radius = _along(capsule, excess[name])
+                centres += list(points)
+                radii += [radius] * len(points)
+        some = slice(first[-1], len(centres))
+        balls.append(bounding_ball(np.array(centres[some]), np.array(radii[some])))
+        first.append(len(centres))
+    return Spheres(
+        centre=np.array(centres),
+        radius=np.array(radii),
+        first=np.array(first),
+        link=np.array([links[name] for name in names]),
+        ball_centre=np.array([centre for centre, _ in balls]),
+        ball_radius=np.array([radius for _, radius in balls]),
+        pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
+    )
+
+
+def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
+    """Return the centres, shape (n, 3), and the radius of spheres that contain a capsule, [m].
+
+    Spheres of radius R that are s apart contain the cylinder of radius r between them if R^2 >= r^2 + s^2 / 4.
+    """
+    length = float(np.linalg.norm(capsule.second - capsule.first))
+    largest = capsule.radius + excess
+    spacing = 2.0 * np.sqrt(largest**2 - capsule.radius**2)
+    number = int(np.ceil(length / spacing))
+    if number == 0:
+        return capsule.first[None], capsule.radius
+    share = np.linspace(0.0, 1.0, number + 1)[:, None]
+    radius = np.sqrt(capsule.radius**2 + 0.25 * (length / number) ** 2)
+    return capsule.first + share * (capsule.second - capsule.first), float(radius)
+
+
+def bounding_ball(centre: Float, radius: Float) -> tuple[Float, float]:
+    """Return a ball around spheres that is hardly larger than the smallest one: its centre and radius, [m].
+
+    In each round the centre moves towards the farthest sphere, by less and less (M. Badoiu and K. L. Clarkson, Smaller
+    core-sets for balls, 2003).
+    """
+    middle = centre.mean(axis=0)
+    for k in range(ROUNDS):
+        away = centre - middle
+        far = np.sqrt((away * away).sum(axis=1)) + radius
+        middle = middle + away[far.argmax()] / (k + 2.0)
+    away = centre - middle
+    return middle, float((np.sqrt((away * away).sum(axis=1)) + radius).max())
+
+
+def _least_distance(spheres: Spheres, centres: Float, first: int, second: int) -> float:
+    """Return the least distance of the spheres of two groups, [m]."""
+    one = slice(spheres.first[first], spheres.first[first + 1])
+    other = slice(spheres.first[second], spheres.first[second + 1])
+    apart = np.linalg.norm(centres[one][:, None] - centres[other], axis=-1)
+    return float((apart - spheres.radius[one][:, None] - spheres.radius[other]).min())

@@ -1,0 +1,118 @@
+"""One environment: a batch of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.utils import EzPickle
+
+from viapoint.envs.common.types import Observation
+from viapoint.envs.common.validation import as_given
+from viapoint.envs.episodes import History
+from viapoint.envs.outcome import Rollout
+from viapoint.envs.plans import Plan
+from viapoint.envs.vector_env import SINGLE_METADATA, ReachVectorEnv
+
+
+class ReachEnv(gym.Env[Any, Any], EzPickle):
+    """One environment of a :class:`~viapoint.envs.vector_env.ReachVectorEnv`, with the same keyword arguments.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> type(env.unwrapped).__name__
+        'ReachEnv'
+    """
+
+    metadata = SINGLE_METADATA
+
+    def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
+        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
+        self.batch = ReachVectorEnv(1, threads=threads, **kwargs)
+        """Vector environment with one environment."""
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+        self.render_mode = self.batch.render_mode
+        self.task = self.batch.task
+        self._over = True
+
+    @property
+    def last_rollout(self) -> Rollout | None:
+        """Last movement at every physics step; None before the first."""
+        rollouts = self.batch.last_rollout
+        return rollouts[0] if rollouts else None
+
+    @property
+    def last_plan(self) -> Plan | None:
+        """Last decision as via-points (K + 2, D) and durations (K + 1,) [s]; None before the first."""
+        plan = self.batch.last_plan
+        return None if plan is None else plan.take(0)
+
+    @property
+    def last_plans(self) -> History:
+        """All plans of the episode with the times at which they began, [s]."""
+        return self.batch.last_plans[0]
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo model."""
+        return self.batch.model
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps simulated so far."""
+        return self.batch.physics_steps
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a new episode; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.reset`."""
+        self.batch.use_generator(self._np_random, self._np_random_seed)
+        observation, info = self.batch.reset(seed=seed, options=options)
+        self._np_random, self._np_random_seed = self.batch.np_random, self.batch.np_random_seed
+        self._over = False
+        return {name: part[0] for name, part in observation.items()}, info
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Make one decision; see :meth:`~viapoint.envs.vector_env.ReachVectorEnv.step`.
+
+        Args:
+            action: Shape (m,), in [-1, 1]; components beyond are clipped.
+        """
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
+        decision = self.batch.execute_actions([action])
+        terminated, truncated = bool(decision.terminated[0]), bool(decision.truncated[0])
+        self._over = terminated or truncated
+        seen = {name: part[0] for name, part in decision.observation.items()}
+        values = {name: value[0].item() for name, value in decision.info.items()}
+        return seen, float(decision.reward[0]), terminated, truncated, values
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a pickle or a copy holds: the arguments, and the running episode."""
+        running = {
+            "batch": self.batch,
+            "_over": self._over,
+            "_np_random": self._np_random,
+            "_np_random_seed": self._np_random_seed,
+        }
+        return {**EzPickle.__getstate__(self), "running": running}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continue the running episode of a pickle or a copy."""
+        running = state.pop("running")
+        EzPickle.__setstate__(self, state)
+        self.__dict__.update(running)
+
+    def render(self) -> Any:
+        """Render the last movement in the render mode; after a reset, the scene."""
+        frames = self.batch.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Stop worker threads and close the render window."""
+        self.batch.close()

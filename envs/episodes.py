@@ -1,0 +1,452 @@
+"""Running episodes of n environments on one thread: decisions, their execution, metrics and rewards."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.arrays import norm, put, take
+from viapoint.envs.common.types import Bool, Float, Int, Observation
+from viapoint.envs.events import NEVER, Event
+from viapoint.envs.executor import Executor, Pieces, Segment
+from viapoint.envs.geometry.obstacles import KINDS
+from viapoint.envs.limits import slowdowns
+from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
+from viapoint.envs.plans import Motion, Plan, checked_plan
+from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
+from viapoint.envs.rewards import reward_terms
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.simulator import Simulator
+from viapoint.envs.task import Task
+
+LIMIT_INSTANTS = 64
+"""Instants at which the limits of a plan are checked."""
+PROLONGED, ENOUGH = 6, 1.0
+"""Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor."""
+
+History = list[tuple[float, Plan]]
+"""Plans of an episode with the times at which they began, [s]."""
+
+
+class Recorded(NamedTuple):
+    """One episode as it was recorded."""
+
+    scene: Scenes
+    """Scene, with one row."""
+    history: History
+    """Plans."""
+    rollout: Rollout
+    """States at every physics step."""
+
+
+class Decision(NamedTuple):
+    """Results of one decision in n environments."""
+
+    observation: Observation
+    reward: Float
+    terminated: Bool
+    truncated: Bool
+    info: dict[str, Any]
+
+
+class Episodes:
+    """Running episodes of n environments of a task.
+
+    Args:
+        task: Task.
+        number: Number of environments n.
+    """
+
+    def __init__(self, task: Task, number: int) -> None:
+        self.task = task
+        meshes = [name for name in task.shapes if name not in KINDS]
+        self.simulator = Simulator(
+            task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
+        )
+        self.executor = Executor(self.simulator, task.space, task.tolerance)
+        self.scenes: Scenes | None = None
+        """Scenes of the running episodes; None before the first start."""
+        self.history: list[History] = [[] for _ in range(number)]
+        """Plans of the running episodes."""
+        self._finished: dict[int, tuple[Scenes, History, Pieces]] = {}
+        """Episodes before the running ones, by row."""
+        self._events = task.events()
+        self._start = np.zeros((number, task.space.dimension))
+        self._zero_duration = np.ones(number)
+        points = task.n_via + 2
+        self.plan = Plan.at_rest(np.zeros((number, points, task.space.dimension)), np.ones((number, points - 1)))
+        """Plans under way."""
+        self.begun = np.zeros(number, bool)
+        """True where a plan is under way, shape (n,)."""
+        self._began = np.zeros(number, np.int64)
+        self._motion = Motion.at_rest(self._start)
+        self.last_plan: Plan | None = None
+        """Plans of the last decisions; None before the first, and where the arm is steered."""
+
+    @property
+    def time(self) -> Float:
+        """Time since the start of each episode, shape (n,), [s]."""
+        return np.asarray(self.executor.state.steps * self.simulator.timestep)
+
+    def start(self, rows: Int, scenes: Scenes, *, keep: bool = False) -> None:
+        """Start episodes with the arms at rest at the start and the obstacles in place.
+
+        Args:
+            rows: Indices of the environments, shape (n,).
+            scenes: Their scenes.
+            keep: True to keep the records of the episodes before.
+        """
+        self._keep_records(rows if keep else rows[:0])
+        if not keep and len(rows) == len(self.begun):
+            self.last_plan = None
+        if self.scenes is None:
+            self.scenes = scenes
+        else:
+            self.scenes = self.scenes.put(rows, scenes)
+        self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
+        space = self.task.space
+        start, goal = space.coordinates(scenes.start), space.coordinates(scenes.goal)
+        self._start[rows] = start
+        self._zero_duration[rows] = self.task.action.zero_duration(start, goal)
+        waiting = np.repeat(start[:, None], self.plan.waypoints.shape[1], axis=1)
+        put(self.plan, rows, Plan.at_rest(waiting, np.ones(waiting.shape[:2])[:, 1:]))
+        self.begun[rows] = False
+        self._began[rows] = 0
+        put(self._motion, rows, Motion.at_rest(start))
+        for row in rows:
+            self.history[row] = []
+
+    def goals(self, time: Float) -> Float:
+        """Return the goals at one time for each episode, in coordinates of the space, shape (n, D)."""
+        assert self.scenes is not None
+        return self.task.space.coordinates(self.scenes.goals(time))
+
+    @property
+    def nominal(self) -> NominalPlan:
+        """Plans that a zero action leads to, and the present references."""
+        since = (self.executor.state.steps - self._began) * self.simulator.timestep
+        goal = self.goals(self.time)
+        return nominal_plan(self.task.action, self.plan, np.asarray(since), self.begun, self._start, goal)
+
+    def observe(self) -> Observation:
+        """Return the present observations."""
+        assert self.scenes is not None
+        state, task, time = self.executor.state, self.task, self.time
+        goal = self.scenes.goals(time)
+        nominal = self.nominal if task.replanning else None
+        command = None
+        if task.stepwise:
+            command = self._motion
+        elif nominal is not None:
+            command = nominal.state
+        return task.observation.observe(
+            state.joints,
+            state.hand,
+            (goal, task.arm.hand(goal)),
+            self.scenes.obstacles_at(time),
+            command,
+            time,
+            nominal,
+        )
+
+    def decide(self, actions: Float, active: Bool | None = None) -> Decision:
+        """Make one decision in each environment and execute it until it ends.
+
+        Args:
+            actions: Shape (n, m), in [-1, 1].
+            active: True for environments that take part, shape (n,); by default all. Results of others mean nothing.
+        """
+        active = np.ones(len(actions), bool) if active is None else active
+        if self.task.stepwise:
+            return self._steer(actions, active)
+        if self.task.whole_movement:
+            plan = self.task.action.decode(actions, self._start, self.goals(self.time))
+            return self._follow(plan, active, active)
+        plan, kept = revise(self.task.action, self.nominal, self.plan, actions)
+        return self._follow(plan, ~kept & active, active)
+
+    def execute(self, plan: Plan) -> Decision:
+        """Replace every plan by another one, which begins at the present reference.
+
+        Raises:
+            ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
+            TypeError: The task has no plans.
+        """
+        if self.task.stepwise:
+            raise TypeError("here an action steers the arm for one control step; plans need another decide_at")
+        everyone = np.ones(len(self.begun), bool)
+        if self.task.whole_movement:
+            return self._follow(checked_plan(plan, self._start), everyone, everyone)
+        state = self.nominal.state
+        plan = checked_plan(plan, state.position)
+        if plan.waypoints.shape != self.plan.waypoints.shape:
+            raise ValueError(
+                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {plan.waypoints.shape}"
+            )
+        waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
+        moving = Plan(waypoints, plan.durations, state.velocity, state.acceleration)
+        return self._follow(moving, everyone, everyone)
+
+    def move_goals(self, joints: Float) -> None:
+        """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
+        assert self.scenes is not None
+        self.scenes.goal[:] = joints
+        self.scenes.jumps[:] = 0.0
+
+    def recorded(self, row: int) -> Recorded:
+        """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
+        assert self.scenes is not None
+        if not self.executor.state.steps[row] and row in self._finished:
+            scene, history, pieces = self._finished[row]
+        else:
+            scene, history, pieces = self.scenes.take([row]), self.history[row], self.executor.past[row]
+        return Recorded(scene, history, self.executor.rollout(pieces, scene))
+
+    def _keep_records(self, rows: Int) -> None:
+        """Keep the records of some episodes that are over, and forget all others."""
+        self._finished = {}
+        if not len(rows):
+            return
+        assert self.scenes is not None
+        scenes = self.scenes.take(rows)
+        for i, row in enumerate(rows):
+            self._finished[int(row)] = scenes.take([i]), self.history[row], self.executor.past[row]
+
+    # Decisions that are plans
+
+    def _follow(self, plan: Plan, revised: Bool, active: Bool) -> Decision:
+        """Follow plans, new ones where they were revised, until the decisions end."""
+        assert self.scenes is not None
+        state, scenes = self.executor.state, self.scenes
+        first = ~self.begun
+        before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
+        self._adopt(plan, np.flatnonzero(revised))
+        ends = self._events(self.plan, self._began, begin, scenes, self.goals)
+        last = np.where(state.reachable & active, ends.step, begin)
+        self._run_until(last)
+        event = np.where(state.collision, Event.CONTACT, ends.event)
+        event = np.where(state.reachable, event, Event.REACH)
+        event = np.where(state.unstable, Event.UNSTABLE, event)
+        final = ends.final & (event == Event.ARRIVAL)
+        return self._decision(before, begin, first, final, event)
+
+    def _adopt(self, plan: Plan, rows: Int) -> None:
+        """Begin new plans in some episodes, as slow as the arm's limits need them.
+
+        A plan that begins in motion cannot be slowed down as it is. It is prolonged, which changes its path; where that
+        is not enough the plan under way stays, which keeps the limits.
+        """
+        if not rows.size:
+            return
+        state = self.executor.state
+        plan = plan.take(rows)
+        plan, stretch, within = self._within_limits(plan)
+        inside = self._inside(plan)
+        state.reachable[rows] &= inside
+        adopted = within | ~self.begun[rows]
+        rows, plan = rows[adopted], plan.take(adopted)
+        state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
+        if self.task.whole_movement:  # with any number of via-points
+            self.plan = plan
+        else:
+            put(self.plan, rows, plan)
+        self.last_plan = Plan(*(part.copy() for part in self.plan))
+        self._began[rows] = state.steps[rows]
+        self.begun[rows] = True
+        for i, row in enumerate(rows):
+            self.history[row].append((float(self.time[row]), plan.take([i])))
+
+    def _within_limits(self, plan: Plan) -> tuple[Plan, Float, Bool]:
+        """Return plans that are slow enough, how much slower they are, and True where they keep the limits."""
+        needed = self._slowdown(plan)
+        stretch = np.maximum(needed, 1.0)
+        slower = plan._replace(durations=plan.durations * stretch[:, None])
+        moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
+        rows = np.flatnonzero(moving & (needed > ENOUGH))
+        for _ in range(PROLONGED):
+            if not rows.size:
+                break
+            state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
+            put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
+            again = self._slowdown(slower.take(rows))
+            rows, again = rows[again > ENOUGH], again[again > ENOUGH]
+            stretch[rows] *= again
+            slower.durations[rows] *= again[:, None]
+        within = np.ones(len(stretch), bool)
+        within[rows] = False
+        return slower, stretch, within
+
+    def _slowdown(self, plan: Plan) -> Float:
+        """Return the factors by which plans must be slower to keep the arm's limits, shape (n,)."""
+        arm = self.task.arm
+        share = np.linspace(0.0, 1.0, LIMIT_INSTANTS + 1)
+        motion = Motion(*plan.trajectory().sample(plan.duration[:, None] * share))
+        joints = self.task.space.joint_motion(motion)
+        return np.asarray(slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *joints))
+
+    def _inside(self, plan: Plan) -> Bool:
+        """Return True for plans that stay within reach and joint ranges, shape (n,)."""
+        share = np.linspace(0.0, 1.0, 2 * LIMIT_INSTANTS + 1)
+        places = plan.trajectory()(plan.duration[:, None] * share)
+        return np.asarray(self.task.space.inside(places).all(axis=-1))
+
+    def _run_until(self, last: Int) -> None:
+        """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
+        assert self.scenes is not None
+        state, timestep = self.executor.state, self.simulator.timestep
+        turns = self._events.steps(self.scenes.turn_time)
+        while True:
+            rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
+            if not rows.size:
+                return
+            now = state.steps[rows]
+            turn = np.where(turns[rows] > now[:, None], turns[rows], NEVER).min(axis=1, initial=NEVER)
+            steps = np.minimum(last[rows], turn) - now
+            time = now * timestep
+            scenes = self.scenes.take(rows)
+            goal = self.task.space.coordinates(scenes.goals((now + steps) * timestep))
+            segment = Segment(rows, steps, scenes.obstacles_at(time), goal)
+            begin, whole = state.steps.copy(), self.task.whole_movement
+            self.executor.run(
+                segment, self._references, resume=not whole, moving=self.task.moving_obstacles
+            )
+            since = (begin - self._began)[rows]
+            done = since + (state.steps - begin)[rows]
+            plan = self.plan.take(rows)
+            state.jerk_cost[rows] += jerk_cost_between(plan, since * timestep, done * timestep)
+
+    def _references(self, rows: Int, number: int) -> Motion:
+        """Return references of plans from now on, shape (n, T + 1, D) each."""
+        since = (self.executor.state.steps - self._began)[rows]
+        times = self.simulator.timestep * (since[:, None] + np.arange(number + 1))
+        return Motion(*self.plan.take(rows).trajectory().sample(times))
+
+    # Decisions of one control step
+
+    def _steer(self, wanted: Float, active: Bool) -> Decision:
+        """Follow velocities for one control step; where the references leave the reach, the arm stays."""
+        assert self.scenes is not None
+        task, state = self.task, self.executor.state
+        steering, first = task.steering, state.steps == 0
+        before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
+        velocity = steering.decode(wanted, self._start, self.goals(self.time))
+        number = steering.physics_steps
+        ahead = steering.follow(self._motion, velocity, number)
+        state.reachable[:] = task.space.inside(ahead.position).all(axis=-1)
+        rows = np.flatnonzero(state.reachable & active)
+        if rows.size:
+            motion = take(self._motion, rows)
+
+            def references(some: Int, count: int) -> Motion:
+                return steering.follow(take(self._motion, some), velocity[some], count)
+
+            scenes = self.scenes.take(rows)
+            goal = task.space.coordinates(scenes.goal)
+            steps = np.full(len(rows), number)
+            segment = Segment(rows, steps, scenes.obstacles_at(self.time[rows]), goal)
+            self.executor.run(segment, references, resume=True, moving=task.moving_obstacles)
+            state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
+            put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
+        self.begun[:] = True
+        settled = state.rest * self.simulator.timestep >= SETTLING - 1e-9
+        event = np.full(len(first), int(Event.HORIZON))
+        event = np.where(settled, Event.ARRIVAL, event)
+        event = np.where(state.steps >= self._events.limit, Event.TIME_LIMIT, event)
+        event = np.where(state.collision, Event.CONTACT, event)
+        event = np.where(state.reachable, event, Event.REACH)
+        event = np.where(state.unstable, Event.UNSTABLE, event)
+        return self._decision(before, begin, first, settled, event)
+
+    # Outcomes
+
+    def _decision(self, before: Outcome, begin: Int, first: Bool, final: Bool, event: Int) -> Decision:
+        """Return the results of a decision that ended with an event."""
+        assert self.scenes is not None
+        state, task, timestep = self.executor.state, self.task, self.simulator.timestep
+        after = self._outcome(final)
+        ended = final | (event >= Event.CONTACT)
+        truncated = (event == Event.TIME_LIMIT) & ~final if task.stepwise else np.zeros(len(event), bool)
+        length = norm(task.space.coordinates(self.scenes.goal) - self._start)
+        terms = reward_terms(
+            before, after, first, ended, length, self._zero_duration, task.tolerance.unit, task.weights
+        )
+        elapsed = np.asarray((state.steps - begin) * timestep)
+        times = {"elapsed": elapsed, "time": self.time, "event": event}
+        info = {**after._asdict(), **terms.as_info(), **times}
+        return Decision(self.observe(), terms.total(), ended & ~truncated, truncated, info)
+
+    def _outcome(self, final: Bool) -> Outcome:
+        """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
+        assert self.scenes is not None
+        state, task, timestep = self.executor.state, self.task, self.simulator.timestep
+        bounds, time = task.tolerance, self.time
+        goal = self.goals(time)
+        here = state.hand[:, :2] if task.space.of_hand else state.joints
+        error = norm(here - goal) if task.space.of_hand else np.abs(here - goal).max(axis=-1)
+        arrived = final & (error < bounds.goal) & (state.last_speed < bounds.speed)
+        if task.stepwise:
+            duration = time - np.where(final, state.rest * timestep, 0.0)
+        else:
+            ends = self._began * timestep + self.plan.duration
+            duration = np.where(self.begun, np.minimum(time, ends), 0.0)
+        cost = straight_jerk_cost(self._straight_length(time), np.maximum(duration, timestep))
+        return state.outcome(arrived & state.sound, error, duration, cost, timestep)
+
+    def _straight_length(self, time: Float) -> Float:
+        """Return the length of the straight lines from target to target until a time for each episode, shape (n,)."""
+        assert self.scenes is not None
+        before = self.task.space.coordinates(self.scenes.goal)
+        length = norm(before - self._start)
+        jumps, times = self.scenes.jumps, self.scenes.jump_times
+        for k in range(jumps.shape[1] if self.task.n_jumps[1] else 0):
+            jumped = times[:, k] <= time + 1e-9
+            target = self.task.space.coordinates(jumps[:, k, 1:])
+            length = length + np.where(jumped, norm(target - before), 0.0)
+            before = np.where(jumped[:, None], target, before)
+        return length
+
+    # Copies
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
+        assert self.scenes is not None
+        return {
+            "scenes": copy.deepcopy(self.scenes),
+            "metrics": {name: part.copy() for name, part in self.executor.state._asdict().items()},
+            "plan": {name: part.copy() for name, part in self.plan._asdict().items()},
+            "motion": {name: part.copy() for name, part in self._motion._asdict().items()},
+            "began": self._began.copy(),
+            "begun": self.begun.copy(),
+            "physics": self.simulator.batch.state.copy(),
+            "physics_steps": self.simulator.physics_steps,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of environments of the same task and number."""
+        self.start(np.arange(len(self.begun)), copy.deepcopy(state["scenes"]))
+        put(self.executor.state, slice(None), type(self.executor.state)(**state["metrics"]))
+        self.plan = Plan(**{name: np.array(part) for name, part in state["plan"].items()})
+        put(self._motion, slice(None), Motion(**state["motion"]))
+        self._began[:], self.begun[:] = state["began"], state["begun"]
+        self.simulator.batch.state[:] = state["physics"]
+        self.simulator.physics_steps = int(state["physics_steps"])
+
+
+def jerk_cost_between(plan: Plan, begin: Float, end: Float) -> Float:
+    """Return half the integral of the squared jerk between two times, shape (n,).
+
+    On each segment the jerk is a parabola of time, so its square has degree four: three Gauss-Legendre nodes are exact.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    knots = np.concatenate((np.zeros_like(begin)[:, None], np.cumsum(plan.durations, axis=-1)), axis=-1)
+    low = np.clip(begin[:, None], knots[:, :-1], knots[:, 1:])
+    half = 0.5 * (np.clip(end[:, None], knots[:, :-1], knots[:, 1:]) - low)
+    times = low[..., None] + half[..., None] * (1.0 + nodes)
+    jerk = plan.trajectory()(times.reshape(len(times), -1), 3)
+    square = (jerk * jerk).sum(axis=-1).reshape(times.shape)
+    each = (square * weights * half[..., None]).reshape(len(times), -1)
+    # Added one after the other, so that the sum does not depend on the number of terms.
+    return 0.5 * np.cumsum(each, axis=-1)[:, -1]

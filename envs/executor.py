@@ -1,0 +1,335 @@
+"""Execution of references: controls, physics, and the metrics of what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import tool_position
+from viapoint.envs.geometry.clearance import (
+    Placed,
+    configuration_clearances,
+    memory,
+    movement_clearance,
+    obstacle_clearance,
+    place,
+    travel,
+)
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, MESH, Obstacles
+from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
+from viapoint.envs.plans import Motion
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.simulator import SimulationLog, Simulator
+from viapoint.envs.spaces import Space
+
+BLOCK = 32
+"""Movements that are executed together: few enough for the processor's cache, and of similar length."""
+CONTROL_STRIDE = 4
+"""Physics steps between two computed torques; those in between are interpolated linearly."""
+
+References = Callable[[Int, int], Motion]
+"""Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each."""
+
+Pieces = list[tuple[Float, Float, Bool]]
+"""Joint positions [rad] and references after each step, and contacts before it, in pieces of an episode."""
+
+
+class Segment(NamedTuple):
+    """Task of the executor: n episodes that go on for a number of steps each."""
+
+    rows: Int
+    """Episodes in increasing order, shape (n,)."""
+    steps: Int
+    """Physics steps of each, 1 or more, shape (n,)."""
+    obstacles: Obstacles
+    """Obstacles of these episodes, at their present places and with the velocities that they keep."""
+    goal: Float
+    """Goals in coordinates of the space, shape (n, D)."""
+
+
+class Executor:
+    """Executor of references in the simulations of one thread.
+
+    Args:
+        simulator: Simulations.
+        space: Space in which references are given.
+        tolerance: Bounds of rest at the goal.
+    """
+
+    def __init__(self, simulator: Simulator, space: Space, tolerance: Tolerance) -> None:
+        self.simulator, self.space, self.tolerance = simulator, space, tolerance
+        arm = simulator.arm
+        number, joints = len(simulator.batch.state), len(arm.joint_names)
+        self.state = EpisodeState.empty(number, joints)
+        """Metrics of the running episodes."""
+        self.past: list[Pieces] = [[] for _ in range(number)]
+        """Records of the running episodes."""
+        self._placed = memory(arm.chain, arm.spheres)
+
+    def begin(self, rows: Int, joints: Float, obstacles: Obstacles) -> None:
+        """Start episodes at rest at joint positions, shape (n, J), among the obstacles of n scenes."""
+        arm = self.simulator.arm
+        self.simulator.place(rows, joints, obstacles)
+        first = np.empty((len(rows), 2))
+        for i in range(len(rows)):
+            first[i] = movement_clearance(
+                arm.chain, arm.spheres, arm.reach, joints[i : i + 1], obstacles, i, 0.0, 0.0, self._placed
+            )
+        self.state.begin(rows, joints, arm.hand(joints), first[:, 0], first[:, 1])
+        for row in rows:
+            self.past[row] = []
+
+    def run(self, segment: Segment, references: References, *, resume: bool, moving: bool) -> None:
+        """Execute a segment and add it to the metrics; an episode stops at its first contact.
+
+        Args:
+            segment: Episodes, and for how long they go on.
+            references: Function that returns the references.
+            resume: True if the episodes may go on afterwards.
+            moving: True if obstacles move.
+        """
+        order = np.argsort(segment.steps, kind="stable")
+        for first in range(0, len(order), BLOCK):
+            some = np.sort(order[first : first + BLOCK])
+            block = Segment(
+                segment.rows[some], segment.steps[some], segment.obstacles.take(some), segment.goal[some]
+            )
+            self._run_block(block, references, resume, moving)
+
+    def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
+        """Return an episode that was recorded in pieces, in its scene."""
+        arm = self.simulator.arm
+        if pieces:
+            joints, planned, contact = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+        else:  # at rest at the start
+            joints = scene.start.copy()
+            planned, contact = self.space.coordinates(joints), np.zeros(1, bool)
+        time = self.simulator.timestep * np.arange(1, len(joints) + 1)
+        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+        clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
+        return Rollout(time, planned, joints, arm.hand(joints), contact, clearance[:, 0])
+
+    def _run_block(self, block: Segment, references: References, resume: bool, moving: bool) -> None:
+        """Execute one block."""
+        arm, timestep = self.simulator.arm, self.simulator.timestep
+        number = int(block.steps.max())
+        # A few steps more than needed, so that no control depends on the longest movement of the block.
+        motion = references(block.rows, number + CONTROL_STRIDE)
+        path, rates, accelerations = self.space.joint_motion(motion)
+        controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]
+        centres = None
+        if moving:
+            time = timestep * np.arange(number)[:, None, None]
+            centres = block.obstacles.centre[:, None] + time * block.obstacles.velocity[:, None]
+        log = self.simulator.rollout(block.rows, controls, block.steps, centres, resume=resume)
+        self._look_between(block, log)
+        for i, row in enumerate(block.rows):
+            steps = _measure(
+                arm.chain,
+                arm.spheres,
+                arm.reach,
+                arm.joint_range,
+                self.space.of_hand,
+                log.joints[i],
+                log.contact[i],
+                motion.position[i],
+                path[i],
+                int(block.steps[i]),
+                block.obstacles,
+                i,
+                timestep,
+                block.goal[i],
+                self.tolerance.goal,
+                self.tolerance.speed,
+                self.state,
+                int(row),
+                self._placed,
+            )
+            piece = log.joints[i, :steps], motion.position[i, 1 : steps + 1], log.contact[i, :steps]
+            self.past[row].append((piece[0].copy(), piece[1].copy(), piece[2].copy()))
+        self.state.unstable[block.rows] |= log.unstable
+
+    def _look_between(self, block: Segment, log: SimulationLog) -> None:
+        """Mark contacts between physics steps, which bodies have that are thin compared with their way in a step."""
+        arm, timestep = self.simulator.arm, self.simulator.timestep
+        for i, row in enumerate(block.rows):
+            thin = self.simulator.thinnest + _thinnest(block.obstacles, i)
+            steps = int(block.steps[i])
+            for k in _risky_steps(
+                arm.chain,
+                arm.spheres,
+                arm.reach,
+                log.joints[i, :steps],
+                log.contact[i, :steps],
+                block.obstacles,
+                i,
+                timestep,
+                0.5 * thin,
+                self._placed,
+            ):
+                ends = log.joints[i, k], log.joints[i, k + 1]
+                places = [
+                    block.obstacles.centre[i] + timestep * (k + 1 + later) * block.obstacles.velocity[i]
+                    for later in (0, 1)
+                ]
+                way = travel(arm.reach, *ends) + np.abs(places[1] - places[0]).max(initial=0.0)
+                if self.simulator.touches_between(int(row), ends, (places[0], places[1]), int(2.0 * way / thin)):
+                    log.contact[i, k + 1] = True
+                    break
+
+
+@compiled
+def _thinnest(obstacles: Obstacles, scene: int) -> float:
+    """Return half the thickness of the thinnest obstacle of a scene, [m]; that of a mesh is not known and counts 0."""
+    thin = 1.0
+    for row in range(obstacles.kind.shape[1]):
+        kind = obstacles.kind[scene, row]
+        if kind in (ABSENT, HALF_SPACE):
+            continue
+        half = obstacles.size[scene, row, 0]
+        if kind in (BOX, CYLINDER):
+            half = min(half, obstacles.size[scene, row, 1])
+        if kind == BOX:
+            half = min(half, obstacles.size[scene, row, 2])
+        thin = min(thin, half if kind < MESH else 0.0)
+    return thin
+
+
+@compiled
+def _risky_steps(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    path: Float,
+    contact: Bool,
+    obstacles: Obstacles,
+    scene: int,
+    timestep: float,
+    longest: float,
+    placed: Placed,
+) -> list[int]:
+    """Return steps in which the arm may have passed through something thin.
+
+    These are steps longer than `longest` [m] from a state without contact to another, with a clearance at the first
+    state that is less than the way.
+    """
+    found = [0 for _ in range(0)]
+    if obstacles.kind.shape[1] == 0:
+        return found
+    fast = 0.0
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] != ABSENT:
+            speed = np.abs(obstacles.velocity[scene, row]).sum()
+            fast = max(fast, speed)
+    for k in range(len(path) - 1):
+        way = travel(reach, path[k], path[k + 1]) + fast * timestep
+        if way <= longest or contact[k] or contact[k + 1]:
+            continue
+        place(chain, spheres, path[k], placed)
+        time = timestep * (k + 1)
+        if obstacle_clearance(spheres, placed, obstacles, scene, time, way, 0.0) < way:
+            found.append(k)
+    return found
+
+
+@compiled
+def _measure(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    joint_range: Float,
+    of_hand: bool,
+    joints: Float,
+    contact: Bool,
+    planned: Float,
+    path: Float,
+    steps: int,
+    obstacles: Obstacles,
+    scene: int,
+    timestep: float,
+    goal: Float,
+    goal_tolerance: float,
+    rest_speed: float,
+    state: EpisodeState,
+    row: int,
+    placed: Placed,
+) -> int:
+    """Add one executed segment to the metrics of an episode, and return how many of its steps count.
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        reach: Reach of the joints.
+        joint_range: Ranges of the joints, shape (J, 2), [rad].
+        of_hand: True if references are of the hand, False if they are of the joints.
+        joints: Joint positions after each step, shape (T, J), [rad].
+        contact: True where there is a contact at the state before a step, shape (T,).
+        planned: References before the first step and after each, shape (T + 1 or more, D).
+        path: Joint positions that belong to them, shape (T + 1 or more, J), [rad].
+        steps: Number of steps.
+        obstacles: Obstacles of the block.
+        scene: Index of the scene in the block.
+        timestep: Length of a step, [s].
+        goal: Goal, shape (D,).
+        goal_tolerance: Greatest distance from the goal at rest.
+        rest_speed: Greatest speed at rest.
+        state: Metrics, which are changed.
+        row: Index of the episode.
+        placed: Memory.
+    """
+    begin = state.steps[row]
+    for k in range(steps):
+        if contact[k]:
+            # The state before this step is the last one that counts.
+            if state.first_contact[row] < 0:
+                state.first_contact[row] = begin + k
+            steps = k + 1
+            break
+    dimension = len(goal)
+    hand = state.hand[row].copy()
+    before = state.joints[row].copy()
+    speed = 0.0
+    for k in range(steps):
+        now = tool_position(chain, joints[k], placed.rotation, placed.origin)
+        moved = 0.0
+        for axis in range(3):
+            moved += (now[axis] - hand[axis]) ** 2
+            hand[axis] = now[axis]
+        moved = np.sqrt(moved)
+        state.path_length[row] += moved
+        state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
+        away, error, fastest = 0.0, 0.0, 0.0
+        for d in range(dimension):
+            here = now[d] if of_hand else joints[k, d]
+            away += (here - planned[k + 1, d]) ** 2
+            error = error + (here - goal[d]) ** 2 if of_hand else max(error, abs(here - goal[d]))
+        for j in range(joints.shape[1]):
+            fastest = max(fastest, abs(joints[k, j] - before[j]) / timestep)
+            before[j] = joints[k, j]
+            low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
+            if joints[k, j] < low or joints[k, j] > high:
+                state.within[row] = False
+        state.deviation[row] += away
+        error = np.sqrt(error) if of_hand else error
+        speed = moved / timestep if of_hand else fastest
+        resting = speed < rest_speed and error < goal_tolerance
+        state.rest[row] = state.rest[row] + 1 if resting else 0
+    state.last_speed[row] = speed
+    state.hand[row] = hand
+    state.joints[row] = before
+    state.steps[row] = begin + steps
+    done = movement_clearance(
+        chain, spheres, reach, joints[:steps], obstacles, scene, timestep, timestep, placed
+    )
+    state.min_clearance[row] = min(state.min_clearance[row], done[0])
+    state.self_clearance[row] = min(state.self_clearance[row], done[1])
+    command = movement_clearance(
+        chain, spheres, reach, path[: steps + 1], obstacles, scene, 0.0, timestep, placed
+    )
+    state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
+    return steps

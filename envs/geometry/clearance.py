@@ -1,0 +1,287 @@
+"""Clearance of configurations and movements: least signed distances of an arm from obstacles and from itself.
+
+The arm is a set of spheres, see :class:`~viapoint.envs.arms.chain.Spheres`. Its clearance from an obstacle is the
+least signed distance of a sphere's centre, minus the radius of the sphere. Broad phase: a bounding ball of each group
+of spheres comes first, and the spheres of a group are only placed where its ball is near enough to matter.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import link_frames
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import point_distance
+from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
+
+FAR = 1.0
+"""Greatest clearance that is reported, [m]; farther obstacles do not matter."""
+WINDOW = 0.06
+"""Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]."""
+
+
+class Placed(NamedTuple):
+    """World places of an arm's parts in one configuration; memory that compiled functions use again and again."""
+
+    rotation: Float
+    """Axes of the links' frames, shape (J + 1, 3, 3)."""
+    origin: Float
+    """Origins of the links' frames, shape (J + 1, 3), [m]."""
+    ball: Float
+    """Centres of the groups' bounding balls, shape (G, 3), [m]."""
+    centre: Float
+    """Centres of the spheres of known groups, shape (S, 3), [m]."""
+    known: Bool
+    """True for groups whose spheres are placed, shape (G,)."""
+
+
+@compiled
+def memory(chain: Chain, spheres: Spheres) -> Placed:
+    """Return memory for the places of an arm."""
+    joints = len(chain.mass)
+    groups = len(spheres.link)
+    return Placed(
+        np.empty((joints + 1, 3, 3)),
+        np.empty((joints + 1, 3)),
+        np.empty((groups, 3)),
+        np.empty((len(spheres.radius), 3)),
+        np.empty(groups, np.bool_),
+    )
+
+
+@kernel
+def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None:
+    """Place links and bounding balls for joint positions of shape (J,)."""
+    link_frames(chain, joints, placed.rotation, placed.origin)
+    for group in range(len(spheres.link)):
+        link = spheres.link[group]
+        for axis in range(3):
+            placed.ball[group, axis] = (
+                placed.origin[link, axis]
+                + placed.rotation[link, axis, 0] * spheres.ball_centre[group, 0]
+                + placed.rotation[link, axis, 1] * spheres.ball_centre[group, 1]
+                + placed.rotation[link, axis, 2] * spheres.ball_centre[group, 2]
+            )
+        placed.known[group] = False
+
+
+@inlined
+def place_group(spheres: Spheres, group: int, placed: Placed) -> None:
+    """Place the spheres of a group, if they are not known yet."""
+    if not placed.known[group]:
+        placed.known[group] = True
+        link = spheres.link[group]
+        for sphere in range(spheres.first[group], spheres.first[group + 1]):
+            for axis in range(3):
+                placed.centre[sphere, axis] = (
+                    placed.origin[link, axis]
+                    + placed.rotation[link, axis, 0] * spheres.centre[sphere, 0]
+                    + placed.rotation[link, axis, 1] * spheres.centre[sphere, 1]
+                    + placed.rotation[link, axis, 2] * spheres.centre[sphere, 2]
+                )
+
+
+@kernel
+def obstacle_clearance(
+    spheres: Spheres,
+    placed: Placed,
+    obstacles: Obstacles,
+    scene: int,
+    time: float,
+    least: float,
+    floor: float,
+) -> float:
+    """Return the clearance of a placed arm from the obstacles of a scene, at most `least`, [m].
+
+    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`.
+
+    Args:
+        spheres: Spheres of the arm.
+        placed: Places of links and bounding balls, see :func:`place`.
+        obstacles: Obstacles of N scenes.
+        scene: Index of the scene.
+        time: Time at which the obstacles are looked at, [s].
+        least: Greatest clearance of interest, [m].
+        floor: Clearance below which the exact value does not matter, [m].
+    """
+    for group in range(len(spheres.link)):
+        if spheres.link[group] == 0:
+            continue
+        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        size = spheres.ball_radius[group]
+        for row in range(obstacles.kind.shape[1]):
+            if obstacles.kind[scene, row] == ABSENT:
+                continue
+            if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
+                continue
+            place_group(spheres, group, placed)
+            for sphere in range(spheres.first[group], spheres.first[group + 1]):
+                radius = spheres.radius[sphere]
+                u, v, w = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+                distance = point_distance(obstacles, scene, row, u, v, w, time, least + radius)
+                if distance - radius < least:
+                    least = distance - radius
+                    if least < floor:
+                        return least
+    return least
+
+
+@kernel
+def self_clearance(spheres: Spheres, placed: Placed, least: float, floor: float) -> float:
+    """Return the clearance of a placed arm from itself, at most `least`, [m]; see :func:`obstacle_clearance`."""
+    for pair in range(len(spheres.pairs)):
+        first, second = spheres.pairs[pair, 0], spheres.pairs[pair, 1]
+        apart = _apart(placed.ball, first, placed.ball, second)
+        if apart - spheres.ball_radius[first] - spheres.ball_radius[second] >= least:
+            continue
+        place_group(spheres, first, placed)
+        place_group(spheres, second, placed)
+        for one in range(spheres.first[first], spheres.first[first + 1]):
+            # The ball of the second group excludes most spheres of the first.
+            away = _apart(placed.centre, one, placed.ball, second)
+            if away - spheres.radius[one] - spheres.ball_radius[second] >= least:
+                continue
+            for other in range(spheres.first[second], spheres.first[second + 1]):
+                distance = _apart(placed.centre, one, placed.centre, other)
+                distance -= spheres.radius[one] + spheres.radius[other]
+                if distance < least:
+                    least = distance
+                    if least < floor:
+                        return least
+    return least
+
+
+@inlined
+def _apart(first: Float, i: int, second: Float, j: int) -> float:
+    """Return the distance of two points of tables, [m]."""
+    x = first[i, 0] - second[j, 0]
+    y = first[i, 1] - second[j, 1]
+    z = first[i, 2] - second[j, 2]
+    return float(np.sqrt(x * x + y * y + z * z))
+
+
+@kernel
+def travel(reach: Float, first: Float, second: Float) -> float:
+    """Return a bound of the way of any sphere between two configurations of shape (J,), [m].
+
+    Args:
+        reach: Greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, shape (J,).
+        first: Joint positions.
+        second: Joint positions a short time later.
+    """
+    total = 0.0
+    for joint in range(len(reach)):
+        total += reach[joint] * abs(second[joint] - first[joint])
+    return total
+
+
+@kernel
+def fastest(obstacles: Obstacles, scene: int) -> float:
+    """Return the greatest speed of an obstacle of a scene, [m/s]."""
+    square = 0.0
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] != ABSENT:
+            x, y, z = obstacles.velocity[scene, row]
+            square = max(square, x * x + y * y + z * z)
+    return float(np.sqrt(square))
+
+
+@kernel
+def movement_clearance(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    path: Float,
+    obstacles: Obstacles,
+    scene: int,
+    begin: float,
+    step: float,
+    placed: Placed,
+) -> tuple[float, float]:
+    """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
+
+    The values are exact, but most configurations are skipped: after a clearance c, no later one is below the least so
+    far before the spheres and the obstacles have moved by the difference.
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        reach: Reach of the joints, see :func:`travel`.
+        path: Configurations, shape (T, J).
+        obstacles: Obstacles of N scenes.
+        scene: Index of the scene.
+        begin: Time of the first configuration, [s].
+        step: Time between two configurations, [s].
+        placed: Memory of :func:`memory`.
+    """
+    least, least_self = FAR, FAR
+    drift = step * fastest(obstacles, scene)
+    spare, spare_self = -1.0, -1.0
+    for k in range(len(path)):
+        if k:
+            way = travel(reach, path[k - 1], path[k])
+            spare -= way + drift
+            spare_self -= 2.0 * way
+        if spare > 0.0 and spare_self > 0.0:
+            continue
+        place(chain, spheres, path[k], placed)
+        if spare <= 0.0:
+            window = min(least + WINDOW, FAR)
+            clearance = obstacle_clearance(spheres, placed, obstacles, scene, begin + k * step, window, -FAR)
+            least = min(least, clearance)
+            spare = clearance - least
+        if spare_self <= 0.0:
+            clearance = self_clearance(spheres, placed, min(least_self + WINDOW, FAR), -FAR)
+            least_self = min(least_self, clearance)
+            spare_self = clearance - least_self
+    return least, least_self
+
+
+@compiled
+def configuration_clearances(
+    chain: Chain, spheres: Spheres, configurations: Float, obstacles: Obstacles, times: Float
+) -> Float:
+    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m].
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        configurations: Joint positions, shape (N, J).
+        obstacles: Obstacles of N scenes.
+        times: Times at which the obstacles are looked at, shape (N,), [s].
+    """
+    placed = memory(chain, spheres)
+    found = np.empty((len(configurations), 2))
+    for scene in range(len(configurations)):
+        place(chain, spheres, configurations[scene], placed)
+        found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
+        found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
+    return found
+
+
+@compiled
+def clearance_profile(
+    chain: Chain, spheres: Spheres, path: Float, obstacles: Obstacles, scene: int, step: float, most: float
+) -> Float:
+    """Return the clearance from obstacles at each of T configurations of a movement, shape (T,), at most `most`, [m].
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        path: Configurations, shape (T, J); the first is looked at with the obstacles as they are.
+        obstacles: Obstacles of N scenes.
+        scene: Index of the scene.
+        step: Time between two configurations, [s].
+        most: Greatest clearance of interest, [m].
+    """
+    placed = memory(chain, spheres)
+    found = np.empty(len(path))
+    for k in range(len(path)):
+        place(chain, spheres, path[k], placed)
+        found[k] = obstacle_clearance(spheres, placed, obstacles, scene, k * step, most, -FAR)
+    return found

@@ -1,1 +1,0 @@
-"""Observations, rewards and task definitions."""

@@ -1,0 +1,151 @@
+"""Observations of all tasks."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.geometry.obstacles import Obstacles, observation_rows
+from viapoint.envs.plans import Motion
+from viapoint.envs.replanning import NominalPlan
+
+FARTHEST = 2.0
+"""Bound of every coordinate and length, [m]."""
+FASTEST = 1.0
+"""Bound of the velocity of an obstacle along any axis, [m/s]."""
+BEYOND_LIMIT = 0.1
+"""Margin beyond the joint limits at which observed joints are clipped, [rad]."""
+POSE_SIZE = 16
+"""Numbers of an obstacle's row besides its kind: centre 3, axes 6, half lengths 3, velocity 3, present 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationLayout:
+    """Names, sizes, bounds and units of the observation's parts.
+
+    `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where there may be obstacles, `obstacles`:
+    n rows (kind one-hot, centre [m], first two axes of the frame, half lengths of the bounding box [m], velocity [m/s],
+    present), flattened. While a movement is under way also the reference that the arm follows, `command`, `velocity`
+    and `acceleration`, and `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero
+    action. What exceeds its bounds is clipped.
+    """
+
+    joint_range: tuple[tuple[float, float], ...]
+    kinds: tuple[str, ...]
+    """Kinds that obstacles may have."""
+    n_rows: int
+    """Greatest number of obstacles."""
+    dimension: int
+    """Dimension D of the space of the movements."""
+    in_joints: bool
+    """True if movements are planned in joint space."""
+    n_via: int | None = None
+    """Number of via-points that are observed; None where plans are not revised."""
+    speed: float = 0.0
+    """Bound of the command's velocity; 0 where it is not observed."""
+    acceleration: float = 0.0
+    """Bound of the command's acceleration."""
+    time_limit: float = 0.0
+    """Time limit of an episode, [s]."""
+
+    @property
+    def row_size(self) -> int:
+        """Number of values of one obstacle."""
+        return len(self.kinds) + POSE_SIZE
+
+    @functools.cached_property
+    def bounds(self) -> dict[str, tuple[Float, Float]]:
+        """Lower and upper bounds of the parts."""
+        low, high = np.array(self.joint_range).T
+        joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT
+        found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
+        if self.in_joints:
+            found["goal_joints"] = joints
+        if self.n_rows:
+            kinds, pose = np.zeros(len(self.kinds)), [FARTHEST] * 3 + [1.0] * 6
+            sizes = [FARTHEST] * 3
+            lowest = np.concatenate((kinds, -np.array(pose), np.zeros(3), [-FASTEST] * 3, [0.0]))
+            highest = np.concatenate((kinds + 1.0, pose, sizes, [FASTEST] * 3, [1.0]))
+            found["obstacles"] = np.tile(lowest, self.n_rows), np.tile(highest, self.n_rows)
+        if self.speed:
+            place = joints if self.in_joints else _box(FARTHEST, self.dimension)
+            found["command"] = place
+            found["velocity"] = _box(self.speed, self.dimension)
+            found["acceleration"] = _box(self.acceleration, self.dimension)
+            found["time_left"] = _span(self.time_limit)
+            if self.n_via is not None:
+                found["remaining"] = _span(self.time_limit)
+                if self.n_via:
+                    found["via"] = np.tile(place[0], self.n_via), np.tile(place[1], self.n_via)
+        return found
+
+    def space(self) -> spaces.Dict:
+        """Return the observation space of one environment."""
+        return spaces.Dict(
+            {
+                name: spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+                for name, (low, high) in self.bounds.items()
+            }
+        )
+
+    def observe(
+        self,
+        joints: Float,
+        hand: Float,
+        goal: tuple[Float, Float],
+        obstacles: Obstacles,
+        command: Motion | None = None,
+        time: Float | None = None,
+        nominal: NominalPlan | None = None,
+    ) -> Observation:
+        """Return observations of N environments in fresh arrays.
+
+        Args:
+            joints: Joint positions, shape (N, J), [rad].
+            hand: Hand positions, shape (N, 3), [m].
+            goal: Goals as joint positions, shape (N, J), [rad], and as hand positions, shape (N, 3), [m].
+            obstacles: Obstacles at their present places.
+            command: References that the arms follow, in tasks in which decisions are made during a movement.
+            time: Time since the start of each episode, shape (N,), [s].
+            nominal: Plans of a zero action, in tasks with replanning.
+        """
+        parts: dict[str, Any] = {
+            "joints": joints,
+            "hand": hand,
+            "goal": goal[1],
+            "goal_joints": goal[0],
+            "obstacles": observation_rows(obstacles, self.kinds).reshape(len(joints), -1),
+        }
+        if command is not None and time is not None:
+            parts |= {
+                "command": command.position,
+                "velocity": command.velocity,
+                "acceleration": command.acceleration,
+                "time_left": (self.time_limit - time)[:, None],
+            }
+        if nominal is not None:
+            parts["via"] = nominal.vias.reshape(len(joints), -1)
+            parts["remaining"] = nominal.remaining[:, None]
+        observation = {}
+        for name, (low, high) in self.bounds.items():
+            observation[name] = np.clip(parts[name], low, high).astype(np.float32)
+        return observation
+
+    def rows(self, part: Any) -> Any:
+        """Return the `obstacles` part as rows, shape (..., n, row_size), in NumPy or torch."""
+        return part.reshape((*part.shape[:-1], self.n_rows, self.row_size))
+
+
+def _box(bound: float, size: int) -> tuple[Float, Float]:
+    """Return symmetric bounds."""
+    return np.full(size, -bound), np.full(size, bound)
+
+
+def _span(most: float) -> tuple[Float, Float]:
+    """Return the bounds of a time, [s]."""
+    return np.zeros(1), np.full(1, most)

@@ -1,0 +1,292 @@
+"""Plans: movements as via-points and durations, and the actions that stand for them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from viapoint import primitives
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import check_increasing_pair, finite_array, whole_number
+
+Timing = Literal["optimal", "learned"]
+SpaceName = Literal["hand", "joints"]
+
+LOG_SPLIT = float(np.log(4.0))
+"""Log ratio of neighbouring segments' durations for an action of 1: a factor of four."""
+MOST_VIAS = 16
+"""Greatest number of via-points of an action; more add no new movements in practice."""
+SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
+"""Bounds of the duration range, [s] in hand space, factors in joint space."""
+PEAK_INSTANTS = 64
+"""Instants at which the joint rates of a movement are looked at."""
+
+
+class Plan(NamedTuple):
+    """Movement as via-points and durations, or a batch of movements.
+
+    Coordinates are those of the space in which the movement is planned: of the hand [m], or of the joints [rad].
+
+    Example:
+        >>> from viapoint.envs.plans import Plan
+        >>> plan = Plan([[-0.2, 0.3], [0.0, 0.45], [0.2, 0.3]], [0.5, 0.5])  # m and s
+        >>> trajectory = plan.trajectory()
+        >>> trajectory(0.5).round(3).tolist()  # position of the hand at 0.5 s
+        [0.0, 0.45]
+    """
+
+    waypoints: Any
+    """Start, via-points and goal, shape (..., K + 2, D)."""
+    durations: Any
+    """Durations of the segments, shape (..., K + 1), [s]."""
+    velocity: Any = None
+    """Initial velocity, shape (..., D); None for rest."""
+    acceleration: Any = None
+    """Initial acceleration, shape (..., D); None for rest."""
+
+    @classmethod
+    def at_rest(cls, waypoints: Float, durations: Float) -> Plan:
+        """Return a batch of plans that begin at rest, with arrays for all parts."""
+        start = waypoints[..., 0, :]
+        return cls(waypoints, durations, np.zeros_like(start), np.zeros_like(start))
+
+    @property
+    def duration(self) -> Float:
+        """Total duration, shape (...), [s]."""
+        return np.asarray(np.sum(self.durations, axis=-1))
+
+    def take(self, rows: Any) -> Plan:
+        """Return the movements at `rows`, an index, slice or mask of the batch."""
+        return Plan(*(None if part is None else part[rows] for part in self))
+
+    def trajectory(self) -> primitives.Trajectory:
+        """Return the minimum-jerk movement through the waypoints."""
+        return primitives.through(
+            self.waypoints,
+            self.durations,
+            start_velocity=self.velocity,
+            start_acceleration=self.acceleration,
+        )
+
+
+class Motion(NamedTuple):
+    """States of references, shape (..., D) each."""
+
+    position: Float
+    """Position."""
+    velocity: Float
+    """Velocity."""
+    acceleration: Float
+    """Acceleration."""
+
+    @classmethod
+    def at_rest(cls, position: Float) -> Motion:
+        """Return references that rest at a position, shape (..., D)."""
+        return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionLayout:
+    """Layout of actions: the meaning of each component.
+
+    An action is a vector in [-1, 1]^m: for each of K via-points its offset from the k-th of K evenly spaced points of
+    the straight line; then the duration; then, with `timing="learned"`, how it is split between the segments. The zero
+    action is the straight minimum-jerk movement. In hand space offsets are along and across the straight line and
+    durations are in seconds. In joint space offsets are of the joints, and the duration is relative to the shortest
+    that the velocity limits of the joints allow.
+    """
+
+    space: SpaceName
+    names_of_axes: tuple[str, ...]
+    """Names of the components of an offset: D of them."""
+    n_via: int = 1
+    """Number of via-points K, 0 to :data:`MOST_VIAS`."""
+    timing: Timing = "optimal"
+    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: part of the action."""
+    duration_range: tuple[float, float]
+    """Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean."""
+    via_scale: tuple[float, ...]
+    """Largest offset of each component, [m] or [rad]."""
+    rate_limit: tuple[float, ...] = ()
+    """Velocity limits of the joints in joint space, [rad/s]."""
+
+    def __post_init__(self) -> None:
+        """Check all fields."""
+        whole_number("n_via", self.n_via, 0, MOST_VIAS)
+        if self.timing not in get_args(Timing):
+            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
+        check_increasing_pair("duration_range", self.duration_range, SHORTEST_DURATION, LONGEST_DURATION)
+        if self.space == "joints" and self.duration_range[0] < 1.0:
+            raise ValueError(
+                "duration_range in joint space is relative to the shortest movement that the limits allow and must "
+                f"begin at 1 or more, got {self.duration_range!r}"
+            )
+        scale = finite_array("via_scale", self.via_scale, (self.dimension,))
+        if (scale <= 0.0).any():
+            raise ValueError(f"via_scale must be positive, got {self.via_scale!r}")
+        low, high = self.duration_range
+        object.__setattr__(self, "duration_range", (float(low), float(high)))
+
+    @property
+    def dimension(self) -> int:
+        """Dimension D of the space."""
+        return len(self.names_of_axes)
+
+    @property
+    def size(self) -> int:
+        """Number of components m."""
+        return len(self.names)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the components, in order."""
+        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in self.names_of_axes]
+        splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
+        return (*vias, "duration", *splits)
+
+    @functools.cached_property
+    def units(self) -> tuple[str, ...]:
+        """Value of an action of 1 in each component."""
+        unit = "m" if self.space == "hand" else "rad"
+        low, high = self.duration_range
+        middle = f"{self.centre:.4g} s" if self.space == "hand" else f"{self.centre:.4g} times the shortest"
+        vias = [f"{scale:g} {unit}" for scale in self.via_scale] * self.n_via
+        splits = ["factor 4 between the segments before and after"] * (self.size - len(vias) - 1)
+        return (*vias, f"factor {(high / low) ** 0.5:.4g} on {middle}", *splits)
+
+    @property
+    def centre(self) -> float:
+        """Duration of the zero action, [s] in hand space, relative in joint space."""
+        low, high = self.duration_range
+        return float((low * high) ** 0.5)
+
+    @property
+    def log_half_range(self) -> float:
+        """Logarithm of the factor on the duration for an action of 1."""
+        low, high = self.duration_range
+        return float(0.5 * np.log(high / low))
+
+    @functools.cached_property
+    def straight_split(self) -> tuple[float, ...]:
+        """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""
+        waypoints = np.linspace(0.0, 1.0, self.n_via + 2)[:, None]
+        durations = primitives.passage_durations(waypoints, np.asarray(1.0))
+        return tuple(float(ratio) for ratio in np.diff(np.log(durations)))
+
+    def zero_duration(self, start: Float, goal: Float) -> Float:
+        """Return the duration of the zero action, shape (...), [s], for ends of shape (..., D)."""
+        if self.space == "hand":
+            return np.full(start.shape[:-1], self.centre)
+        # The greatest rate of the straight minimum-jerk movement is 15/8 of the mean one.
+        rate = 1.875 * np.abs(goal - start) / np.array(self.rate_limit)
+        return np.asarray(self.centre * rate.max(axis=-1))
+
+    def decode(self, action: Any, start: Any, goal: Any) -> Plan:
+        """Return the movements of actions.
+
+        Args:
+            action: Shape (..., m), in [-1, 1].
+            start: Shape (..., D).
+            goal: Shape (..., D), apart from the start.
+
+        Raises:
+            ValueError: One of them has another shape.
+        """
+        action = finite_array("action", action, (..., self.size))
+        start = finite_array("start", start, (..., self.dimension))
+        goal = finite_array("goal", goal, (..., self.dimension))
+        waypoints = self.waypoints(action, start, goal)
+        factor = self.centre * np.exp(action[..., self.n_via * self.dimension] * self.log_half_range)
+        shares = self._shares(waypoints, action)
+        unit = factor if self.space == "hand" else factor * self.shortest(waypoints, shares)
+        return Plan.at_rest(waypoints, shares * unit[..., None])
+
+    def waypoints(self, action: Float, start: Float, goal: Float) -> Float:
+        """Return start, via-points and goal of actions, shape (..., K + 2, D)."""
+        line = goal - start
+        vias = [start]
+        for k in range(self.n_via):
+            offset = action[..., k * self.dimension : (k + 1) * self.dimension] * np.array(self.via_scale)
+            if self.space == "hand":
+                offset = turned(offset, line)
+            vias.append(start + line * ((k + 1) / (self.n_via + 1)) + offset)
+        return np.stack([*vias, np.broadcast_to(goal, start.shape)], axis=-2)
+
+    def encode(self, plan: Plan) -> Float:
+        """Return the actions of movements, shape (..., m), the inverse of :meth:`decode`.
+
+        Components outside [-1, 1] say that the movement lies outside the action space.
+
+        Raises:
+            ValueError: The movement has another dimension or another number of via-points.
+        """
+        waypoints = finite_array("waypoints", plan.waypoints, (..., self.n_via + 2, self.dimension))
+        durations = finite_array("durations", plan.durations, (..., self.n_via + 1))
+        start, goal = waypoints[..., 0, :], waypoints[..., -1, :]
+        line = goal - start
+        parts = []
+        for k in range(self.n_via):
+            offset = waypoints[..., k + 1, :] - (start + line * ((k + 1) / (self.n_via + 1)))
+            if self.space == "hand":
+                # The frame of the straight line turned back: its second axis mirrored.
+                offset = turned(offset, line * np.array([1.0, -1.0]))
+            parts.append(offset / np.array(self.via_scale))
+        total = durations.sum(axis=-1)
+        unit = self.centre if self.space == "hand" else self.centre * self.shortest(
+            waypoints, durations / total[..., None]
+        )
+        parts.append((np.log(total / unit) / self.log_half_range)[..., None])
+        if self.timing == "learned":
+            ratios = np.log(durations[..., 1:] / durations[..., :-1])
+            parts.append((ratios - np.array(self.straight_split)) / LOG_SPLIT)
+        return np.concatenate(parts, axis=-1)
+
+    def shortest(self, waypoints: Float, shares: Float) -> Float:
+        """Return the shortest durations that keep the velocity limits of the joints, shape (...), [s].
+
+        Args:
+            waypoints: Shape (..., K + 2, D), [rad].
+            shares: Shares of the duration of the segments, shape (..., K + 1).
+        """
+        trajectory = primitives.through(waypoints, shares)
+        velocity = trajectory(np.linspace(0.0, 1.0, PEAK_INSTANTS + 1)[1:-1], 1)
+        relative = np.abs(velocity) / np.array(self.rate_limit)
+        return np.maximum(relative.max(axis=(-2, -1)), SHORTEST_DURATION)
+
+    def _shares(self, waypoints: Float, action: Float) -> Float:
+        """Return the shares of the duration of the segments, shape (..., K + 1)."""
+        if self.timing == "optimal":
+            return np.asarray(primitives.passage_durations(waypoints, np.ones(waypoints.shape[:-2])))
+        split = action[..., self.n_via * self.dimension + 1 :]
+        logs = np.cumsum(np.array(self.straight_split) + LOG_SPLIT * split, axis=-1)
+        shares = np.exp(np.concatenate((np.zeros_like(logs[..., :1]), logs), axis=-1))
+        return np.asarray(shares / shares.sum(axis=-1, keepdims=True))
+
+
+def turned(offset: Float, line: Float) -> Float:
+    """Return offsets along and across a line in the plane as vectors of the plane, shape (..., 2)."""
+    along = line / np.sqrt((line * line).sum(axis=-1, keepdims=True))
+    x, y = along[..., 0], along[..., 1]
+    u, v = offset[..., 0], offset[..., 1]
+    return np.stack((u * x - v * y, u * y + v * x), axis=-1)
+
+
+MAX_START_OFFSET = 1e-3
+"""Greatest distance of a plan's beginning from the present reference, [m] or [rad]."""
+
+
+def checked_plan(plan: Plan, start: Float) -> Plan:
+    """Return plans as arrays, after a check that they begin at the references, shape (N, D)."""
+    number, dimension = start.shape
+    waypoints = finite_array("waypoints of the plan", plan[0], (number, None, dimension))
+    durations = finite_array("durations of the plan", plan[1], (number, waypoints.shape[1] - 1))
+    away = np.sqrt(((waypoints[:, 0] - start) ** 2).sum(axis=-1))
+    if (away > MAX_START_OFFSET).any():
+        env = int(away.argmax())
+        raise ValueError(f"plan {env} must begin where the arm is, at {start[env]}, got {waypoints[env, 0]}")
+    if (durations <= 0.0).any():
+        raise ValueError(f"durations of the plan must be positive, got {durations.min()}")
+    return Plan.at_rest(waypoints, durations)

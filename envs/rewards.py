@@ -1,0 +1,136 @@
+"""Rewards of all tasks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.validation import number_of_at_least
+from viapoint.envs.outcome import Outcome, straight_jerk_cost
+
+CLEARANCE_RANGE = (-0.05, 0.01)
+"""Range in which clearance changes the reward, [m]."""
+CLEARANCE_UNIT = 0.05
+"""Unit of the clearance term, [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeights:
+    """Weights of the terms of the reward, 0 or more; see :func:`reward_terms`."""
+
+    success: float = 1.0
+    """Success at the end of the episode."""
+    collision: float = 0.5
+    """Contact at any physics step, negative."""
+    clearance: float = 0.5
+    """Clearance of the plan, within bounds."""
+    goal_error: float = 0.5
+    """Distance from the goal at the end of the episode, negative."""
+    smoothness: float = 0.1
+    """Logarithm of the jerk cost, negative."""
+    duration: float = 0.25
+    """Duration, negative."""
+    progress: float = 0.0
+    """Way towards the goal in each decision."""
+
+    def __post_init__(self) -> None:
+        """Check that no weight is negative."""
+        for field in dataclasses.fields(self):
+            value = number_of_at_least(f"reward weight {field.name}", getattr(self, field.name), 0.0)
+            object.__setattr__(self, field.name, value)
+
+    @classmethod
+    def of(cls, weights: RewardWeights | Mapping[str, float] | None, **defaults: float) -> RewardWeights:
+        """Return weights from a record, from a mapping of some of them, or the defaults.
+
+        Raises:
+            ValueError: The argument is something else, or names an unknown term.
+        """
+        if isinstance(weights, RewardWeights):
+            return weights
+        known = {field.name for field in dataclasses.fields(cls)}
+        if weights is None or (isinstance(weights, Mapping) and known >= set(weights)):
+            return cls(**{**defaults, **(weights or {})})
+        raise ValueError(
+            f"reward_weights must be {cls.__name__} or a mapping with some of {', '.join(sorted(known))}, "
+            f"got {weights!r}"
+        )
+
+
+class RewardTerms(NamedTuple):
+    """Weighted terms of N rewards, shape (N,) each; the reward is their sum."""
+
+    success: Float
+    collision: Float
+    clearance: Float
+    goal_error: Float
+    smoothness: Float
+    duration: Float
+    progress: Float
+
+    def total(self) -> Float:
+        """Return the reward, shape (N,): the terms added in order."""
+        return np.asarray(sum(self))
+
+    def as_info(self) -> dict[str, Any]:
+        """Return the terms as `reward_*`."""
+        return {f"reward_{name}": term for name, term in self._asdict().items()}
+
+
+def reward_terms(
+    before: Outcome,
+    after: Outcome,
+    first: Bool,
+    ended: Bool,
+    length: Float,
+    zero_duration: Float,
+    goal_unit: float,
+    weights: RewardWeights,
+) -> RewardTerms:
+    """Return the weighted terms of one decision of N episodes.
+
+    Over an episode the terms add up to
+
+        w_success 1[success] - w_collision 1[contact] + w_clearance clip(c, -5 cm, 1 cm) / 5 cm
+        - w_goal min(e / u, 1) - w_smoothness log(1 + J / J_0) - w_duration T / T_0 + w_progress (1 - e / length)
+
+    with the clearance c, jerk cost J and duration T of all that was commanded, the distance e from the goal at the end,
+    and the jerk cost J_0 and the duration T_0 of the straight movement of the zero action. With the default weights any
+    success is worth more than any failure, and the duration T_0 is the best one of a straight movement.
+
+    Args:
+        before: Metrics before the decision.
+        after: Metrics after the decision.
+        first: True for the first decision of an episode, shape (N,).
+        ended: True if the episode ended, shape (N,).
+        length: Distance from start to goal, shape (N,), [m] or [rad].
+        zero_duration: Duration T_0, shape (N,), [s].
+        goal_unit: Distance u from the goal at which its term saturates, [m] or [rad].
+        weights: Weights of the terms.
+    """
+    later = ~first
+    clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)
+    cost = straight_jerk_cost(length, zero_duration)
+    rough = np.log1p(after.jerk_cost / cost) - np.log1p(before.jerk_cost / cost)
+    spent = (after.duration - before.duration) / zero_duration
+    far = np.minimum(after.goal_error / goal_unit, 1.0)
+    nearer = (before.goal_error - after.goal_error) / length
+    return RewardTerms(
+        success=np.where(ended & after.is_success, weights.success, 0.0),
+        collision=np.where(ended & after.collision, -weights.collision, 0.0),
+        clearance=weights.clearance * clearance,
+        goal_error=np.where(ended, -weights.goal_error * far, 0.0),
+        smoothness=-weights.smoothness * rough,
+        duration=-weights.duration * spent,
+        progress=weights.progress * nearer,
+    )
+
+
+def _bounded(clearance: Float) -> Float:
+    """Return clearance within the range that changes the reward, in its unit."""
+    return np.asarray(np.clip(clearance, *CLEARANCE_RANGE) / CLEARANCE_UNIT)

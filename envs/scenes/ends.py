@@ -1,0 +1,410 @@
+"""Starts and goals of drawn scenes: compiled attempts at free configurations that one would reach for."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.inverse_kinematics import solve_planar, solve_pose, solve_position
+from viapoint.envs.arms.kinematics import tool_position, transform
+from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
+from viapoint.envs.scenes.scene import NEVER, row_clearance
+
+PAIRS, TRIES = 3, 6
+"""Pairs of start and goal for a layout, and attempts at each end."""
+HOME, REACHING = 0.4, 0.8
+"""Share of starts at home or near it, and of these and starts in places of goals; others are free ones."""
+FREE_GOALS = 0.1
+"""Share of goals that are free configurations, where the layout has places."""
+EXCHANGED = 0.25
+"""Share of pairs whose start and goal are exchanged, where the layout has no places of starts."""
+JITTER = 0.3
+"""Greatest deviation from home of half of the starts there, [rad]."""
+SELF_MARGIN = 0.005
+"""Least clearance of the arm from itself at ends, [m]."""
+INSTANTS = 32
+"""Parts of the straight movement between which it is looked at."""
+ROLL = 0.3
+"""Greatest deviation of the tool's roll about its axis from quarter turns, [rad]."""
+SEED_SPREAD = 0.3
+"""Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints."""
+BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
+"""What becomes of a straight movement."""
+
+
+class Mover(NamedTuple):
+    """Arm and the space in which it moves, as compiled functions read them."""
+
+    chain: Chain
+    spheres: Spheres
+    joint_range: Float
+    """Ranges of the joints, shape (J, 2), [rad] or [m]."""
+    inner_range: Float
+    """Ranges of the joints at ends, shape (J, 2), [rad] or [m]."""
+    velocity_limit: Float
+    """Shape (J,), [rad/s] or [m/s]."""
+    home: Float
+    """Shape (J,), [rad] or [m]."""
+    bearing: float
+    """Bearing of the tool at home, seen from the axis of the first joint, [rad]."""
+    plane: bool
+    """True for an arm of two joints in the plane."""
+    of_hand: bool
+    """True if movements are planned in hand space, False for joint space."""
+    margin: float
+    """Least clearance of ends from obstacles, [m]."""
+    least_way: float
+    """Least length of the way from start to goal in joint space, [rad]."""
+
+
+class Attempts(NamedTuple):
+    """One attempt at each of N scenes: layouts as padded tables, and random numbers."""
+
+    rows: Float
+    """Obstacles of the layouts, shape (N, W, ROW)."""
+    n_rows: Int
+    """Numbers of obstacles, shape (N,); -1 for scenes whose obstacles are given."""
+    keep: Int
+    """Numbers of obstacles that are kept, or 0, shape (N,)."""
+    places: Float
+    """Places of starts, then those of goals, shape (N, 2, P, PLACE)."""
+    n_places: Int
+    """Numbers of both, shape (N, 2)."""
+    fixed: Bool
+    """True for starts and goals that are given, shape (N, 2)."""
+    numbers: Float
+    """Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)."""
+
+
+class Draft(NamedTuple):
+    """N scenes that are being drawn, and memory."""
+
+    mover: Mover
+    attempts: Attempts
+    ends: Float
+    """Starts and goals, shape (N, 2, J)."""
+    obstacles: Obstacles
+    """W obstacles of each scene, or those that are given."""
+    turn_time: Float
+    """Times of the changes of course, shape (N, W), [s]."""
+    turn_velocity: Float
+    """Velocities after the changes, shape (N, W, 3), [m/s]."""
+    jumps: Float
+    """Jumps of the target, shape (N, MOST_JUMPS, J + 1)."""
+    placed: Placed
+    at_start: Placed
+    at_goal: Placed
+
+
+def numbers_of_end(joints: int) -> int:
+    """Return how many random numbers the attempts at an end take: two, and for each try a place and a seed."""
+    return 2 + TRIES * (8 + joints)
+
+
+@compiled
+def draw_ends(draft: Draft, which: Int) -> Bool:
+    """Draw starts and goals, and obstacles, of the scenes at K indices; return True for those that were found, (K,)."""
+    attempts = draft.attempts
+    found = np.zeros(len(which), np.bool_)
+    for k in range(len(which)):
+        scene = which[k]
+        # Places in the plane are points: another attempt would be the same one.
+        once = draft.mover.plane or (attempts.fixed[scene, 0] and attempts.fixed[scene, 1])
+        for pair in range(1 if once else PAIRS):
+            if attempts.n_rows[scene] >= 0:
+                _unpack_rows(draft, scene)
+            if _draw_pair(draft, scene, pair):
+                found[k] = True
+                break
+    return found
+
+
+@compiled
+def _unpack_rows(draft: Draft, scene: int) -> None:
+    """Put the obstacles of a layout into a scene, at rest; the rows behind them become absent."""
+    obstacles, rows = draft.obstacles, draft.attempts.rows[scene]
+    for row in range(obstacles.kind.shape[1]):
+        draft.turn_time[scene, row] = NEVER
+        obstacles.kind[scene, row] = ABSENT
+        if row < draft.attempts.n_rows[scene]:
+            obstacles.kind[scene, row] = int(rows[row, 0])
+        for axis in range(3):
+            draft.turn_velocity[scene, row, axis] = 0.0
+            obstacles.velocity[scene, row, axis] = 0.0
+            obstacles.centre[scene, row, axis] = rows[row, 1 + axis]
+            obstacles.size[scene, row, axis] = rows[row, 13 + axis]
+            for column in range(3):
+                obstacles.rotation[scene, row, axis, column] = rows[row, 4 + 3 * axis + column]
+
+
+@compiled
+def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
+    """Draw a start and a goal, and return True if they and the straight movement between them are as they must be."""
+    attempts = draft.attempts
+    start_given, goal_given = attempts.fixed[scene, 0], attempts.fixed[scene, 1]
+    # The goal first: it is harder to find.
+    if not goal_given and not _draw_end(draft, scene, pair, 1):
+        return False
+    if not start_given and not _draw_end(draft, scene, pair, 0):
+        return False
+    start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
+    exchange = not start_given and not goal_given and attempts.n_places[scene, 0] == 0
+    if exchange and attempts.numbers[scene, pair, 0, 1] < EXCHANGED:
+        for joint in range(len(start)):
+            start[joint], goal[joint] = goal[joint], start[joint]
+    way = 0.0
+    for joint in range(len(start)):
+        way += (goal[joint] - start[joint]) ** 2
+    both_given = start_given and goal_given
+    if not both_given and np.sqrt(way) < draft.mover.least_way:
+        return False
+    drawn = attempts.n_rows[scene] >= 0
+    if drawn and (start_given or goal_given or attempts.keep[scene]) and not _make_room(draft, scene):
+        return False
+    what = straight_movement(draft, scene)
+    if what == FREE:
+        # Given obstacles need not be in the way.
+        return bool(attempts.n_rows[scene] <= 0)
+    return what == BLOCKED or both_given
+
+
+@compiled
+def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
+    """Draw a start (end 0) or a goal (end 1), and return True if it is free."""
+    mover, attempts, joints = draft.mover, draft.attempts, draft.ends[scene, end]
+    numbers = attempts.numbers[scene, pair, end]
+    size = len(joints)
+    listed = end
+    home, reaching = 0.0, 1.0 if mover.plane else 1.0 - FREE_GOALS
+    if end == 0 and attempts.n_places[scene, 0] == 0 and not mover.plane:
+        listed = 1
+        home, reaching = HOME, REACHING
+    n_places = attempts.n_places[scene, listed]
+    for k in range(1 if mover.plane else TRIES):
+        first = 2 + k * (8 + size)
+        for joint in range(size):
+            low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
+            seed = numbers[first + 8 + joint]
+            joints[joint] = low + (high - low) * seed
+            if numbers[0] < home:
+                deviation = JITTER if numbers[first] < 0.5 else 0.0
+                joints[joint] = mover.home[joint] + deviation * (2.0 * seed - 1.0)
+        if n_places > 0 and home <= numbers[0] < reaching:
+            there = attempts.places[scene, listed, int(numbers[first] * n_places)]
+            if not _reach(draft, scene, there, numbers[first + 1 : first + 8], joints):
+                continue
+        if is_end(draft, joints) and (attempts.keep[scene] > 0 or _is_clear(draft, scene)):
+            return True
+    return False
+
+
+@compiled
+def is_end(draft: Draft, joints: Float) -> bool:
+    """Return True if joints are within their inner ranges, and the arm, which is placed, is free of itself."""
+    mover, placed = draft.mover, draft.placed
+    for joint in range(len(joints)):
+        low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
+        if not low <= joints[joint] <= high:
+            return False
+    place(mover.chain, mover.spheres, joints, placed)
+    return bool(self_clearance(mover.spheres, placed, SELF_MARGIN, SELF_MARGIN) >= SELF_MARGIN)
+
+
+@compiled
+def _is_clear(draft: Draft, scene: int) -> bool:
+    """Return True if the placed arm has the margin of ends to all obstacles at time 0."""
+    margin = draft.mover.margin
+    spheres, obstacles = draft.mover.spheres, draft.obstacles
+    return bool(obstacle_clearance(spheres, draft.placed, obstacles, scene, 0.0, margin, margin) >= margin)
+
+
+@compiled
+def _is_row_clear(draft: Draft, placed: Placed, scene: int, row: int, link: int) -> bool:
+    """Return True if links from `link` on of a placed arm have the margin of ends to one obstacle at time 0."""
+    margin, spheres = draft.mover.margin, draft.mover.spheres
+    least = row_clearance(spheres, placed, draft.obstacles, scene, row, 0.0, margin, margin, link)
+    return bool(least >= margin)
+
+
+@compiled
+def _make_room(draft: Draft, scene: int) -> bool:
+    """Leave out obstacles that touch an end, and those that are too many; return True if the others are enough.
+
+    If the obstacles of the layout belong together, none may touch an end.
+    """
+    mover, obstacles, keep = draft.mover, draft.obstacles, draft.attempts.keep[scene]
+    place(mover.chain, mover.spheres, draft.ends[scene, 0], draft.at_start)
+    place(mover.chain, mover.spheres, draft.ends[scene, 1], draft.at_goal)
+    count = 0
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] == ABSENT:
+            continue
+        if keep > 0 and count == keep:
+            obstacles.kind[scene, row] = ABSENT
+            continue
+        free = _is_row_clear(draft, draft.at_start, scene, row, 1)
+        free = free and _is_row_clear(draft, draft.at_goal, scene, row, 1)
+        if not free and keep == 0:
+            return False
+        if free:
+            _move_row(obstacles, scene, row, count)
+            count += 1
+        else:
+            obstacles.kind[scene, row] = ABSENT
+    return bool(keep == 0 or count == keep)
+
+
+@compiled
+def _move_row(obstacles: Obstacles, scene: int, row: int, to: int) -> None:
+    """Move an obstacle to an earlier row."""
+    if row == to:
+        return
+    obstacles.kind[scene, to] = obstacles.kind[scene, row]
+    obstacles.kind[scene, row] = ABSENT
+    for axis in range(3):
+        obstacles.centre[scene, to, axis] = obstacles.centre[scene, row, axis]
+        obstacles.size[scene, to, axis] = obstacles.size[scene, row, axis]
+        for column in range(3):
+            obstacles.rotation[scene, to, axis, column] = obstacles.rotation[scene, row, axis, column]
+
+
+@compiled
+def straight_movement(draft: Draft, scene: int) -> int:
+    """Return what becomes of the straight movement: FREE, BLOCKED by an obstacle, or OUT_OF_REACH."""
+    mover, start, goal = draft.mover, draft.ends[scene, 0], draft.ends[scene, 1]
+    placed, joints = draft.placed, np.empty(len(start))
+    x, y, u, v = 0.0, 0.0, 0.0, 0.0
+    if mover.of_hand:
+        x, y, _ = tool_position(mover.chain, start, placed.rotation, placed.origin)
+        u, v, _ = tool_position(mover.chain, goal, placed.rotation, placed.origin)
+        for k in range(1, INSTANTS):
+            share = k / INSTANTS
+            here = x + share * (u - x), y + share * (v - y)
+            if not solve_planar(mover.chain, mover.joint_range, here[0], here[1], joints):
+                return OUT_OF_REACH
+    for k in range(1, INSTANTS):
+        share = _bit_reversed(k)
+        if mover.of_hand:
+            here = x + share * (u - x), y + share * (v - y)
+            solve_planar(mover.chain, mover.joint_range, here[0], here[1], joints)
+        else:
+            for joint in range(len(joints)):
+                joints[joint] = start[joint] + share * (goal[joint] - start[joint])
+        place(mover.chain, mover.spheres, joints, placed)
+        if obstacle_clearance(mover.spheres, placed, draft.obstacles, scene, 0.0, 0.0, 0.0) < 0.0:
+            return BLOCKED
+    return FREE
+
+
+@compiled
+def _bit_reversed(number: int) -> float:
+    """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..."""
+    point, step = 0.0, 0.5
+    while number:
+        point += step * (number & 1)
+        number >>= 1
+        step *= 0.5
+    return point
+
+
+@compiled
+def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float) -> bool:
+    """Solve for joint positions with the tool in a place, and return True if it gets there."""
+    mover, placed = draft.mover, draft.placed
+    across = there[6] * (2.0 * numbers[0] - 1.0), there[7] * (2.0 * numbers[1] - 1.0)
+    position, axes = np.empty(3), np.empty((3, 3))
+    position[0] = there[0] + there[9] * across[0] - there[10] * across[1]
+    position[1] = there[1] + there[10] * across[0] + there[9] * across[1]
+    position[2] = there[2] + there[8] * (2.0 * numbers[2] - 1.0)
+    chain, limits = mover.chain, mover.inner_range
+    if mover.plane:
+        return bool(solve_planar(chain, limits, position[0], position[1], joints))
+    _seed(mover, position, joints)
+    if len(joints) < 6:
+        return bool(solve_position(chain, limits, position, joints, placed.rotation, placed.origin))
+    _tool_axes(there[3:6], there[11], numbers[3:7], axes)
+    if draft.attempts.keep[scene] == 0 and not _is_hand_clear(draft, scene, position, axes):
+        return False
+    return bool(solve_pose(chain, limits, position, axes, joints, placed.rotation, placed.origin))
+
+
+@compiled
+def _seed(mover: Mover, position: Float, joints: Float) -> None:
+    """Change joints between their limits into some near home, with the first one turned towards a position.
+
+    From there inverse kinematics finds more solutions, and fewer contorted ones.
+    """
+    origin = mover.chain.origin[0]
+    for joint in range(len(joints)):
+        low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
+        joints[joint] = mover.home[joint] + SEED_SPREAD * (joints[joint] - 0.5 * (low + high))
+        if joint == 0 and not mover.chain.sliding[0]:
+            joints[0] += np.arctan2(position[1] - origin[1], position[0] - origin[0]) - mover.bearing
+        joints[joint] = min(max(joints[joint], low), high)
+
+
+@compiled
+def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bool:
+    """Return True if the last link is free with the tool at a pose, which is known without inverse kinematics."""
+    chain, spheres, placed = draft.mover.chain, draft.mover.spheres, draft.placed
+    last = len(chain.mass)
+    for row in range(3):
+        for column in range(3):
+            turn = 0.0
+            for k in range(3):
+                turn += axes[row, k] * chain.tool_rotation[column, k]
+            placed.rotation[last, row, column] = turn
+        placed.origin[last, row] = position[row]
+        for k in range(3):
+            placed.origin[last, row] -= placed.rotation[last, row, k] * chain.tool_origin[k]
+    for group in range(len(spheres.link)):
+        if spheres.link[group] == last:
+            placed.known[group] = False
+            ball = transform(placed.rotation, placed.origin, last, spheres.ball_centre[group])
+            placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2] = ball
+    clear = True
+    for row in range(draft.obstacles.kind.shape[1]):
+        clear = clear and _is_row_clear(draft, placed, scene, row, last)
+    return clear
+
+
+@compiled
+def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> None:
+    """Fill in random axes of the tool, as columns, with the z axis in a cone around the approach."""
+    x, y, z = approach[0], approach[1], approach[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        x, length, cone = 1.0, 1.0, np.pi
+    _fill_frame(x / length, y / length, z / length, axes)
+    # A uniform direction in the cone around the third axis.
+    cosine = 1.0 - (1.0 - np.cos(cone)) * numbers[0]
+    sine = np.sqrt(max(1.0 - cosine * cosine, 0.0))
+    angle = 2.0 * np.pi * numbers[1]
+    u, v = sine * np.cos(angle), sine * np.sin(angle)
+    x = u * axes[0, 0] + v * axes[0, 1] + cosine * axes[0, 2]
+    y = u * axes[1, 0] + v * axes[1, 1] + cosine * axes[1, 2]
+    z = u * axes[2, 0] + v * axes[2, 1] + cosine * axes[2, 2]
+    _fill_frame(x, y, z, axes)
+    roll = 0.5 * np.pi * np.floor(4.0 * numbers[2]) + ROLL * (2.0 * numbers[3] - 1.0)
+    c, s = np.cos(roll), np.sin(roll)
+    for row in range(3):
+        first, second = axes[row, 0], axes[row, 1]
+        axes[row, 0] = c * first + s * second
+        axes[row, 1] = c * second - s * first
+
+
+@compiled
+def _fill_frame(x: float, y: float, z: float, axes: Float) -> None:
+    """Fill in axes, as columns, of which the third is a unit vector, and the first is horizontal."""
+    level = np.sqrt(x * x + y * y)
+    u, v = 1.0, 0.0
+    if level > 1e-6:
+        u, v = -y / level, x / level
+    axes[0, 0], axes[1, 0], axes[2, 0] = u, v, 0.0
+    axes[0, 1], axes[1, 1], axes[2, 1] = -z * v, z * u, x * v - y * u
+    axes[0, 2], axes[1, 2], axes[2, 2] = x, y, z

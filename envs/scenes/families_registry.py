@@ -1,0 +1,225 @@
+"""Registry of scene families: functions that draw the layout of a scene."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from viapoint.envs.common.validation import whole_number
+from viapoint.envs.geometry.obstacles import KINDS, MESH, pack
+from viapoint.envs.geometry.shapes import Shape
+from viapoint.envs.scenes import families_plane, families_space
+from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
+
+Build = Callable[[np.random.Generator, Room], Any]
+"""Function of a random generator and a room that returns a layout, see :func:`register_scene_family`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFamily:
+    """Kind of scenes that have a name."""
+
+    build: Build
+    """Function that draws a layout."""
+    plane: bool = False
+    """True for arms in the plane, False for arms in space."""
+    kinds: tuple[str, ...] = ()
+    """Kinds of obstacles that the family needs."""
+    n_obstacles: int = 1
+    """Least number of obstacles that a scene must have room for."""
+    trained: bool = False
+    """True if the family is one of those of training by default."""
+    hard: bool = False
+    """True if the family is part of the frozen hard scenes."""
+
+
+def _plane(build: Build, n_obstacles: int) -> SceneFamily:
+    """Return a family of structures in the plane, which are not trained on."""
+    return SceneFamily(build=build, plane=True, kinds=("box",), n_obstacles=n_obstacles, hard=True)
+
+
+def _furniture(build: Build, n_obstacles: int, *, trained: bool = True) -> SceneFamily:
+    """Return a family of furniture in space."""
+    return SceneFamily(
+        build=build, kinds=("box",), n_obstacles=n_obstacles, trained=trained, hard=not trained
+    )
+
+
+FAMILIES: dict[tuple[bool, str], SceneFamily] = {
+    (True, "clutter"): SceneFamily(build=families_plane.clutter, plane=True, trained=True),
+    (True, "gate"): _plane(families_plane.gate, 2),
+    (True, "corridor"): _plane(families_plane.corridor, 4),
+    (True, "ring"): _plane(families_plane.ring, 5),
+    (True, "oblique bar"): _plane(families_plane.oblique_bar, 3),
+    (True, "cul-de-sac"): _plane(families_plane.cul_de_sac, 5),
+    (False, "shelf"): _furniture(families_space.shelf, 4),
+    (False, "table"): _furniture(families_space.table, 2),
+    (False, "bin"): _furniture(families_space.bin_, 5),
+    (False, "gate"): _furniture(families_space.gate, 3),
+    (False, "tunnel"): _furniture(families_space.tunnel, 4),
+    (False, "clutter"): SceneFamily(build=families_space.clutter, trained=True),
+    (False, "cage"): _furniture(families_space.cage, 6, trained=False),
+    (False, "wall_window"): _furniture(families_space.wall_window, 4, trained=False),
+}
+"""Families by their place, True for the plane and False for space, and their name."""
+
+
+def scene_families(plane: bool) -> Mapping[str, SceneFamily]:
+    """Return the families of scenes in the plane or in space, by name.
+
+    Example:
+        >>> from viapoint.envs.scenes.families_registry import scene_families
+        >>> families = scene_families(plane=False)
+        >>> families["shelf"].trained, families["cage"].trained
+        (True, False)
+    """
+    return MappingProxyType({name: each for (there, name), each in FAMILIES.items() if there == plane})
+
+
+def default_families(plane: bool, kinds: Iterable[str], most: int) -> tuple[str, ...]:
+    """Return the families of training that scenes with some kinds, and at most so many obstacles, have room for."""
+    names = []
+    for name, family in scene_families(plane).items():
+        if family.trained and set(family.kinds) <= set(kinds) and family.n_obstacles <= max(most, 1):
+            names.append(name)
+    return tuple(names)
+
+
+def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], most: int) -> tuple[str, ...]:
+    """Return names of families after a check that scenes have room for them.
+
+    Raises:
+        ValueError: A name is unknown, or a family needs other kinds or more obstacles.
+    """
+    known = scene_families(plane)
+    if isinstance(families, str) or not families or any(name not in known for name in families):
+        raise ValueError(f"families must be some of {', '.join(known)}, got {families!r}")
+    for name in families:
+        family = known[name]
+        missing = set(family.kinds) - set(kinds)
+        if missing:
+            raise ValueError(f"the family {name!r} needs obstacles of the kinds {', '.join(sorted(missing))}")
+        if family.n_obstacles > max(most, 1):
+            raise ValueError(
+                f"the family {name!r} needs {family.n_obstacles} obstacles, n_obstacles allows {most}"
+            )
+    return tuple(families)
+
+
+def register_scene_family(
+    name: str,
+    build: Build,
+    *,
+    plane: bool = False,
+    kinds: tuple[str, ...] = (),
+    n_obstacles: int = 1,
+    trained: bool = False,
+) -> None:
+    """Register a family of scenes under a name, which tasks then accept in `families`.
+
+    Scenes in which an end cannot be reached or touches something, or whose straight movement is free, are drawn again.
+    A process that loads a task with the name must register the family, too.
+
+    Args:
+        name: Name that is not taken among families of the same place.
+        build: Function `build(rng, room)` of a random generator and a
+            :class:`~viapoint.envs.scenes.layout.Room`. It returns a list of shapes and a list of
+            :class:`~viapoint.envs.scenes.layout.Place`, [m], where goals are; without places, goals are free
+            configurations. In the plane it returns a third list of one place, the start. Or it returns the layout of a
+            :class:`~viapoint.envs.scenes.layout.Furniture`. It must depend on nothing but its arguments.
+        plane: True for arms in the plane, False for arms in space.
+        kinds: Kinds of obstacles that the family needs; others appear only if `room.kinds` has them.
+        n_obstacles: Least number of obstacles that a task must have room for; `room.most` says how many it has room
+            for.
+        trained: True if the family is one of those of training by default.
+
+    Raises:
+        TypeError: The name is not a string, or `build` is not a function of two arguments.
+        ValueError: The name is taken or empty, or a kind or number is not allowed.
+
+    Example:
+        >>> from viapoint.envs.geometry.shapes import Sphere
+        >>> from viapoint.envs.scenes.families_registry import register_scene_family, scene_families
+        >>> from viapoint.envs.scenes.layout import Place
+        >>> def ball(rng, room):
+        ...     '''Return a ball in front of the arm, and a goal behind it.'''
+        ...     x = rng.uniform(0.4, 0.5)
+        ...     return [Sphere(0.08, position=(x, 0.0, 0.4))], [Place((x + 0.15, 0.0, 0.4), half=(0.05, 0.05, 0.05))]
+        >>> register_scene_family("ball", ball, kinds=("sphere",))
+        >>> "ball" in scene_families(plane=False)
+        True
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"name must be a string, got {name!r}")
+    taken = scene_families(plane)
+    if not name or name in taken:
+        raise ValueError(f"name must not be empty or one of {', '.join(taken)}, got {name!r}")
+    unknown = [kind for kind in kinds if kind not in KINDS[:MESH]]
+    if unknown:
+        raise ValueError(f"kinds of families must be some of {', '.join(KINDS[:MESH])}, got {unknown}")
+    whole_number("n_obstacles", n_obstacles, 1)
+    try:
+        inspect.signature(build).bind(None, None)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"build must be a function build(rng, room), got {build!r}: {error}") from None
+    FAMILIES[plane, name] = SceneFamily(
+        build=_checked(name, build),
+        plane=plane,
+        kinds=tuple(kinds),
+        n_obstacles=n_obstacles,
+        trained=trained,
+    )
+
+
+def _checked(name: str, build: Build) -> Build:
+    """Return a function that returns the layout of a user's function, or says what is wrong with it."""
+
+    def checked(rng: np.random.Generator, room: Room) -> Layout:
+        built = build(rng, room)
+        try:
+            layout = built if isinstance(built, Layout) else _as_layout(*built)
+            numbers = np.array([*layout.rows, *layout.goals, *layout.starts])
+            if len(layout.rows) % ROW or (len(layout.goals) + len(layout.starts)) % PLACE:
+                raise ValueError("a layout must be made by Furniture")
+            if not np.isfinite(numbers).all():
+                raise ValueError("obstacles and places must be finite")
+            found = {KINDS[int(kind)] for kind in layout.rows[::ROW]}
+            if not found <= set(room.kinds):
+                raise ValueError(f"kinds must be among {room.kinds}, got {sorted(found)}")
+            drawn = len(layout.rows) // ROW
+            count = layout.keep or drawn
+            if count > room.most or drawn > most_rows(room.most):
+                raise ValueError(f"there must be at most {room.most} obstacles, got {count} of {drawn}")
+            if max(len(layout.goals), len(layout.starts)) > MOST_PLACES * PLACE:
+                raise ValueError(f"there must be at most {MOST_PLACES} places of starts, and of goals")
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"scene family {name!r}: {error}") from None
+        return layout
+
+    return checked
+
+
+def _as_layout(shapes: Iterable[Shape], goals: Iterable[Place] = (), starts: Iterable[Place] = ()) -> Layout:
+    """Return the layout of shapes and places."""
+    obstacles = pack([list(shapes)])
+    rows: list[float] = []
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[0, row] >= MESH:
+            raise ValueError(f"kinds must be some of {', '.join(KINDS[:MESH])}")
+        rows += [obstacles.kind[0, row], *obstacles.centre[0, row], *obstacles.rotation[0, row].ravel()]
+        rows += [*obstacles.size[0, row]]
+    return Layout(rows, _numbers(goals), _numbers(starts))
+
+
+def _numbers(places: Iterable[Place]) -> list[float]:
+    """Return places as numbers."""
+    numbers: list[float] = []
+    for place in places:
+        position, approach, half, cone = Place(*place)
+        numbers += [*position, *approach, *half, 1.0, 0.0, cone]
+    return numbers

@@ -1,0 +1,261 @@
+"""Changes of drawn scenes: jumps of the target, and obstacles that move with at most one turn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.arms.inverse_kinematics import solve_planar
+from viapoint.envs.arms.kinematics import tool_position
+from viapoint.envs.geometry.clearance import Placed, place
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE
+from viapoint.envs.plans import SHORTEST_DURATION
+from viapoint.envs.scenes.ends import Draft, Mover, is_end
+from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER, row_clearance
+
+CANDIDATES = 8
+"""Candidates for a jump, or for the course of an obstacle."""
+COURSE_NUMBERS = 9
+"""Random numbers of a candidate for the course of an obstacle."""
+FIRST_JUMP, NEXT_JUMP = (0.1, 0.7), (0.4, 0.9)
+"""Time of the first jump, and from a jump to the next, relative to the centre duration."""
+JUMP_OF_HAND, JUMP_OF_JOINTS = (0.10, 0.30), (0.25, 0.75)
+"""Distance from a target to the next in hand space, [m], and in joint space, [rad]."""
+SPEED = (0.05, 0.30)
+"""Speed of obstacles, [m/s]."""
+STEEPNESS = 0.5
+"""Greatest height that an obstacle in space gains, relative to its way."""
+TURNING, TURN = 0.5, (0.2, 0.7)
+"""Share of obstacles that turn, and the time of the turn, relative to the centre duration."""
+MEETING = (0.25, 0.6)
+"""Time at which an obstacle is where it was drawn, relative to the centre duration."""
+MARGIN = 0.015
+"""Least clearance of the start at first, of the goal while movements may end, and of targets that appear, [m]."""
+FARTHEST = 1.5
+"""Greatest coordinate of a moving obstacle at the beginning, [m]."""
+BEGINNING, BEGINNING_TIMES = 0.2, 3
+"""Time that the start stays free, relative to the centre duration, and number of times at which this is checked."""
+ENDING, ENDING_TIMES = 1.2, 10
+"""Time until which the goal stays free, relative to the longest duration, and number of times."""
+PASSED = 8
+"""Parts of the way to a new target between which it is looked at."""
+
+
+class Changes(NamedTuple):
+    """Distribution of changes."""
+
+    fewest_jumps: int
+    most_jumps: int
+    moving: bool
+    """True if obstacles move."""
+    shortest: float
+    """Shortest duration of movements, [s], in joint space relative to the shortest possible."""
+    centre: float
+    """Centre duration."""
+    longest: float
+    """Longest duration."""
+
+
+def numbers_of_jumps(joints: int) -> int:
+    """Return how many random numbers the jumps of a scene take."""
+    return 1 + MOST_JUMPS * (1 + CANDIDATES * (1 + joints))
+
+
+@compiled
+def _mixed(limits: tuple[float, float], share: float) -> float:
+    """Return the number at a share of the way from a lower limit to an upper one."""
+    return limits[0] + (limits[1] - limits[0]) * share
+
+
+@compiled
+def time_unit(mover: Mover, start: Float, goal: Float) -> float:
+    """Return the unit of durations, [s]: in joint space the shortest duration that the velocity limits allow."""
+    if mover.of_hand:
+        return 1.0
+    unit = SHORTEST_DURATION
+    for joint in range(len(start)):
+        # The greatest rate of a minimum-jerk movement is 15/8 of the mean one.
+        unit = max(unit, 1.875 * abs(goal[joint] - start[joint]) / mover.velocity_limit[joint])
+    return unit
+
+
+@compiled
+def draw_courses(draft: Draft, changes: Changes, which: Int, numbers: Float) -> None:
+    """Let the obstacles of some scenes move; half-spaces, and obstacles of which no course fits, stand still.
+
+    Args:
+        draft: N scenes with W obstacles each.
+        changes: Distribution of changes.
+        which: Indices of the scenes, shape (K,).
+        numbers: Uniform random numbers, shape (K, W, CANDIDATES, COURSE_NUMBERS).
+    """
+    mover, obstacles = draft.mover, draft.obstacles
+    for k in range(len(which)):
+        scene = which[k]
+        start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
+        unit = time_unit(mover, start, goal)
+        place(mover.chain, mover.spheres, start, draft.at_start)
+        place(mover.chain, mover.spheres, goal, draft.at_goal)
+        for row in range(obstacles.kind.shape[1]):
+            if obstacles.kind[scene, row] in (ABSENT, HALF_SPACE):
+                continue
+            met = obstacles.centre[scene, row].copy()
+            fits = False
+            for candidate in range(CANDIDATES):
+                _set_course(draft, scene, row, met, unit * changes.centre, numbers[k, row, candidate])
+                fits = _course_fits(draft, changes, unit, scene, row)
+                if fits:
+                    break
+            if not fits:
+                _set_course(draft, scene, row, met, 0.0, np.zeros(COURSE_NUMBERS))
+
+
+@compiled
+def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float, u: Float) -> None:
+    """Give an obstacle a random course through a place during a movement of some duration; it rests if that is 0."""
+    first, second = np.zeros(3), np.zeros(3)
+    turn, meeting = NEVER, 0.0
+    if duration > 0.0:
+        height = 0.0 if draft.mover.plane else STEEPNESS
+        _fill_velocity(u[0], u[1], height * (2.0 * u[2] - 1.0), first)
+        meeting = duration * _mixed(MEETING, u[8])
+        if u[6] < TURNING:
+            turn = duration * _mixed(TURN, u[7])
+            _fill_velocity(u[3], u[4], height * (2.0 * u[5] - 1.0), second)
+    for axis in range(3):
+        way = first[axis] * min(meeting, turn) + second[axis] * max(meeting - turn, 0.0)
+        draft.obstacles.centre[scene, row, axis] = met[axis] - way
+        draft.obstacles.velocity[scene, row, axis] = first[axis]
+        draft.turn_velocity[scene, row, axis] = second[axis]
+    draft.turn_time[scene, row] = turn
+
+
+@compiled
+def _fill_velocity(fast: float, heading: float, rise: float, velocity: Float) -> None:
+    """Fill in a velocity from two random numbers and the sine of its angle to the horizontal, shape (3,), [m/s]."""
+    speed, angle = _mixed(SPEED, fast), 2.0 * np.pi * heading
+    level = np.sqrt(1.0 - rise * rise)
+    velocity[0] = speed * level * np.cos(angle)
+    velocity[1] = speed * level * np.sin(angle)
+    velocity[2] = speed * rise
+
+
+@compiled
+def _course_fits(draft: Draft, changes: Changes, unit: float, scene: int, row: int) -> bool:
+    """Return True if an obstacle leaves the start free at first, and the goal at first and while movements may end."""
+    centre = draft.obstacles.centre[scene, row]
+    if max(abs(centre[0]), abs(centre[1]), abs(centre[2])) > FARTHEST:
+        return False
+    for k in range(BEGINNING_TIMES):
+        time = unit * changes.centre * BEGINNING * k / (BEGINNING_TIMES - 1)
+        if clearance_at(draft, draft.at_start, scene, row, time) < MARGIN:
+            return False
+    for k in range(-1, ENDING_TIMES):
+        share = k / (ENDING_TIMES - 1)
+        time = unit * _mixed((changes.shortest, ENDING * changes.longest), share) if k >= 0 else 0.0
+        if clearance_at(draft, draft.at_goal, scene, row, time) < MARGIN:
+            return False
+    return True
+
+
+@compiled
+def clearance_at(draft: Draft, placed: Placed, scene: int, row: int, time: float) -> float:
+    """Return the clearance of a placed arm from an obstacle at some time, at most MARGIN, [m]."""
+    obstacles = draft.obstacles
+    after = max(time - draft.turn_time[scene, row], 0.0)
+    before = (
+        obstacles.centre[scene, row, 0],
+        obstacles.centre[scene, row, 1],
+        obstacles.centre[scene, row, 2],
+    )
+    # After the turn, the place is that of the first course, moved by what the turn changes.
+    for axis in range(3):
+        change = draft.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
+        obstacles.centre[scene, row, axis] += after * change
+    least = row_clearance(draft.mover.spheres, placed, obstacles, scene, row, time, MARGIN, MARGIN, 1)
+    for axis in range(3):
+        obstacles.centre[scene, row, axis] = before[axis]
+    return float(least)
+
+
+@compiled
+def draw_jumps(draft: Draft, changes: Changes, which: Int, numbers: Float) -> Bool:
+    """Draw the jumps of the target of some scenes, and return True for scenes in which all of them fit, shape (K,).
+
+    Args:
+        draft: N scenes.
+        changes: Distribution of changes.
+        which: Indices of the scenes, shape (K,).
+        numbers: Uniform random numbers, shape (K, :func:`numbers_of_jumps`).
+    """
+    joints = draft.ends.shape[2]
+    each = 1 + CANDIDATES * (1 + joints)
+    good = np.ones(len(which), np.bool_)
+    before, target = np.empty(joints), np.empty(joints)
+    for k in range(len(which)):
+        scene, u = which[k], numbers[k]
+        count = changes.fewest_jumps + int((changes.most_jumps - changes.fewest_jumps + 1) * u[0])
+        start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
+        duration = changes.centre * time_unit(draft.mover, start, goal)
+        draft.jumps[scene] = 0.0
+        before[:] = goal
+        time = 0.0
+        for jump in range(count):
+            first = 1 + jump * each
+            time += duration * _mixed(NEXT_JUMP if jump else FIRST_JUMP, u[first])
+            fits = False
+            for candidate in range(CANDIDATES):
+                begin = first + 1 + candidate * (1 + joints)
+                if _jump(draft, start, before, u[begin : begin + 1 + joints], target):
+                    fits = _is_free_at(draft, scene, target, time)
+                if fits:
+                    break
+            if not fits:
+                good[k] = False
+                break
+            draft.jumps[scene, jump, 0] = time
+            for joint in range(joints):
+                before[joint] = target[joint]
+                draft.jumps[scene, jump, 1 + joint] = target[joint]
+    return good
+
+
+@compiled
+def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) -> bool:
+    """Fill in a target at a random distance from the one before, and return True if the hand has a way to it."""
+    mover, placed = draft.mover, draft.placed
+    if not mover.of_hand:
+        length = 0.0
+        for joint in range(len(target)):
+            target[joint] = 2.0 * u[1 + joint] - 1.0
+            length += target[joint] ** 2
+        scale = _mixed(JUMP_OF_JOINTS, u[0]) / max(np.sqrt(length), 1e-6)
+        for joint in range(len(target)):
+            target[joint] = before[joint] + scale * target[joint]
+        return True
+    x, y, _ = tool_position(mover.chain, before, placed.rotation, placed.origin)
+    a, b, _ = tool_position(mover.chain, start, placed.rotation, placed.origin)
+    length, angle = _mixed(JUMP_OF_HAND, u[0]), 2.0 * np.pi * u[1]
+    to_x, to_y = x + length * np.cos(angle), y + length * np.sin(angle)
+    # The hand is between the start and the target before: its way is between the ways from there.
+    for k in range(PASSED + 1):
+        share = k / PASSED
+        for p, q in ((a, b), (x, y)):
+            there = p + share * (to_x - p), q + share * (to_y - q)
+            if not solve_planar(mover.chain, mover.inner_range, there[0], there[1], target):
+                return False
+    return True
+
+
+@compiled
+def _is_free_at(draft: Draft, scene: int, target: Float, time: float) -> bool:
+    """Return True if a target is within the limits and free when it appears."""
+    if not is_end(draft, target):
+        return False
+    for row in range(draft.obstacles.kind.shape[1]):
+        if clearance_at(draft, draft.placed, scene, row, time) < MARGIN:
+            return False
+    return True

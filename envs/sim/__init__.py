@@ -1,1 +1,0 @@
-"""Physics simulation of plans and its metrics."""

@@ -1,0 +1,220 @@
+"""MuJoCo's batch engine with one arm and obstacles of any place, size and shape in each simulation."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import batch
+
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.geometry.obstacles import MESH, Obstacles, geoms_of
+
+OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
+"""Position of absent obstacles, [m]."""
+MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+"""Parts of a control sequence with moving obstacles: controls, then the obstacles' positions."""
+MOST_BETWEEN = 64
+"""Greatest number of states between two physics steps that are checked for contact."""
+
+
+class SimulationLog(NamedTuple):
+    """Record of n simulations over T physics steps."""
+
+    joints: Float
+    """Joint positions after each step, shape (n, T, J), [rad]."""
+    contact: Bool
+    """True where there is a contact at the state before a step, shape (n, T)."""
+    unstable: Bool
+    """True for simulations that MuJoCo stopped with a warning, shape (n,)."""
+
+
+class MeshGeom(NamedTuple):
+    """Geom of a mesh as MuJoCo compiled it: in a frame of its own, along the axes of inertia of the mesh."""
+
+    mesh: int
+    """Index of the mesh in the model."""
+    position: Float
+    """Origin of the frame in that of the shape, shape (3,), [m]."""
+    quaternion: Float
+    """Orientation of the frame in that of the shape, shape (4,)."""
+    size: Float
+    """Shape (3,), [m]."""
+    bound: float
+    """Radius of the bounding sphere, [m]."""
+    box: Float
+    """Centre and half lengths of the bounding box, shape (6,), [m]."""
+
+    @classmethod
+    def of_model(cls, model: mujoco.MjModel, name: str) -> MeshGeom:
+        """Return the geom of a name."""
+        geom = model.geom(name)
+        return cls(
+            mesh=int(geom.dataid[0]),
+            position=geom.pos.copy(),
+            quaternion=geom.quat.copy(),
+            size=geom.size.copy(),
+            bound=float(geom.rbound[0]),
+            box=model.geom_aabb[geom.id].copy(),
+        )
+
+
+class Simulator:
+    """Simulations of an arm among obstacles, on one thread.
+
+    Args:
+        arm: Arm.
+        n_obstacles: Greatest number of obstacles in a simulation.
+        num_envs: Number of simulations.
+        meshes: Names of registered meshes that obstacles may be.
+    """
+
+    def __init__(self, arm: Arm, *, n_obstacles: int, num_envs: int, meshes: Sequence[str] = ()) -> None:
+        self.arm = arm
+        self.model = arm.compile(n_obstacles, meshes)
+        """MuJoCo model."""
+        self.timestep = float(self.model.opt.timestep)
+        """Length of a physics step, [s]."""
+        self.physics_steps = 0
+        """Physics steps simulated so far, all simulations together."""
+        self.batch = batch.Batch(self.model, num_envs, 1)
+        """MuJoCo's batch engine; row i of its state is simulation i."""
+        self.thinnest = _thinnest_geom(self.model)
+        """Half the thickness of the thinnest geom of the arm that can touch an obstacle, [m]."""
+        self._rest = self.batch.state[0].copy()
+        self._geoms = np.array([self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)], int)
+        self._meshes = {name: MeshGeom.of_model(self.model, f"mesh_{name}_0") for name in meshes}
+        self._fields: dict[str, Any] = {}
+        if n_obstacles:
+            names = ("geom_type", "geom_size", "geom_rbound", "geom_aabb", *(("geom_dataid",) if meshes else ()))
+            self._fields = {name: self.batch.expand(name) for name in names}
+        self._offset = np.zeros((num_envs, n_obstacles, 3))
+        self._present = np.zeros((num_envs, n_obstacles), bool)
+        self._probe: tuple[mujoco.MjModel, mujoco.MjData] | None = None
+
+    def place(self, sims: Int, joints: Float, obstacles: Obstacles) -> None:
+        """Place the arms of n simulations at rest at joint positions (n, J), and the obstacles of n scenes."""
+        self.batch.state[sims] = self._rest
+        self.batch.bind("qpos")[sims] = joints
+        if not len(self._geoms):
+            return
+        geoms = geoms_of(obstacles)
+        rows = np.ix_(sims, self._geoms)
+        self._fields["geom_type"][rows] = geoms.type
+        self._fields["geom_size"][rows] = geoms.size
+        self._fields["geom_rbound"][rows] = geoms.bound
+        self._fields["geom_aabb"][rows] = geoms.box
+        position = geoms.position.copy()
+        quaternion = geoms.quaternion.copy()
+        for scene, row in np.argwhere(obstacles.kind == MESH):
+            mesh = self._meshes[geoms.mesh[scene, row]]
+            self._put_mesh(mesh, int(sims[scene]), int(self._geoms[row]))
+            position[scene, row] += obstacles.rotation[scene, row] @ mesh.position
+            mujoco.mju_mulQuat(quaternion[scene, row], geoms.quaternion[scene, row], mesh.quaternion)
+        self._offset[sims] = position - obstacles.centre
+        self._present[sims] = obstacles.present
+        self.batch.bind("mocap_pos")[sims] = np.where(
+            obstacles.present[..., None], position, OUT_OF_THE_WAY
+        )
+        self.batch.bind("mocap_quat")[sims] = quaternion
+
+    def rollout(
+        self, sims: Int, controls: Float, steps: Int, centres: Float | None = None, *, resume: bool = False
+    ) -> SimulationLog:
+        """Run n simulations, in increasing order, each for its own number of steps, 1 to T.
+
+        All run for T steps. To `resume` later, each is set back to its state after its own steps.
+
+        Args:
+            sims: Indices of the simulations, shape (n,).
+            controls: Controls of the actuators, shape (n, T, U).
+            steps: Steps of each simulation, shape (n,).
+            centres: Centres of moving obstacles before each step, shape (n, T, rows, 3), [m]; None if all rest.
+            resume: True if the simulations go on afterwards.
+        """
+        number = controls.shape[1]
+        warnings = self._warnings(sims)
+        kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ())) if resume else ("qpos",)
+        if centres is None:
+            out = self.batch.rollout(number, controls, record=(*kept, "ncon"), ids=sims)
+        else:
+            places = np.where(
+                self._present[sims][:, None, :, None], centres + self._offset[sims][:, None], OUT_OF_THE_WAY
+            )
+            sequence = np.concatenate((controls, places.reshape(*controls.shape[:2], -1)), axis=-1)
+            out = self.batch.rollout(number, sequence, MOVING, record=(*kept, "ncon"), ids=sims)
+        self.physics_steps += number * len(sims)
+        each, last = np.arange(len(sims)), steps - 1
+        if resume:
+            for name in kept:
+                self.batch.bind(name)[sims] = out[name][each, last]
+            if centres is not None:
+                self.batch.bind("mocap_pos")[sims] = places[each, last]
+        joints, contact = out["qpos"], out["ncon"] > 0
+        # A simulation that stops repeats its record; one that went on after its own steps was sound in them.
+        stopped = (joints[each, last] == joints[:, -1]).all(axis=-1)
+        unstable = (self._warnings(sims) > warnings) & stopped
+        unstable |= ~np.isfinite(joints[each, last]).all(axis=-1)
+        return SimulationLog(joints, contact, unstable)
+
+    def touches_between(
+        self, sim: int, joints: tuple[Float, Float], centres: tuple[Float, Float], number: int
+    ) -> bool:
+        """Return True if there is a contact between two physics steps, at `number` states on a straight line.
+
+        Args:
+            sim: Index of the simulation.
+            joints: Joint positions at both steps, shape (J,) each, [rad].
+            centres: Centres of the obstacles at both steps, shape (rows, 3) each, [m].
+            number: Number of states between the steps that are looked at.
+        """
+        if self._probe is None:
+            model = copy.copy(self.model)
+            self._probe = model, mujoco.MjData(model)
+        model, data = self._probe
+        number = min(number, MOST_BETWEEN)
+        for share in np.arange(1, number + 1) / (number + 1):
+            data.qpos[:] = (1.0 - share) * joints[0] + share * joints[1]
+            self.copy_obstacles(sim, model, data, (1.0 - share) * centres[0] + share * centres[1])
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            if data.ncon:
+                return True
+        return False
+
+    def copy_obstacles(self, sim: int, model: mujoco.MjModel, data: mujoco.MjData, centres: Float) -> None:
+        """Give a copy of the model, and its data, the obstacles of a simulation at centres of shape (rows, 3), [m]."""
+        if not len(self._geoms):
+            return
+        for name, field in self._fields.items():
+            getattr(model, name)[self._geoms] = field[sim, self._geoms]
+        places = np.where(self._present[sim][:, None], centres + self._offset[sim], OUT_OF_THE_WAY)
+        data.mocap_pos[:] = places
+        data.mocap_quat[:] = self.batch.bind("mocap_quat")[sim].reshape(-1, 4)
+
+    def _put_mesh(self, mesh: MeshGeom, sim: int, geom: int) -> None:
+        """Make a geom that of a mesh."""
+        self._fields["geom_type"][sim, geom] = mujoco.mjtGeom.mjGEOM_MESH
+        self._fields["geom_dataid"][sim, geom] = mesh.mesh
+        self._fields["geom_size"][sim, geom] = mesh.size
+        self._fields["geom_rbound"][sim, geom] = mesh.bound
+        self._fields["geom_aabb"][sim, geom] = mesh.box
+
+    def _warnings(self, sims: Int) -> Any:
+        return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
+
+
+def _thinnest_geom(model: mujoco.MjModel) -> float:
+    """Return half the thickness of the thinnest geom that takes part in contacts and is no obstacle, [m]."""
+    thin = 1.0
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        if geom.name.startswith("obstacle_") or not (geom.contype[0] or geom.conaffinity[0]):
+            continue
+        is_round = geom.type[0] in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        thin = min(thin, float(geom.size[0] if is_round else model.geom_aabb[i, 3:].min()))
+    return thin

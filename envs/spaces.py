@@ -1,0 +1,110 @@
+"""Spaces in which movements are planned: the plane of the hand, and the joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion
+from viapoint.envs.plans import Motion, SpaceName
+
+REACH_TOLERANCE = 1e-9
+"""Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]."""
+
+
+class Space(Protocol):
+    """Space in which a movement is a minimum-jerk trajectory."""
+
+    @property
+    def name(self) -> SpaceName:
+        """Name of the space."""
+
+    @property
+    def dimension(self) -> int:
+        """Dimension D."""
+
+    @property
+    def of_hand(self) -> bool:
+        """True if coordinates are those of the hand, False if they are joint positions."""
+
+    def coordinates(self, joints: Float) -> Float:
+        """Return coordinates, shape (..., D), of joint positions of shape (..., J)."""
+
+    def joints(self, coordinates: Float) -> Float:
+        """Return joint positions, shape (..., J), of coordinates of shape (..., D)."""
+
+    def joint_motion(self, motion: Motion) -> Motion:
+        """Return positions, rates and accelerations of the joints, shape (N, T, J) each, of N references."""
+
+    def inside(self, coordinates: Float) -> Bool:
+        """Return True for coordinates within reach and joint ranges, shape (...), of shape (..., D)."""
+
+
+@dataclass(frozen=True)
+class JointSpace:
+    """Space of the joints: every coordinate is the position of a joint."""
+
+    arm: Arm
+    name: SpaceName = "joints"
+    of_hand: bool = False
+
+    @property
+    def dimension(self) -> int:
+        """Number of joints."""
+        return len(self.arm.joint_names)
+
+    def coordinates(self, joints: Float) -> Float:
+        """Return joint positions as they are."""
+        return joints
+
+    def joints(self, coordinates: Float) -> Float:
+        """Return joint positions as they are."""
+        return coordinates
+
+    def joint_motion(self, motion: Motion) -> Motion:
+        """Return the references as they are."""
+        return motion
+
+    def inside(self, coordinates: Float) -> Bool:
+        """Return True where all joints are within their ranges."""
+        low, high = self.arm.joint_range.T
+        within = (coordinates >= low - REACH_TOLERANCE) & (coordinates <= high + REACH_TOLERANCE)
+        return np.asarray(within.all(axis=-1))
+
+
+@dataclass(frozen=True)
+class HandPlane:
+    """Horizontal plane of the hand of an arm of two hinges with vertical axes; coordinates are x and y."""
+
+    arm: Arm
+    name: SpaceName = "hand"
+    of_hand: bool = True
+    dimension: int = 2
+
+    def coordinates(self, joints: Float) -> Float:
+        """Return the hand's x and y, [m]."""
+        return np.asarray(self.arm.hand(joints)[..., :2])
+
+    def joints(self, coordinates: Float) -> Float:
+        """Return joint positions; out of reach, the elbow is as straight or as bent as it can be."""
+        return np.asarray(planar_joints(self.arm, coordinates))
+
+    def joint_motion(self, motion: Motion) -> Motion:
+        """Return the motion of the joints that moves the hand."""
+        return Motion(*planar_motion(self.arm, *motion))
+
+    def inside(self, coordinates: Float) -> Bool:
+        """Return True where the hand reaches the coordinates with joints within their ranges."""
+        joints = self.joints(coordinates)
+        away = np.abs(self.coordinates(joints) - coordinates).max(axis=-1)
+        within = JointSpace(self.arm).inside(joints)
+        return np.asarray(within & (away < REACH_TOLERANCE))
+
+
+def space_of(arm: Arm, name: SpaceName) -> Space:
+    """Return the space of a name for an arm."""
+    return HandPlane(arm) if name == "hand" else JointSpace(arm)

@@ -1,0 +1,294 @@
+"""Task of an environment: everything that defines it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from viapoint.envs.common.validation import (
+    fewest_and_most,
+    number_of_at_least,
+    whole_number,
+)
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.events import TRIGGERS, EventPredictor, Trigger
+from viapoint.envs.geometry.shapes import check_kinds
+from viapoint.envs.observation import ObservationLayout
+from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
+from viapoint.envs.plans import ActionLayout, SpaceName, Timing
+from viapoint.envs.rewards import RewardWeights
+from viapoint.envs.scenes.families_registry import check_families, default_families
+from viapoint.envs.scenes.sampler import SceneSampler, is_planar
+from viapoint.envs.scenes.scene import MOST_JUMPS
+from viapoint.envs.spaces import Space, space_of
+from viapoint.envs.steering import Steering
+
+END, STEPS = "end", "steps"
+"""Values of `decide_at` with one decision for a movement, and with one in every control step."""
+MOST_OBSTACLES, MOST_DRAWN = 256, 32
+"""Greatest number of obstacles in a scene that is given, and in one that is drawn."""
+PLANE_SHAPES = ("cylinder", "box")
+"""Default shapes of obstacles in the plane."""
+SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
+"""Default shapes of obstacles in space."""
+HAND_OFFSETS = (0.15, 0.25)
+"""Largest offsets of via-points along and across the straight line of the hand, [m]."""
+RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
+"""Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]."""
+JOINT_MOVEMENT = 5.0
+"""Time that a movement in joint space is given where time is limited, [s]."""
+HAND_SPEED, HAND_BANDWIDTH = 1.5, 25.0
+"""Top speed of the hand where it is steered, [m/s], and bandwidth of the reference, [rad/s]."""
+JOINT_SPEED_SHARE, JOINT_BANDWIDTH = 0.5, 12.0
+"""Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]."""
+DURATIONS: dict[str, tuple[float, float]] = {"hand": (0.6, 1.2), "joints": (1.1, 2.5)}
+"""Default duration range by space: seconds, and multiples of the shortest movement that the limits allow."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Task of an environment: arm, space, actions, scenes, decisions and rewards.
+
+    Create it with :meth:`of`, which checks the values and fills in those that depend on the arm. The environments
+    document the fields, see :class:`~viapoint.envs.vector_env.ReachVectorEnv`.
+    """
+
+    arm: Arm
+    space_name: SpaceName
+    n_via: int
+    timing: Timing
+    duration_range: tuple[float, float]
+    n_obstacles: tuple[int, int]
+    shapes: tuple[str, ...]
+    families: tuple[str, ...]
+    whole_arm: bool
+    moving_obstacles: bool
+    n_jumps: tuple[int, int]
+    decide_at: str | tuple[Trigger, ...]
+    horizon: float
+    margin: float
+    control_step: float
+    weights: RewardWeights
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        arm: Arm | str = "planar",
+        space: SpaceName | None = None,
+        n_via: int = 1,
+        timing: Timing = "optimal",
+        duration_range: tuple[float, float] | None = None,
+        n_obstacles: int | tuple[int, int] = (1, 5),
+        shapes: str | Sequence[str] | None = None,
+        families: str | Sequence[str] | None = None,
+        whole_arm: bool = False,
+        moving_obstacles: bool = False,
+        n_jumps: int | tuple[int, int] = 0,
+        decide_at: str | Sequence[Trigger] = END,
+        horizon: float = 0.3,
+        margin: float = 0.02,
+        control_step: float = 0.04,
+        reward_weights: RewardWeights | Mapping[str, float] | None = None,
+    ) -> Task:
+        """Return the task that these keyword arguments of an environment describe.
+
+        Raises:
+            TypeError: An argument has another type.
+            ValueError: An argument has a value that is not allowed.
+        """
+        arm = arm_of(arm)
+        spaces = ("hand", "joints") if arm.space == "hand" else ("joints",)
+        space = arm.space if space is None else space
+        if space not in spaces:
+            raise ValueError(f"space of this arm must be one of {', '.join(spaces)}, got {space!r}")
+        for name, value in (("moving_obstacles", moving_obstacles), ("whole_arm", whole_arm)):
+            if not isinstance(value, bool | np.bool_):
+                raise TypeError(f"{name} must be True or False, got {value!r}")
+        most = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        plane = is_planar(arm)
+        kinds = check_kinds((PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes)
+        names = (families,) if isinstance(families, str) else families
+        names = default_families(plane, kinds, most[1]) if names is None else names
+        task = cls(
+            arm=arm,
+            space_name=space,
+            n_via=whole_number("n_via", n_via, 0),
+            timing=timing,
+            duration_range=DURATIONS[space] if duration_range is None else duration_range,
+            n_obstacles=most,
+            shapes=kinds,
+            families=check_families(names, plane, kinds, most[1]),
+            whole_arm=bool(whole_arm),
+            moving_obstacles=bool(moving_obstacles),
+            n_jumps=fewest_and_most("n_jumps", n_jumps, MOST_JUMPS, MOST_JUMPS),
+            decide_at=_checked_decisions(decide_at),
+            horizon=number_of_at_least("horizon", horizon, 1e-3),
+            margin=number_of_at_least("margin", margin, 0.0),
+            control_step=number_of_at_least("control_step", control_step, 1e-3),
+            weights=RewardWeights.of(reward_weights),
+        )
+        if not task.whole_movement and timing != "optimal":
+            raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
+        if task.whole_movement and (task.moving_obstacles or task.n_jumps[1]):
+            raise ValueError("obstacles that move and targets that jump need decide_at with events of a movement")
+        if task.stepwise:
+            task.steering  # noqa: B018 - checks the control step
+        return dataclasses.replace(task, duration_range=task.action.duration_range)
+
+    @property
+    def whole_movement(self) -> bool:
+        """True if an episode is one decision."""
+        return self.decide_at == END
+
+    @property
+    def stepwise(self) -> bool:
+        """True if a decision is made in every control step."""
+        return self.decide_at == STEPS
+
+    @property
+    def replanning(self) -> bool:
+        """True if an episode is several plans, each made while the one before is under way."""
+        return not isinstance(self.decide_at, str)
+
+    @functools.cached_property
+    def space(self) -> Space:
+        """Space in which movements are planned."""
+        return space_of(self.arm, self.space_name)
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """Bounds of success."""
+        return TOLERANCES[self.space_name]
+
+    @functools.cached_property
+    def action(self) -> ActionLayout:
+        """Layout of the actions that are movements."""
+        in_hand = self.space_name == "hand"
+        width = self.arm.joint_range[:, 1] - self.arm.joint_range[:, 0]
+        offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
+        limits = np.minimum(self.arm.velocity_limit, 1e6)
+        return ActionLayout(
+            space=self.space_name,
+            names_of_axes=("along", "across") if in_hand else self.arm.joint_names,
+            n_via=self.n_via,
+            timing=self.timing,
+            duration_range=self.duration_range,
+            via_scale=HAND_OFFSETS if in_hand else tuple(float(offset) for offset in offsets),
+            rate_limit=() if in_hand else tuple(float(limit) for limit in limits),
+        )
+
+    @functools.cached_property
+    def steering(self) -> Steering:
+        """Layout of the actions of control steps."""
+        in_hand = self.space_name == "hand"
+        timestep = self.arm.timestep
+        number = round(self.control_step / timestep)
+        if abs(number * timestep - self.control_step) > 1e-6 * self.control_step or number > 500:
+            raise ValueError(
+                f"control_step must be 1 to 500 physics steps of {timestep} s, got {self.control_step!r}"
+            )
+        speeds = JOINT_SPEED_SHARE * np.minimum(self.arm.velocity_limit, 10.0)
+        return Steering(
+            space=self.space_name,
+            names=self.action.names_of_axes,
+            top_speed=(HAND_SPEED,) * 2 if in_hand else tuple(float(speed) for speed in speeds),
+            bandwidth=HAND_BANDWIDTH if in_hand else JOINT_BANDWIDTH,
+            physics_steps=number,
+            timestep=timestep,
+        )
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the components of an action."""
+        return self.steering.names if self.stepwise else self.action.names
+
+    @property
+    def time_limit(self) -> float:
+        """Time limit of an episode, [s]; very long where an episode is one movement."""
+        if self.whole_movement:
+            return 1e9
+        movement = self.duration_range[1] if self.space_name == "hand" else JOINT_MOVEMENT
+        return (1 if self.stepwise else 2 + self.n_jumps[1]) * movement + SETTLING
+
+    @functools.cached_property
+    def observation(self) -> ObservationLayout:
+        """Layout of the observations."""
+        top = 2.0 * max(self.steering.top_speed) if not self.whole_movement else 0.0
+        return ObservationLayout(
+            joint_range=tuple((float(low), float(high)) for low, high in self.arm.joint_range),
+            kinds=self.shapes,
+            n_rows=self.n_obstacles[1],
+            dimension=self.space.dimension,
+            in_joints=self.space_name == "joints",
+            n_via=self.n_via if self.replanning else None,
+            speed=top,
+            acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
+            time_limit=0.0 if self.whole_movement else self.time_limit,
+        )
+
+    def events(self) -> EventPredictor:
+        """Return the predictor of the ends of decisions."""
+        return EventPredictor(
+            self.arm,
+            self.space,
+            timestep=self.arm.timestep,
+            triggers=() if isinstance(self.decide_at, str) else self.decide_at,
+            horizon=self.horizon,
+            margin=self.margin,
+            time_limit=self.time_limit,
+        )
+
+    def sampler(self) -> SceneSampler:
+        """Return a sampler of scenes of the task."""
+        low, high = self.duration_range
+        return SceneSampler(
+            self.arm,
+            space=self.space_name,
+            n_obstacles=self.n_obstacles,
+            kinds=self.shapes,
+            families=self.families,
+            rows=self.n_obstacles[1],
+            tall=self.whole_arm,
+            jumps=self.n_jumps,
+            moving=self.moving_obstacles,
+            durations=(low, self.action.centre, high),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the task as plain values for JSON; the arm by its name."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values["arm"] = self.arm.name
+        values["space"] = values.pop("space_name")
+        values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in values.items()
+        }
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> Task:
+        """Return the task of a record of :meth:`as_dict`; its arm must be registered.
+
+        Raises:
+            ValueError: The arm is not registered, or a value is not allowed.
+        """
+        values = {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        return cls.of(**values)
+
+
+def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:
+    """Return when decisions are made."""
+    if isinstance(decide_at, str):
+        if decide_at in (END, STEPS):
+            return decide_at
+    elif isinstance(decide_at, Sequence) and all(each in TRIGGERS for each in decide_at):
+        return tuple(decide_at)
+    raise ValueError(
+        f"decide_at must be {END!r}, {STEPS!r} or some of {', '.join(TRIGGERS)}, got {decide_at!r}"
+    )
