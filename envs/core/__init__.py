@@ -1,1 +1,0 @@
-"""Core of version 2: arms as chains with spheres, compiled geometry, one environment."""

@@ -1,1 +1,0 @@
-"""Arms: chains of joints with spheres on their links."""

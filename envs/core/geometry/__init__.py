@@ -1,1 +1,0 @@
-"""Obstacles: shapes, packed arrays, signed distances and clearance."""

@@ -1,1 +1,0 @@
-"""Scenes: starts, goals and obstacles, and how they are drawn."""
