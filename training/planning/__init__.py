@@ -1,1 +1,0 @@
-"""Planning with known obstacles: candidates, compiled checks, and search."""
