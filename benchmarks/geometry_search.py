@@ -30,11 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.registration import REPLANNING_TASKS, TASKS
-from viapoint.training.planners.baselines import factory
+from viapoint.training.planning.baselines import factory
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
-from viapoint.training.search.geometry_search import GeometrySearch
-from viapoint.training.search.plan_checks import NODES, check_plans
+from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.planning.plan_checks import NODES, check_plans
 
 REPEATS = 9
 BATCH = 250

@@ -11,37 +11,38 @@ from viapoint.envs.registration import ENV_IDS, TASKS, register_all
 from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
-    from viapoint.envs.actions.via_points import Plan
-    from viapoint.envs.arm_import.loader import load_arm
-    from viapoint.envs.arms import register_arm
-    from viapoint.envs.arms.base import Arm
-    from viapoint.envs.geometry.box import Box
-    from viapoint.envs.geometry.convex_mesh import ConvexMesh
-    from viapoint.envs.geometry.cylinder import Cylinder
-    from viapoint.envs.geometry.half_space import HalfSpace
-    from viapoint.envs.geometry.point_cloud import PointCloud
-    from viapoint.envs.geometry.round_shapes import Capsule, Sphere
-    from viapoint.envs.geometry.rows import observation_rows, obstacle_rows, obstacles_from_rows
-    from viapoint.envs.geometry.shape import Shape
+    from viapoint.envs.arms.arm import Arm
+    from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
+    from viapoint.envs.arms.load import load_arm
+    from viapoint.envs.arms.registry import arm_of, register_arm
+    from viapoint.envs.env import ReachEnv
+    from viapoint.envs.geometry.distance import signed_distances
+    from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
     from viapoint.envs.geometry.shapes import (
         SHAPES,
-        add_to_model,
+        Box,
+        Capsule,
+        ConvexMesh,
+        Cylinder,
+        HalfSpace,
+        PointCloud,
+        Shape,
+        Sphere,
         as_obstacle,
         as_obstacles,
-        nearest_distance,
         obstacles_from_json,
         obstacles_to_json,
         register_mesh,
-        signed_distances,
     )
-    from viapoint.envs.mdp.task import family_sampler
+    from viapoint.envs.plans import Plan
     from viapoint.envs.record_video import RecordMovements
-    from viapoint.envs.replanning_env import ReplanningEnv, ReplanningVectorEnv
-    from viapoint.envs.scenes.families import register_scene_family
-    from viapoint.envs.scenes.options import scene_from_json, scene_to_json
-    from viapoint.envs.scenes.scene import TARGETS, rows_of_lights
-    from viapoint.envs.vector_env import ReachEnv, ReachVectorEnv
-    from viapoint.envs.velocity_env import VelocityEnv, VelocityVectorEnv
+    from viapoint.envs.rewards import RewardWeights
+    from viapoint.envs.scenes.families_registry import register_scene_family
+    from viapoint.envs.scenes.layout import Furniture, Place, Room
+    from viapoint.envs.scenes.options import Pose, scene_from_json, scene_to_json
+    from viapoint.envs.scenes.scene import Scenes
+    from viapoint.envs.task import Task
+    from viapoint.envs.vector_env import ReachVectorEnv
 else:
     __getattr__, __dir__ = lazy_imports(__name__)
 
@@ -50,40 +51,40 @@ register_all()
 __all__ = [
     "ENV_IDS",
     "SHAPES",
-    "TARGETS",
     "TASKS",
     "Arm",
     "Box",
     "Capsule",
     "ConvexMesh",
     "Cylinder",
+    "Furniture",
     "HalfSpace",
+    "Obstacles",
+    "Place",
     "Plan",
     "PointCloud",
+    "Pose",
     "ReachEnv",
     "ReachVectorEnv",
     "RecordMovements",
-    "ReplanningEnv",
-    "ReplanningVectorEnv",
+    "RewardWeights",
+    "Room",
+    "Scenes",
     "Shape",
     "Sphere",
-    "VelocityEnv",
-    "VelocityVectorEnv",
-    "add_to_model",
+    "Task",
+    "arm_of",
     "as_obstacle",
     "as_obstacles",
-    "family_sampler",
+    "inverse_kinematics",
     "load_arm",
-    "nearest_distance",
     "observation_rows",
-    "obstacle_rows",
     "obstacles_from_json",
     "obstacles_from_rows",
     "obstacles_to_json",
     "register_arm",
     "register_mesh",
     "register_scene_family",
-    "rows_of_lights",
     "scene_from_json",
     "scene_to_json",
     "signed_distances",

@@ -77,7 +77,9 @@ class Episodes:
         self._start = np.zeros((number, task.space.dimension))
         self._zero_duration = np.ones(number)
         points = task.n_via + 2
-        self.plan = Plan.at_rest(np.zeros((number, points, task.space.dimension)), np.ones((number, points - 1)))
+        self.plan = Plan.at_rest(
+            np.zeros((number, points, task.space.dimension)), np.ones((number, points - 1))
+        )
         """Plans under way."""
         self.begun = np.zeros(number, bool)
         """True where a plan is under way, shape (n,)."""
@@ -176,7 +178,9 @@ class Episodes:
             TypeError: The task has no plans.
         """
         if self.task.stepwise:
-            raise TypeError("here an action steers the arm for one control step; plans need another decide_at")
+            raise TypeError(
+                "here an action steers the arm for one control step; plans need another decide_at"
+            )
         everyone = np.ones(len(self.begun), bool)
         if self.task.whole_movement:
             return self._follow(checked_plan(plan, self._start), everyone, everyone)
@@ -310,9 +314,7 @@ class Episodes:
             goal = self.task.space.coordinates(scenes.goals((now + steps) * timestep))
             segment = Segment(rows, steps, scenes.obstacles_at(time), goal)
             begin, whole = state.steps.copy(), self.task.whole_movement
-            self.executor.run(
-                segment, self._references, resume=not whole, moving=self.task.moving_obstacles
-            )
+            self.executor.run(segment, self._references, resume=not whole, moving=self.task.moving_obstacles)
             since = (begin - self._began)[rows]
             done = since + (state.steps - begin)[rows]
             plan = self.plan.take(rows)

@@ -178,7 +178,9 @@ class Executor:
                     for later in (0, 1)
                 ]
                 way = travel(arm.reach, *ends) + np.abs(places[1] - places[0]).max(initial=0.0)
-                if self.simulator.touches_between(int(row), ends, (places[0], places[1]), int(2.0 * way / thin)):
+                if self.simulator.touches_between(
+                    int(row), ends, (places[0], places[1]), int(2.0 * way / thin)
+                ):
                     log.contact[i, k + 1] = True
                     break
 

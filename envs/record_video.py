@@ -7,8 +7,6 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import RecordVideo
 
-from viapoint.envs.multi_step import MultiStepVectorEnv
-
 EVERY_FRAME = "rgb_array_list"
 """Render mode that returns all frames of a movement."""
 
@@ -49,6 +47,5 @@ class RecordMovements(RecordVideo[Any, Any]):
     def _capture_frame(self) -> None:
         frames: Any = self.env.render()
         self.recorded_frames.extend(frames[self._shown :])
-        # In episodes of several steps, each step returns the frames from the beginning of the episode.
-        if isinstance(getattr(self.env.unwrapped, "batch", None), MultiStepVectorEnv):
-            self._shown = len(frames)
+        # Each step returns the frames from the beginning of the episode.
+        self._shown = len(frames)

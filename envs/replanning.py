@@ -80,9 +80,7 @@ def least_remaining(layout: ActionLayout) -> float:
     return 0.5 * layout.duration_range[0] if layout.space == "hand" else 0.3
 
 
-def revise(
-    layout: ActionLayout, nominal: NominalPlan, plan: Plan, actions: Float
-) -> tuple[Plan, Bool]:
+def revise(layout: ActionLayout, nominal: NominalPlan, plan: Plan, actions: Float) -> tuple[Plan, Bool]:
     """Return plans for actions (N, m), and True where the present one is kept: zero action or close to the goal."""
     zero = (actions == 0.0).all(axis=-1)
     near = (nominal.remaining > 0.0) & (nominal.remaining < least_remaining(layout))
@@ -107,7 +105,13 @@ def timed(waypoints: Float, duration: Float, state: Motion) -> Plan:
 
 
 def revised_waypoints(
-    layout: ActionLayout, line: Float, position: Float, vias: Float, goal: Float, remaining: Float, actions: Float
+    layout: ActionLayout,
+    line: Float,
+    position: Float,
+    vias: Float,
+    goal: Float,
+    remaining: Float,
+    actions: Float,
 ) -> tuple[Float, Float]:
     """Return waypoints (..., K + 2, D) and durations (...,), [s], of revised plans; batch dimensions broadcast.
 

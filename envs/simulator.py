@@ -90,7 +90,13 @@ class Simulator:
         self._meshes = {name: MeshGeom.of_model(self.model, f"mesh_{name}_0") for name in meshes}
         self._fields: dict[str, Any] = {}
         if n_obstacles:
-            names = ("geom_type", "geom_size", "geom_rbound", "geom_aabb", *(("geom_dataid",) if meshes else ()))
+            names = (
+                "geom_type",
+                "geom_size",
+                "geom_rbound",
+                "geom_aabb",
+                *(("geom_dataid",) if meshes else ()),
+            )
             self._fields = {name: self.batch.expand(name) for name in names}
         self._offset = np.zeros((num_envs, n_obstacles, 3))
         self._present = np.zeros((num_envs, n_obstacles), bool)
@@ -117,9 +123,7 @@ class Simulator:
             mujoco.mju_mulQuat(quaternion[scene, row], geoms.quaternion[scene, row], mesh.quaternion)
         self._offset[sims] = position - obstacles.centre
         self._present[sims] = obstacles.present
-        self.batch.bind("mocap_pos")[sims] = np.where(
-            obstacles.present[..., None], position, OUT_OF_THE_WAY
-        )
+        self.batch.bind("mocap_pos")[sims] = np.where(obstacles.present[..., None], position, OUT_OF_THE_WAY)
         self.batch.bind("mocap_quat")[sims] = quaternion
 
     def rollout(
@@ -138,7 +142,9 @@ class Simulator:
         """
         number = controls.shape[1]
         warnings = self._warnings(sims)
-        kept = ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ())) if resume else ("qpos",)
+        kept = (
+            ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ())) if resume else ("qpos",)
+        )
         if centres is None:
             out = self.batch.rollout(number, controls, record=(*kept, "ncon"), ids=sims)
         else:

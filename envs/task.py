@@ -137,7 +137,9 @@ class Task:
         if not task.whole_movement and timing != "optimal":
             raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
         if task.whole_movement and (task.moving_obstacles or task.n_jumps[1]):
-            raise ValueError("obstacles that move and targets that jump need decide_at with events of a movement")
+            raise ValueError(
+                "obstacles that move and targets that jump need decide_at with events of a movement"
+            )
         if task.stepwise:
             task.steering  # noqa: B018 - checks the control step
         return dataclasses.replace(task, duration_range=task.action.duration_range)
@@ -267,9 +269,7 @@ class Task:
         values["arm"] = self.arm.name
         values["space"] = values.pop("space_name")
         values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
-        return {
-            name: list(value) if isinstance(value, tuple) else value for name, value in values.items()
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> Task:

@@ -111,7 +111,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         height: int = 480,
         threads: int = 0,
     ) -> None:
-        given = as_given({name: value for name, value in locals().items() if name not in ("self", "__class__")})
+        given = as_given(
+            {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        )
         EzPickle.__init__(self, **given)
         own = ("num_envs", "autoreset_mode", "render_mode", "width", "height", "threads")
         self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
@@ -174,9 +176,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Last movements at every physics step, one for each environment; empty before the first reset."""
         if not self._running:
             return ()
-        return tuple(
-            each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun))
-        )
+        return tuple(each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun)))
 
     @property
     def last_plan(self) -> Plan | None:
@@ -393,7 +393,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         reward = np.concatenate([part.reward for part in parts])
         return Decision(observation, reward, self.terminated, self.truncated, info)
 
-    def _as_step(self, decision: Decision, active: Bool) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
+    def _as_step(
+        self, decision: Decision, active: Bool
+    ) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
         """Return the result of `step`, after the next episodes have begun where that is due."""
         observation, info = decision.observation, decision.info
         ended = self.terminated | self.truncated

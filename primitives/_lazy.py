@@ -19,7 +19,7 @@ def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
         >>> from viapoint.primitives._lazy import lazy_imports
         >>> get, names = lazy_imports("viapoint.envs")
         >>> get("Sphere").__module__
-        'viapoint.envs.geometry.round_shapes'
+        'viapoint.envs.geometry.shapes'
     """
     module: Any = sys.modules[package]
     places: dict[str, str] = {}

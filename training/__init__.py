@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
-    from viapoint.training.algorithms.agent import Agent, load_agent
-    from viapoint.training.algorithms.extractors import SceneExtractor
-    from viapoint.training.algorithms.viaq import ViaQ
+    from viapoint.training.agents.agent import Agent, load_agent
+    from viapoint.training.agents.extractors import SceneExtractor
+    from viapoint.training.agents.viaq import ViaQ
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
-    from viapoint.training.search.geometry_search import GeometrySearch
-    from viapoint.training.search.observe_candidates import ObserveCandidates, VectorObserveCandidates
+    from viapoint.training.planning.search import GeometrySearch
+    from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
     from viapoint.training.study.config import Study
     from viapoint.training.study.run import run_study
 else:

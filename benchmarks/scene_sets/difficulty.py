@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.planners.cma_planner import screen
+from viapoint.training.planning.cma_planner import screen
 from viapoint.training.rollouts.rollout import SceneSimulation
 
 FEW, MANY, ENOUGH = 512, 4096, 8

@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
-from viapoint.training.planners.replanning_baselines import INSTANTS, ReplanningPlanner
+from viapoint.training.planning.replanning_baselines import INSTANTS, ReplanningPlanner
 from viapoint.training.rollouts.rollout import EpisodeSimulation
 from viapoint.training.scene_sets.scene_set import FrozenScenes
-from viapoint.training.search.planned_movements import plan_movements
+from viapoint.training.planning.planned_movements import plan_movements
 
 SIZES = {"validation": 200, "test": 500}
 SEEDS = {"validation": 1_000_000, "test": 2_000_000}

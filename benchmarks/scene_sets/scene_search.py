@@ -14,9 +14,9 @@ from tqdm import tqdm
 from scene_sets.difficulty import planned_share, solution_share
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planning.cma_planner import Planner, PlannerBudget
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.search.geometry_search import GeometrySearch
+from viapoint.training.planning.search import GeometrySearch
 
 SPARE, SAFE = 1.2, 1.1
 """Factors on the number of scenes that are taken by their estimated share, and on this estimate, as it errs."""

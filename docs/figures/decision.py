@@ -22,8 +22,8 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import load_agent
 from viapoint.training.plotting.top_view import draw_movement
 from viapoint.training.scene_sets.scene_set import load
-from viapoint.training.search.plan_checks import check_plans
-from viapoint.training.search.planned_movements import plan_movements
+from viapoint.training.planning.plan_checks import check_plans
+from viapoint.training.planning.planned_movements import plan_movements
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 1
 """Environment, and row of its `validation` set."""

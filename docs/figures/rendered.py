@@ -16,7 +16,7 @@ from viapoint.envs import load_arm
 from viapoint.envs.common.types import Float, Frame
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent
-from viapoint.training.planners.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.scene_sets.scene_set import load
 
 ROOT = Path(__file__).parents[2]

@@ -319,7 +319,9 @@ def _capsules(
             continue
         kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
         if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
-            raise ValueError(f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none")
+            raise ValueError(
+                f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"
+            )
         half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
         link = links[name]

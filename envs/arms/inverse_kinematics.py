@@ -142,7 +142,13 @@ def _descend(
 
 @compiled
 def solve_pose(
-    chain: Chain, joint_range: Float, position: Float, axes: Float, joints: Float, rotation: Float, origin: Float
+    chain: Chain,
+    joint_range: Float,
+    position: Float,
+    axes: Float,
+    joints: Float,
+    rotation: Float,
+    origin: Float,
 ) -> bool:
     """Move joints from where they are so that the tool has a place and axes; return False if that fails.
 

@@ -110,9 +110,7 @@ def point_jacobian(
 
 
 @kernel
-def tool_jacobian(
-    chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float
-) -> None:
+def tool_jacobian(chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float) -> None:
     """Fill the derivative of the tool's position and of its rotation vector by the joints, in world axes, shape (6, J)."""
     n_joints = chain.origin.shape[0]
     x, y, z = tool_origin[0], tool_origin[1], tool_origin[2]

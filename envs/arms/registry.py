@@ -81,4 +81,6 @@ def arm_of(arm: Any) -> Arm:
         return _BUILT_IN[arm]()
     if isinstance(arm, str) and arm in _OWN:
         return _OWN[arm]
-    raise ValueError(f"arm must be an Arm or one of {', '.join(arm_names())}, got {arm!r:.60}; {REGISTER_HINT}")
+    raise ValueError(
+        f"arm must be an Arm or one of {', '.join(arm_names())}, got {arm!r:.60}; {REGISTER_HINT}"
+    )

@@ -83,9 +83,7 @@ def cover(
     for _ in range(SHRINKING):
         spheres = _spheres(names, links, capsules, excess, pairs)
         centres = sphere_centres(chain, spheres, home)
-        close = [
-            (names[a], names[b]) for a, b in pairs if _least_distance(spheres, centres, a, b) <= 0.0
-        ]
+        close = [(names[a], names[b]) for a, b in pairs if _least_distance(spheres, centres, a, b) <= 0.0]
         if not close:
             return Cover(spheres, names, left_out, max(excess.values()))
         for name in {name for pair in close for name in pair}:
@@ -96,9 +94,7 @@ def cover(
     )
 
 
-def touching_at_home(
-    model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]
-) -> set[frozenset[str]]:
+def touching_at_home(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]) -> set[frozenset[str]]:
     """Return the pairs of bodies whose geoms are in contact in the present configuration."""
     geoms = {name: _collision_geoms(model, name) for name in names}
     found = set()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from viapoint.training.algorithms.model_io import ALGORITHMS, check_hyperparameters
+from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import (
     DemoConfig,

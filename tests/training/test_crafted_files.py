@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.actions.via_points import MOST_VIAS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
-from viapoint.training.algorithms.model_io import build, load_model, save_model
+from viapoint.training.agents.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv

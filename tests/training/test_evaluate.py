@@ -11,7 +11,7 @@ from viapoint.training.evaluation.evaluator import (
     evaluate_methods,
     single_decision_times,
 )
-from viapoint.training.planners.baselines import StoredSolutions, make_method
+from viapoint.training.planning.baselines import StoredSolutions, make_method
 from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation
 from viapoint.training.scene_sets.scene_set import BANDS, load
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training.algorithms.extractors import SceneExtractor
+from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 IDS = ("viapoint/PlanarReach-v0", "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0")

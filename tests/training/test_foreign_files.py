@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from viapoint.training import load_agent
-from viapoint.training.algorithms.agent import find_model
-from viapoint.training.algorithms.model_io import weights
+from viapoint.training.agents.agent import find_model
+from viapoint.training.agents.model_io import weights
 from viapoint.training.cli import demo
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, PaperConfig, PlayConfig, TrainConfig

@@ -6,12 +6,12 @@ import pytest
 
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import REPLANNING_TASKS
-from viapoint.training.planners.baselines import factory
+from viapoint.training.planning.baselines import factory
 from viapoint.training.rollouts.rollout import new_simulation
 from viapoint.training.scene_sets.scene_set import load
-from viapoint.training.search import geometry_search
-from viapoint.training.search.geometry_search import GeometrySearch
-from viapoint.training.search.plan_checks import (
+from viapoint.training.planning import geometry_search
+from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.planning.plan_checks import (
     MAX_REFINED,
     MIN_REFINED,
     NODES,
@@ -19,7 +19,7 @@ from viapoint.training.search.plan_checks import (
     merit,
     pruned_merit,
 )
-from viapoint.training.search.planned_movements import plan_movements
+from viapoint.training.planning.planned_movements import plan_movements
 
 PLANE, WHOLE_ARM, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")

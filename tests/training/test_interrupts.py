@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.agents.model_io import load_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import BadFileError, read_arrays, versions, write_json
@@ -116,7 +116,7 @@ def test_a_partial_evaluation_replaces_no_whole_one(tmp_path, monkeypatch, shipp
     def interrupted(self, observation, scenes):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("viapoint.training.planners.baselines.RandomVias.decide", interrupted)
+    monkeypatch.setattr("viapoint.training.planning.baselines.RandomVias.decide", interrupted)
     with pytest.raises(SystemExit) as end:
         cli.main(words)
     assert end.value.code == 130

@@ -23,7 +23,7 @@ from viapoint.envs.geometry.rows import widened
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import load_agent
-from viapoint.training.algorithms.agent import SAC
+from viapoint.training.agents.agent import SAC
 from viapoint.training.cli import main as cli
 from viapoint.training.live import drawing, movements, obstacle_editing
 from viapoint.training.live.decisions import APART, plan_by_hand

@@ -7,9 +7,9 @@ import pytest
 
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planners import ompl_planner
-from viapoint.training.planners.baselines import make_method
-from viapoint.training.planners.ompl_planner import points_on
+from viapoint.training.planning import ompl_planner
+from viapoint.training.planning.baselines import make_method
+from viapoint.training.planning.ompl_planner import points_on
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load
 

@@ -13,9 +13,9 @@ from viapoint.envs import Sphere
 from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.task import Task
 from viapoint.training import ObserveCandidates, evaluate, load_agent
-from viapoint.training.algorithms.agent import SAC, find_model
-from viapoint.training.algorithms.model_io import ALGORITHMS
-from viapoint.training.algorithms.viaq import ViaQ
+from viapoint.training.agents.agent import SAC, find_model
+from viapoint.training.agents.model_io import ALGORITHMS
+from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.cli import main as cli
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
@@ -33,7 +33,7 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.live.scene_file import from_json
 from viapoint.training.paper.claim import Claim
-from viapoint.training.planners.baselines import agent_method, make_method
+from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import gallery
 from viapoint.training.plotting.video import record_video
@@ -42,7 +42,7 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
-from viapoint.training.search.geometry_search import GeometrySearch
+from viapoint.training.planning.search import GeometrySearch
 
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")

@@ -5,7 +5,7 @@ import pytest
 from scene_sets.replanning import SIZES, solution_shares
 
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planners.baselines import make_method
+from viapoint.training.planning.baselines import make_method
 from viapoint.training.rollouts.rollout import EpisodeSimulation
 from viapoint.training.scene_sets.scene_set import load
 

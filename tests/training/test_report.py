@@ -10,7 +10,7 @@ from rich.console import Console
 
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planners.baselines import StoredSolutions
+from viapoint.training.planning.baselines import StoredSolutions
 from viapoint.training.plotting import plots
 
 ENV = "viapoint/PlanarObstacles-v0"

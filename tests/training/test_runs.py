@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms import ARMS, PANDA
-from viapoint.training.algorithms.model_io import build, describe, load_model, save_model, weights
+from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io import files

@@ -8,11 +8,11 @@ from stable_baselines3 import PPO, SAC
 from viapoint.envs import Box, Cylinder, obstacles_from_rows
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.training import GeometrySearch, SceneExtractor, ViaQ, ViaVecEnv
-from viapoint.training.planners.cma_planner import Planner, PlannerBudget
+from viapoint.training.planning.cma_planner import Planner, PlannerBudget
 from viapoint.training.plotting.top_view import widened_outline
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.search.plan_checks import check_plans
-from viapoint.training.search.planned_movements import take_rows
+from viapoint.training.planning.plan_checks import check_plans
+from viapoint.training.planning.planned_movements import take_rows
 
 PANDA, PLANE, WHOLE, MOVING = (
     "viapoint/PandaObstacles-v0",
@@ -68,7 +68,7 @@ def test_planners_solve_a_scene_with_a_box():
     found = Planner(simulation, budget=PlannerBudget(first=64, generations=1))(scenes)
     assert found.success.all()
     pytest.importorskip("ompl")
-    from viapoint.training.planners.ompl_planner import MotionPlanner
+    from viapoint.training.planning.ompl_planner import MotionPlanner
 
     plan = MotionPlanner(simulation).plan(scenes)
     assert simulation.execute_plan(scenes, plan).success.all()

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from viapoint.envs.registration import STEP_TASKS
-from viapoint.training.algorithms.model_io import build
+from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planners.baselines import Straight, agent_method
+from viapoint.training.planning.baselines import Straight, agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets.scene_set import load

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from viapoint.training.algorithms.model_io import load_model
+from viapoint.training.agents.model_io import load_model
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods

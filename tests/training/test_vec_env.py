@@ -180,7 +180,7 @@ def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
     "line",
     [
         "from viapoint.training.rollouts.vec_env import ViaVecEnv; ViaVecEnv(ID, 2)",
-        "from viapoint.training.search.geometry_search import GeometrySearch; GeometrySearch(ID)",
+        "from viapoint.training.planning.search import GeometrySearch; GeometrySearch(ID)",
         "from viapoint.training import load_agent; load_agent(ID)",
     ],
 )

@@ -10,10 +10,10 @@ import torch
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from viapoint.training.algorithms.outcome_buffer import Outcomes, outcome_of
-from viapoint.training.algorithms.viaq import ViaQ
-from viapoint.training.algorithms.viaq_policy import ViaQPolicy
-from viapoint.training.planners.baselines import agent_method
+from viapoint.training.agents.outcome_buffer import Outcomes, outcome_of
+from viapoint.training.agents.viaq import ViaQ
+from viapoint.training.agents.viaq_policy import ViaQPolicy
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 
 ENV, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"

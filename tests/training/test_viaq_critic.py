@@ -16,11 +16,11 @@ import viapoint.envs.geometry.distance
 import viapoint.envs.geometry.narrow_phase
 import viapoint.envs.scenes.dynamic_scene
 import viapoint.envs.sim.outcome
-import viapoint.training.search.geometry_search
-import viapoint.training.search.plan_checks
-import viapoint.training.search.planned_clearance
-from viapoint.training.algorithms import viaq_policy
-from viapoint.training.algorithms.obstacle_parts import (
+import viapoint.training.planning.search
+import viapoint.training.planning.plan_checks
+import viapoint.training.planning.planned_clearance
+from viapoint.training.agents import viaq_policy
+from viapoint.training.agents.obstacle_parts import (
     PART,
     Poses,
     ShapePairs,
@@ -28,14 +28,14 @@ from viapoint.training.algorithms.obstacle_parts import (
     pair_features,
     whole_obstacles,
 )
-from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.algorithms.pair_networks import PairMinimum
-from viapoint.training.algorithms.viaq import ViaQ
-from viapoint.training.algorithms.viaq_critic import Values, _Saturated
+from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
+from viapoint.training.agents.pair_networks import PairMinimum
+from viapoint.training.agents.viaq import ViaQ
+from viapoint.training.agents.viaq_critic import Values, _Saturated
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
-from viapoint.training.search.candidates import best_duration, candidate_actions
-from viapoint.training.search.geometry_search import score_plans
-from viapoint.training.search.plan_checks import INFEASIBLE
+from viapoint.training.planning.candidates import best_duration, candidate_actions
+from viapoint.training.planning.search import score_plans
+from viapoint.training.planning.plan_checks import INFEASIBLE
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",
@@ -49,9 +49,9 @@ KNOW_OBSTACLES = (
     viapoint.envs.scenes.dynamic_scene,
     viapoint.envs.geometry.broad_phase,
     viapoint.envs.sim.outcome,
-    viapoint.training.search.plan_checks,
-    viapoint.training.search.planned_clearance,
-    viapoint.training.search.geometry_search,
+    viapoint.training.planning.plan_checks,
+    viapoint.training.planning.planned_clearance,
+    viapoint.training.planning.search,
 )
 FEW = {"candidates": 32, "refinements": 1, "per_refinement": 16, "width": 8}
 
@@ -73,7 +73,7 @@ def refuse_geometry(monkeypatch):
         for name, function in inspect.getmembers(module, inspect.isfunction):
             if function.__module__ == module.__name__:
                 monkeypatch.setattr(module, name, refuse)
-                for user in (viaq_policy, viapoint.training.algorithms.viaq):
+                for user in (viaq_policy, viapoint.training.agents.viaq):
                     if getattr(user, name, None) is function:
                         monkeypatch.setattr(user, name, refuse)
 
@@ -242,7 +242,7 @@ def test_bodies_that_share_a_network_differ_by_their_size(size):
         for order in ([0, 1, 2], [1, 0, 2])
     )
     assert not torch.allclose(values[:, :, 0], values[:, :, 1])
-    assert torch.equal(values, swapped[:, :, [1, 0, 2]])
+    torch.testing.assert_close(values, swapped[:, :, [1, 0, 2]])
 
 
 @pytest.mark.parametrize("networks", [(), (0, 1), (0, 0, 1)])

@@ -7,13 +7,13 @@ from typing import Any
 
 import gymnasium as gym
 
-from viapoint.training.algorithms.agent import load_agent
+from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, evenly_spread, task_of
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
-from viapoint.training.planners.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run

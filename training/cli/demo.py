@@ -10,13 +10,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.training.algorithms.agent import Agent, find_model, load_agent
-from viapoint.training.algorithms.model_io import untrained
+from viapoint.training.agents.agent import Agent, find_model, load_agent
+from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
 from viapoint.training.io.files import BadFileError, check_ours, read_json
-from viapoint.training.planners.baselines import Method, StoredSolutions, agent_method, make_method
+from viapoint.training.planning.baselines import Method, StoredSolutions, agent_method, make_method
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery, play
 from viapoint.training.plotting.video import record_video

@@ -27,7 +27,7 @@ class Preset:
     checkpoint_every: int = 5_000
     """Decisions between two checkpoints."""
     hyperparameters: tuple[tuple[str, Any], ...]
-    """Hyperparameters; schedules and noise as :mod:`viapoint.training.algorithms.model_io` writes them."""
+    """Hyperparameters; schedules and noise as :mod:`viapoint.training.agents.model_io` writes them."""
 
     def arguments(self) -> dict[str, Any]:
         """Return the hyperparameters as a new dictionary."""

@@ -19,14 +19,14 @@ from viapoint.envs.registration import REPLANNING_TASKS, check_registered
 from viapoint.envs.scenes.dynamic_scene import ChangingScenes
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sim.outcome import Outcome
-from viapoint.training.algorithms.agent import load_agent
-from viapoint.training.algorithms.model_io import untrained
+from viapoint.training.agents.agent import load_agent
+from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.checks import check_whole
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.io.files import versions
-from viapoint.training.planners.baselines import Method, agent_method, check_method, make_method
-from viapoint.training.planners.replanning_baselines import OpenLoopBaseline
+from viapoint.training.planning.baselines import Method, agent_method, check_method, make_method
+from viapoint.training.planning.replanning_baselines import OpenLoopBaseline
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for

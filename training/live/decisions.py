@@ -14,11 +14,11 @@ from viapoint import primitives
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float, Int, Observation, Single
 from viapoint.envs.mdp.observation import is_replanning
-from viapoint.training.planners.baselines import agent_method
-from viapoint.training.search.candidates import candidate_actions
-from viapoint.training.search.geometry_search import GeometrySearch
-from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN, check_plans, merit
-from viapoint.training.search.planned_movements import plan_movements
+from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.planning.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN, check_plans, merit
+from viapoint.training.planning.planned_movements import plan_movements
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task

@@ -17,7 +17,7 @@ import torch
 import viser
 
 from viapoint.envs.registration import check_registered
-from viapoint.training.algorithms.agent import Agent, load_agent
+from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.live.session import Session
 from viapoint.training.live.setting import Shared

@@ -24,7 +24,7 @@ from viapoint.envs.geometry.shapes import SHAPES
 from viapoint.envs.scenes.dynamic_scene import MOST_JUMPS, ChangingScenes
 from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.search.geometry_search import numbers_of_shape
+from viapoint.training.planning.search import numbers_of_shape
 
 SCENE_SHAPES = tuple(name for name, shape in SHAPES.items() if shape.in_scenes)
 """Shapes that obstacles of a scene may have."""

@@ -15,13 +15,13 @@ from viapoint.envs.common.types import Observation
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.registration import STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes, check_scenes
-from viapoint.training.algorithms.agent import Agent
+from viapoint.training.agents.agent import Agent
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene_draws import Draw, scene_kinds
 from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
-from viapoint.training.planners.baselines import Method, agent_method, make_method
+from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation, whole_task
 
 BASELINES = {"straight": "straight", "geometry search": "search512", "planner": "planner"}

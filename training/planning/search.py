@@ -95,7 +95,7 @@ class GeometrySearch:
 
         Args:
             observation: Parts of shape (B, .) each.
-            scenes: Unused; part of the protocol :class:`~viapoint.training.planners.baselines.Method`.
+            scenes: Unused; part of the protocol :class:`~viapoint.training.planning.baselines.Method`.
         """
         return self.solve(Problem.of_observation(observation, self.task))
 

@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.mdp.rewards import RewardTerms
 from viapoint.envs.registration import ENV_IDS, check_registered
-from viapoint.training.search.candidates import OBSERVED
-from viapoint.training.search.observe_candidates import VectorObserveCandidates
+from viapoint.training.planning.candidates import OBSERVED
+from viapoint.training.planning.observe_candidates import VectorObserveCandidates
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -75,7 +75,7 @@ class ViaVecEnv(VecEnv):
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
         observe_candidates: Number of candidate plans whose computed margins are part of the observation, see
-            :class:`~viapoint.training.search.observe_candidates.ObserveCandidates`; 0 for none.
+            :class:`~viapoint.training.planning.observe_candidates.ObserveCandidates`; 0 for none.
         **kwargs: Keyword arguments of the environment.
 
     Raises:

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
-from viapoint.training.planners.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run

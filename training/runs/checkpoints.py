@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 
-from viapoint.training.algorithms.model_io import describe
+from viapoint.training.agents.model_io import describe
 from viapoint.training.io.files import (
     BadFileError,
     read_arrays,

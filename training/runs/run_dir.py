@@ -22,8 +22,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.training.algorithms.agent import best_model
-from viapoint.training.algorithms.model_io import save_model
+from viapoint.training.agents.agent import best_model
+from viapoint.training.agents.model_io import save_model
 from viapoint.training.config.checks import check_folder
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import (

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from viapoint.training.algorithms.model_io import build
+from viapoint.training.agents.model_io import build
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError, versions

@@ -18,13 +18,13 @@ from typing import Any, TypeVar
 
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS, STEP_TASKS
-from viapoint.training.algorithms import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
-from viapoint.training.algorithms.model_io import check_hyperparameters
+from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
+from viapoint.training.agents.model_io import check_hyperparameters
 from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import preset_of
 from viapoint.training.io.files import read_json, read_yaml
-from viapoint.training.planners.baselines import check_method
+from viapoint.training.planning.baselines import check_method
 from viapoint.training.scene_sets.scene_set import SETS, shipped_path
 
 Values = Mapping[str, Any]

@@ -10,10 +10,10 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from viapoint.training.algorithms.model_io import load_model, untrained
+from viapoint.training.agents.model_io import load_model, untrained
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json, write_json
-from viapoint.training.planners.baselines import Method, StoredSolutions, agent_method, make_method
+from viapoint.training.planning.baselines import Method, StoredSolutions, agent_method, make_method
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume

@@ -14,7 +14,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
 from viapoint.primitives import speed_valleys
-from viapoint.training.algorithms.agent import load_agent
+from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.movements import (
@@ -28,7 +28,7 @@ from viapoint.training.paper.movements import (
     simulate,
 )
 from viapoint.training.paper.rows.curved import FAST, SLOW
-from viapoint.training.planners.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)

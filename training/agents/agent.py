@@ -16,12 +16,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
-from viapoint.training.algorithms.model_io import ALGORITHMS, load_model, save_model
+from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
-from viapoint.training.search.geometry_search import scene_from_rest
-from viapoint.training.search.observe_candidates import with_candidates
+from viapoint.training.planning.search import scene_from_rest
+from viapoint.training.planning.observe_candidates import with_candidates
 
 if TYPE_CHECKING:
     from viapoint.envs.geometry.shape import Shape

@@ -6,7 +6,7 @@ outcome of single movements which pair of obstacle and link determined it:
     m(s, a) = min over obstacle parts i, bodies h, instants t of q_h(i seen from h at t)
 
 Each q_h is a small network. Its input is the pose of an obstacle relative to a body, a capsule of the arm
-(:mod:`viapoint.training.algorithms.obstacle_parts`); the planned pose of the body follows from the plan alone. Bodies
+(:mod:`viapoint.training.agents.obstacle_parts`); the planned pose of the body follows from the plan alone. Bodies
 may share a network, which then also gets their size. The distance between surfaces is learned, not computed.
 """
 
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from viapoint.training.algorithms.obstacle_parts import CapsulePairs, PairGeometry, Parts, Poses
+from viapoint.training.agents.obstacle_parts import CapsulePairs, PairGeometry, Parts, Poses
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -140,7 +140,7 @@ class PairMinimum(nn.Module):
 
         This takes a fraction of the time of the minimum over all pairs, and is never less. A pair is near if its
         distance exceeds the least one of the plan by at most `near`, [m]. Distance means here the rough one of
-        :meth:`~viapoint.training.algorithms.obstacle_parts.PairGeometry.gap`.
+        :meth:`~viapoint.training.agents.obstacle_parts.PairGeometry.gap`.
         """
         scenes = range(len(parts.present))
         return torch.stack([self._of_near_pairs(poses, parts, near, scene) for scene in scenes])

@@ -27,7 +27,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from viapoint.envs.actions.via_points import MOST_VIAS
 from viapoint.envs.scenes.families import MOST_OBSTACLES
-from viapoint.training.algorithms.extractors import EXTRACTORS
+from viapoint.training.agents.extractors import EXTRACTORS
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments, observed_candidates

@@ -131,7 +131,7 @@ class MotionPlanner:
         return clear
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return plans as rows, see :class:`~viapoint.training.planners.baselines.Method`."""
+        """Return plans as rows, see :class:`~viapoint.training.planning.baselines.Method`."""
         d = scenes.start.shape[-1]
         rows = np.zeros((len(scenes.start), 2 + VIA_COUNTS[-1] * d))
         for i, row in enumerate(rows):

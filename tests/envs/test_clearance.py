@@ -27,7 +27,10 @@ def unit(rng, size):
 def some_shapes(rng, number, kinds=KINDS, moving=False):
     shapes = []
     for _ in range(number):
-        pose = {"position": rng.uniform(-0.7, 0.7, 3) * (1.0, 1.0, rng.choice((0.2, 1.0))), "quaternion": unit(rng, 4)}
+        pose = {
+            "position": rng.uniform(-0.7, 0.7, 3) * (1.0, 1.0, rng.choice((0.2, 1.0))),
+            "quaternion": unit(rng, 4),
+        }
         pose["velocity"] = rng.uniform(-0.5, 0.5, 3) if moving else (0.0, 0.0, 0.0)
         kind = rng.choice(kinds)
         if kind == "sphere":

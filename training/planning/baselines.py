@@ -15,14 +15,14 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.planners.cma_planner import Planner
-from viapoint.training.planners.ompl_planner import MotionPlanner
-from viapoint.training.planners.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
+from viapoint.training.planning.cma_planner import Planner
+from viapoint.training.planning.ompl_planner import MotionPlanner
+from viapoint.training.planning.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
 from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, new_simulation
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.search.candidates import candidate_actions
-from viapoint.training.search.geometry_search import GeometrySearch, score_plans
-from viapoint.training.search.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
+from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.search import GeometrySearch, score_plans
+from viapoint.training.planning.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 
 class Method(Protocol):

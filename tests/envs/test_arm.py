@@ -67,7 +67,9 @@ NEEDLE = """
 def small(kind="capsule", size='fromto="0 0 0 0.2 0 0" size="0.02"', gap=0.1):
     xml = NEEDLE.format(kind=kind, size=size, gap=gap)
     limits = {"velocity_limit": (2.0,) * 3, "torque_limit": (50.0,) * 3}
-    return arm_from_xml("small", xml, joints=("one", "two", "three"), tool="tip", home=(0.0, 0.0, 0.0), **limits)
+    return arm_from_xml(
+        "small", xml, joints=("one", "two", "three"), tool="tip", home=(0.0, 0.0, 0.0), **limits
+    )
 
 
 def test_collision_geoms_of_other_shapes_are_refused():

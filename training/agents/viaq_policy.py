@@ -19,18 +19,18 @@ from viapoint.envs.geometry.rows import has_shapes
 from viapoint.envs.mdp.observation import is_replanning
 from viapoint.envs.mdp.task import Task
 from viapoint.envs.sim.outcome import SETTLING
-from viapoint.training.algorithms.obstacle_parts import Poses, cut_obstacles, whole_obstacles
-from viapoint.training.algorithms.viaq_critic import PlanInputs, SceneInputs, ViaQCritic
+from viapoint.training.agents.obstacle_parts import Poses, cut_obstacles, whole_obstacles
+from viapoint.training.agents.viaq_critic import PlanInputs, SceneInputs, ViaQCritic
 from viapoint.training.config.checks import check_arguments
-from viapoint.training.search.candidates import candidate_actions, normal_steps
-from viapoint.training.search.geometry_search import best_actions, score_plans
-from viapoint.training.search.plan_checks import (
+from viapoint.training.planning.candidates import candidate_actions, normal_steps
+from viapoint.training.planning.search import best_actions, score_plans
+from viapoint.training.planning.plan_checks import (
     CLEARANCE_MARGIN,
     INFEASIBLE,
     REACH_MARGIN,
     reward_bounds,
 )
-from viapoint.training.search.planned_movements import (
+from viapoint.training.planning.planned_movements import (
     Observation,
     direction,
     plan_movements,

@@ -23,13 +23,13 @@ from torch.nn import functional
 from viapoint.envs.arms import ARMS
 from viapoint.envs.mdp.rewards import StepRewardWeights
 from viapoint.envs.mdp.task import Task
-from viapoint.training.algorithms.agent import Agent
-from viapoint.training.algorithms.model_io import ALGORITHMS
-from viapoint.training.algorithms.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
-from viapoint.training.algorithms.viaq_critic import Values
-from viapoint.training.algorithms.viaq_policy import KEEP, ViaQPolicy
+from viapoint.training.agents.agent import Agent
+from viapoint.training.agents.model_io import ALGORITHMS
+from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
+from viapoint.training.agents.viaq_critic import Values
+from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.config.checks import check_arguments
-from viapoint.training.search.candidates import candidate_actions
+from viapoint.training.planning.candidates import candidate_actions
 
 FIXED_PARTS = ("arm", "whole_arm", "action")
 """Parts of the task that agent and environment must share, because the policy plans with them."""

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from viapoint.envs.geometry.rows import CAPSULES
 from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.training.algorithms.obstacle_parts import Parts, Poses, ShapePairs
-from viapoint.training.algorithms.pair_networks import PairMinimum, dense, networks_of
+from viapoint.training.agents.obstacle_parts import Parts, Poses, ShapePairs
+from viapoint.training.agents.pair_networks import PairMinimum, dense, networks_of
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -82,7 +82,7 @@ class _Saturated(torch.autograd.Function):
 class ViaQCritic(nn.Module):
     """Network that predicts the value of plans from their margin, reach and effort.
 
-    The margin m(s, a) is learned (see :mod:`viapoint.training.algorithms.pair_networks`). The reach margin r(a) of the
+    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pair_networks`). The reach margin r(a) of the
     planned hand does not depend on obstacles and is computed:
 
         P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(l r + d + c(s, a)),

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from viapoint.envs.common.types import Observation, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.mdp.observation import is_replanning
-from viapoint.training.search.candidates import OBSERVED, candidate_actions
-from viapoint.training.search.plan_checks import check_plans
-from viapoint.training.search.planned_movements import take_rows
+from viapoint.training.planning.candidates import OBSERVED, candidate_actions
+from viapoint.training.planning.plan_checks import check_plans
+from viapoint.training.planning.planned_movements import take_rows
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -36,7 +36,7 @@ def candidate_margins(observation: Mapping[str, NDArray[Any]], task: Task, numbe
     """Return the computed margins of fixed candidate plans, shape (B, number), [m].
 
     The margin of a plan is the minimum of its clearance and its reach margin, clipped to +- BOUND. Candidate k is the
-    same action in every observation, see :func:`~viapoint.training.search.candidates.candidate_actions`; the first one
+    same action in every observation, see :func:`~viapoint.training.planning.candidates.candidate_actions`; the first one
     is the zero action.
     """
     actions = candidate_actions(task, number, replanning=is_replanning(observation))

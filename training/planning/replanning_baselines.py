@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
 from viapoint.training.rollouts.rollout import EpisodeSimulation, SimulationResults
-from viapoint.training.search.candidates import sobol_actions
-from viapoint.training.search.planned_movements import plan_movements
+from viapoint.training.planning.candidates import sobol_actions
+from viapoint.training.planning.planned_movements import plan_movements
 
 SUFFICIENT_CLEARANCE = 0.004
 """Clearance beyond which more of it has no merit, [m]."""
@@ -32,7 +32,7 @@ class OpenLoopBaseline:
         self._simulation = EpisodeSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
-        """Return the decision of the method, see :class:`viapoint.training.planners.baselines.Method`."""
+        """Return the decision of the method, see :class:`viapoint.training.planning.baselines.Method`."""
         decisions: Float = self._method.decide(observation, scenes)
         return decisions
 
@@ -54,7 +54,7 @@ class ReplanningPlanner:
         self._generator = np.random.default_rng(0)
 
     def decide(self, observation: Observation, scenes: Any) -> Float:
-        """Return the best actions, see :class:`viapoint.training.planners.baselines.Method`."""
+        """Return the best actions, see :class:`viapoint.training.planning.baselines.Method`."""
         number = len(scenes.start)
         rows = [slice(first, first + GROUP) for first in range(0, number, GROUP)]
         return np.concatenate(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.search.plan_checks import check_plans
+from viapoint.training.planning.plan_checks import check_plans
 
 if TYPE_CHECKING:
     from viapoint.envs.mdp.task import Task
@@ -135,7 +135,7 @@ class Planner:
         return rewards
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return the best actions, see :class:`~viapoint.training.planners.baselines.Method`."""
+        """Return the best actions, see :class:`~viapoint.training.planning.baselines.Method`."""
         return self(scenes).action
 
     def _refine(self, scenes: Scenes, found: PlannedActions) -> None:

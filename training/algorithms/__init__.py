@@ -1,5 +1,0 @@
-"""Learning algorithms, their networks and replay buffers."""
-
-from viapoint.training.algorithms.viaq import ViaQ  # which adds itself to the table of algorithms
-
-__all__ = ["ViaQ"]

@@ -1,1 +1,0 @@
-"""Planners and baselines without learning."""

@@ -1,1 +1,0 @@
-"""Search for plans by computed geometry."""
