@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import clearance_profile
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion, Plan

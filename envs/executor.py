@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import tool_position
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
     configuration_clearances,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from viapoint.envs.common.types import Float
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.kinematics import inverse_dynamics
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.compiled import compiled
 
 LIMIT_SHARE = 0.97

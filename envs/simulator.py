@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import MESH, Obstacles, geoms_of
 
 OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])

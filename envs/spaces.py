@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.plans import Motion, SpaceName
 
 REACH_TOLERANCE = 1e-9

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.validation import (
     fewest_and_most,
     number_of_at_least,
     whole_number,
 )
-from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.events import TRIGGERS, EventPredictor, Trigger
 from viapoint.envs.geometry.shapes import check_kinds
 from viapoint.envs.observation import ObservationLayout

@@ -15,6 +15,7 @@ from gymnasium.utils import EzPickle, seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import (
     as_given,
@@ -25,7 +26,6 @@ from viapoint.envs.common.validation import (
     seeds_of,
     whole_number,
 )
-from viapoint.envs.arms.arm import Arm
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.events import Trigger
 from viapoint.envs.outcome import Rollout

@@ -7,11 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.kinematics import forward, link_frames, tool_jacobian, transform
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled
 
 ITERATIONS = 80

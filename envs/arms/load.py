@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, number_of_at_least
 
 DEFAULT_VELOCITY_LIMIT = 2.0
 """Velocity limit of joints without one, [rad/s] or [m/s]."""

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Float
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import sphere_centres
+from viapoint.envs.common.types import Float
 
 LARGEST_EXCESS = 0.005
 """Greatest distance by which a sphere may stick out of a capsule, [m]."""

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import link_frames
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.kernels import inlined, kernel

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.inverse_kinematics import solve_planar, solve_pose, solve_position
 from viapoint.envs.arms.kinematics import tool_position, transform
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.arms.inverse_kinematics import solve_planar
 from viapoint.envs.arms.kinematics import tool_position
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import finite_array
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints
 from viapoint.envs.arms.kinematics import sphere_centres
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     REGISTERED_MESHES,

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import planar_joints
 from viapoint.envs.arms.kinematics import link_poses, sphere_centres
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.plans import SpaceName

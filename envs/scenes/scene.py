@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance

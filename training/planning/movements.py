@@ -86,9 +86,7 @@ def movement_table(n_via: int) -> MovementTable:
     velocity[:, n_via + 1] = 1.0
     acceleration[:, n_via + 2] = 1.0
     each = np.repeat(durations[:, None], columns, axis=1)
-    movements = primitives.through(
-        waypoints, each, start_velocity=velocity, start_acceleration=acceleration
-    )
+    movements = primitives.through(waypoints, each, start_velocity=velocity, start_acceleration=acceleration)
     instants = np.linspace(0.0, 1.0, INSTANTS)
     basis = np.ascontiguousarray(movements(instants)[..., 0].transpose(0, 2, 1))
     rate = np.ascontiguousarray(movements(instants, 1)[..., 0].transpose(0, 2, 1))
@@ -190,7 +188,11 @@ def least_clearance(
             placed.ball[0, 0] = place_of_hand[0]
             placed.ball[0, 1] = place_of_hand[1]
             placed.ball[0, 2] = 0.0
-            placed.centre[0, 0], placed.centre[0, 1], placed.centre[0, 2] = place_of_hand[0], place_of_hand[1], 0.0
+            placed.centre[0, 0], placed.centre[0, 1], placed.centre[0, 2] = (
+                place_of_hand[0],
+                place_of_hand[1],
+                0.0,
+            )
             placed.known[0] = True
         else:
             if setting.of_hand:

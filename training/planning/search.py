@@ -235,5 +235,3 @@ def registered_task(env_id: str, **kwargs: Any) -> Task:
     task: Task = env.unwrapped.task
     env.close()
     return task
-
-
