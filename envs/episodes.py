@@ -309,7 +309,7 @@ class Episodes:
             now = state.steps[rows]
             turn = np.where(turns[rows] > now[:, None], turns[rows], NEVER).min(axis=1, initial=NEVER)
             steps = np.minimum(last[rows], turn) - now
-            time = now * timestep
+            time = np.asarray(now * timestep)
             scenes = self.scenes.take(rows)
             goal = self.task.space.coordinates(scenes.goals((now + steps) * timestep))
             segment = Segment(rows, steps, scenes.obstacles_at(time), goal)
@@ -318,7 +318,9 @@ class Episodes:
             since = (begin - self._began)[rows]
             done = since + (state.steps - begin)[rows]
             plan = self.plan.take(rows)
-            state.jerk_cost[rows] += jerk_cost_between(plan, since * timestep, done * timestep)
+            state.jerk_cost[rows] += jerk_cost_between(
+                plan, np.asarray(since * timestep), np.asarray(done * timestep)
+            )
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""

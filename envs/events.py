@@ -5,7 +5,7 @@ Plans and courses are known to the environment, so all events but a contact are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -111,7 +111,9 @@ class EventPredictor:
         number = np.ceil((np.minimum(time, 1e8) - 1e-9) / self.timestep).astype(np.int64)
         return np.where(time < 1e8, number, NEVER)
 
-    def __call__(self, plan: Plan, began: Int, now: Int, scenes: Scenes, goal: Float) -> Ends:
+    def __call__(
+        self, plan: Plan, began: Int, now: Int, scenes: Scenes, goal: Callable[[Float], Float]
+    ) -> Ends:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
         Args:

@@ -109,7 +109,7 @@ class Executor:
         else:  # at rest at the start
             joints = scene.start.copy()
             planned, contact = self.space.coordinates(joints), np.zeros(1, bool)
-        time = self.simulator.timestep * np.arange(1, len(joints) + 1)
+        time = np.asarray(self.simulator.timestep * np.arange(1, len(joints) + 1))
         every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
         clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
         return Rollout(time, planned, joints, arm.hand(joints), contact, clearance[:, 0])

@@ -256,7 +256,7 @@ class ActionLayout:
         trajectory = primitives.through(waypoints, shares)
         velocity = trajectory(np.linspace(0.0, 1.0, PEAK_INSTANTS + 1)[1:-1], 1)
         relative = np.abs(velocity) / np.array(self.rate_limit)
-        return np.maximum(relative.max(axis=(-2, -1)), SHORTEST_DURATION)
+        return np.asarray(np.maximum(relative.max(axis=(-2, -1)), SHORTEST_DURATION))
 
     def _shares(self, waypoints: Float, action: Float) -> Float:
         """Return the shares of the duration of the segments, shape (..., K + 1)."""

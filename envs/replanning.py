@@ -17,7 +17,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.plans import ActionLayout, Motion, Plan, turned
 
 CORRECTION_JERK = 10.0
-"""Jerk of the correction by which a plan follows a goal that moves a little, [m/s^3] or [rad/s^3]: 60 distance / time^3."""
+"""Jerk with which a plan follows a goal that moves a little, [m/s^3] or [rad/s^3]: 60 distance / time^3."""
 NEARBY = {"hand": 0.02, "joints": 0.05}
 """Distance of a new goal from the old one below which the plan changes in proportion, [m] or [rad]."""
 

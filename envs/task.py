@@ -278,7 +278,10 @@ class Task:
         Raises:
             ValueError: The arm is not registered, or a value is not allowed.
         """
-        values = {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+        values: dict[str, Any] = dict(record)
+        for name, value in record.items():
+            if isinstance(value, list):
+                values[name] = tuple(value)
         return cls.of(**values)
 
 

@@ -116,8 +116,8 @@ class Arm:
     def controls(self, position: Float, velocity: Float, acceleration: Float, stride: int = 1) -> Float:
         """Return controls of the actuators that track motions of the joints, shape (N, T, J).
 
-        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the torque of
-        the motion, plus stiffness and damping times the references.
+        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the
+        torque of the motion, plus stiffness and damping times the references.
 
         Args:
             position: References of the joints at T physics steps, shape (N, T, J).
@@ -330,7 +330,7 @@ def _capsules(
     return found
 
 
-def _collides(model: mujoco.MjModel, body: int) -> Bool:
+def _collides(model: mujoco.MjModel, body: int) -> bool:
     """Return True for a body with a geom that takes part in contacts."""
     geoms = model.geom_bodyid == body
     return bool((geoms & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))).any())
@@ -388,7 +388,7 @@ def _greatest_inertia(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[
 
 
 def _reach(chain: Chain, spheres: Spheres, joint_range: Float) -> Float:
-    """Return the greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, (J,), [m]."""
+    """Return the greatest distance of a sphere from the axis of each joint, 1 for slides, shape (J,), [m]."""
     number = len(chain.mass)
     farthest = np.zeros(number + 2)
     for link in range(number, 0, -1):

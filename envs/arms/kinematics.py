@@ -111,7 +111,7 @@ def point_jacobian(
 
 @kernel
 def tool_jacobian(chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float) -> None:
-    """Fill the derivative of the tool's position and of its rotation vector by the joints, in world axes, shape (6, J)."""
+    """Fill the derivative of the tool's position and rotation vector by the joints, shape (6, J), world axes."""
     n_joints = chain.origin.shape[0]
     x, y, z = tool_origin[0], tool_origin[1], tool_origin[2]
     point_jacobian(chain, rotation, origin, n_joints, x, y, z, jacobian)
@@ -315,7 +315,7 @@ def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return the world frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins, (..., J + 1, 3), [m]."""
+    """Return the frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins (..., J + 1, 3), [m]."""
     flat, batch = _flat("joints", chain, joints)
     links = len(chain.mass) + 1
     rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
@@ -324,7 +324,7 @@ def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 
 def jacobians(chain: Chain, joints: Float) -> Float:
-    """Return the derivatives of the tool's position and rotation vector by the joints, shape (..., 6, J), world axes."""
+    """Return the derivatives of the tool's position and rotation vector by the joints, (..., 6, J), world axes."""
     flat, batch = _flat("joints", chain, joints)
     jacobian = np.empty((len(flat), 6, flat.shape[1]))
     _all_jacobians(chain, flat, jacobian)

@@ -75,7 +75,7 @@ class EpisodeRenderer:
     def _draw(self, recorded: Recorded, step: int) -> Any:
         """Return the picture of a step, or show it and return False after the window has been closed."""
         view, screen = self._open()
-        view.set(self._picture(recorded, step))
+        view.write(self._picture(recorded, step))
         return screen.draw()
 
     def _picture(self, recorded: Recorded, step: int) -> Picture:

@@ -74,7 +74,7 @@ class SceneView:
         self._floor = float(self.model.geom("table").pos[2])
         self._aim(width, height)
 
-    def set(self, picture: Picture) -> None:
+    def write(self, picture: Picture) -> None:
         """Set up one picture."""
         self._pose(picture)
         shapes = ShapeWriter(self.scene)
@@ -89,7 +89,7 @@ class SceneView:
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
             if len(part) > 1:
-                shapes.line(part + [0.0, 0.0, PLAN], DONE, colour)
+                shapes.line(part + np.array([0.0, 0.0, PLAN]), DONE, colour)
 
     def _pose(self, picture: Picture) -> None:
         """Start the scene with the arm in a configuration among the obstacles; geoms in contact are red."""
