@@ -245,7 +245,7 @@ class Episodes:
         """
         if not rows.size:
             return
-        state = self.executor.state
+        state, given = self.executor.state, plan
         plan = plan.take(rows)
         plan, stretch, within = self._within_limits(plan)
         inside = self._inside(plan)
@@ -253,10 +253,9 @@ class Episodes:
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
-        if self.task.whole_movement:  # with any number of via-points
-            self.plan = plan
-        else:
-            put(self.plan, rows, plan)
+        if given.waypoints.shape != self.plan.waypoints.shape:  # whole movements have any number of via-points
+            self.plan = Plan(*(part.copy() for part in given))
+        put(self.plan, rows, plan)
         self.last_plan = Plan(*(part.copy() for part in self.plan))
         self._began[rows] = state.steps[rows]
         self.begun[rows] = True

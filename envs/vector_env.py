@@ -251,14 +251,30 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             decision = decision._replace(observation=self.observe())
         return self._as_step(decision, ~over)
 
-    def execute_actions(self, actions: Any) -> Decision:
+    def begin(self, scenes: Scenes) -> Observation:
+        """Start scenes that were drawn or checked before, one in each environment, and return first observations."""
+        rows = np.arange(self.num_envs)
+        self._start(rows, scenes)
+        for flags in (self.terminated, self.truncated, self._over):
+            flags[rows] = False
+        return self.observe()
+
+    def execute_actions(self, actions: Any, active: Bool | None = None) -> Decision:
         """Make one decision in each environment and execute it until it ends, without a reset.
 
         `terminated` and `truncated` tell which episodes ended; these must not be continued.
+
+        Args:
+            actions: Shape (num_envs, m), in [-1, 1]; components beyond are clipped.
+            active: True for environments that take part, shape (num_envs,); by default all. Results of others mean
+                nothing.
         """
         self._check_running()
         actions = checked_actions(actions, self.num_envs, self.action_names)
-        decision = self._joined(self._each(lambda episodes, share: episodes.decide(actions[share])))
+        some = np.ones(self.num_envs, bool) if active is None else active
+        decision = self._joined(
+            self._each(lambda episodes, share: episodes.decide(actions[share], some[share]))
+        )
         self._show()
         return decision
 

@@ -7,7 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from viapoint.envs.registration import OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS, TASKS
+from viapoint.envs.task import Task
 
 Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
 
@@ -114,14 +114,12 @@ REPLANNING_PRESETS: dict[str, Preset] = {
 """Presets of replanning tasks."""
 
 
-def preset_of(env_id: str, algo: Algorithm) -> Preset:
-    """Return the default settings of an algorithm in an environment."""
-    if env_id in STEP_TASKS:
+def preset_of(task: Task, algo: Algorithm) -> Preset:
+    """Return the default settings of an algorithm for a task."""
+    if task.stepwise:
         return STEP_PRESETS[algo]
-    task = TASKS.get(OWN_ARM_TASKS.get(env_id, env_id), {})
-    presets = PRESETS
-    if env_id in REPLANNING_TASKS:
-        presets = REPLANNING_PRESETS
-    elif task.get("n_obstacles") == 0:
-        presets = REACH_PRESETS
-    return presets.get(algo, PRESETS[algo])
+    if task.replanning:
+        return REPLANNING_PRESETS.get(algo, PRESETS[algo])
+    if not task.n_obstacles[1]:
+        return REACH_PRESETS.get(algo, PRESETS[algo])
+    return PRESETS[algo]

@@ -15,19 +15,25 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float, Int, Observation
-from viapoint.envs.registration import REPLANNING_TASKS, check_registered
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Outcome
+from viapoint.envs.outcome import Outcome
+from viapoint.envs.registration import check_registered
+from viapoint.envs.scenes.scene import NEVER, Scenes
+from viapoint.envs.task import Task
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.checks import check_whole
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.io.files import versions
-from viapoint.training.planning.baselines import Method, agent_method, check_method, make_method
-from viapoint.training.planning.replanning_baselines import OpenLoopBaseline
-from viapoint.training.rollouts.rollout import EpisodeSimulation, SceneSimulation, new_simulation, whole_task
+from viapoint.training.planning.baselines import (
+    Method,
+    OpenLoopBaseline,
+    agent_method,
+    check_method,
+    make_method,
+)
+from viapoint.training.planning.search import registered_task
+from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
@@ -220,9 +226,10 @@ def evaluate(
             check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
-    env_id, kwargs = task_of(agent, env, env_kwargs)
-    check_baselines(baselines, agent, env_id)
-    chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), env_id, kwargs)
+    env_id, kwargs = environment_of(agent, env, env_kwargs)
+    task = registered_task(env_id, **kwargs)
+    check_baselines(baselines, agent, task)
+    chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
     methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
     return evaluate_methods(
         methods,
@@ -240,7 +247,7 @@ def evenly_spread(number: int, count: int | None) -> Int:
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
-def task_of(
+def environment_of(
     agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
     """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
@@ -252,21 +259,20 @@ def task_of(
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
         check_registered(env)
-        return whole_task(env, env_kwargs or {})
+        return env, whole_task(env, env_kwargs or {})
     mine, kwargs = env_arguments(agent.get_env())
-    env_id, kwargs = whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
-    if env not in (None, mine, env_id):
+    if env not in (None, mine):
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
-    return env_id, kwargs
+    return mine, whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
 
 
 def check_baselines(
-    baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, env_id: str
+    baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, task: Task
 ) -> None:
-    """Check that the named baselines exist for an environment."""
+    """Check that the named baselines exist for a task."""
     for each in baselines:
         if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
-            check_method(each, env_id)
+            check_method(each, task)
 
 
 def _rows_of(
@@ -295,9 +301,9 @@ def _baselines(
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
             methods += _rows_of(untrained(agent), checks, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and env_id in REPLANNING_TASKS:
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
             first = agent_method("agent", agent, None if checks is None else 0)
-            methods.append(OpenLoopBaseline(first, EpisodeSimulation(env_id, **env_kwargs)))
+            methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs)))
         else:
             methods.append(make_method(each, env_id, **env_kwargs))
     return methods
@@ -317,7 +323,7 @@ def evaluate_methods(
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     results: list[MethodResult] = []
-    opened = new_simulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
+    opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
     with one_thread(), closing(opened) as simulation:
         for method in methods:
             result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
@@ -367,17 +373,16 @@ def _evaluate_one(
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
-        distance=_distances(frozen.scenes)[:done],
+        distance=_distances(frozen.scenes, simulation.task)[:done],
         partial=interrupted and done < number,
         interrupted=interrupted,
     )
 
 
-def _distances(scenes: Scenes | ChangingScenes) -> Float:
-    away = np.linalg.norm(scenes.goal - scenes.start, axis=-1)
-    if isinstance(scenes, ChangingScenes):
-        return np.where(np.isfinite(scenes.jump_times).any(axis=-1), np.nan, away)
-    return np.asarray(away)
+def _distances(scenes: Scenes, task: Task) -> Float:
+    """Return the hand's distances from start to goal, shape (N,), [m]; NaN if the target jumps."""
+    away = np.linalg.norm(task.arm.hand(scenes.goal) - task.arm.hand(scenes.start), axis=-1)
+    return np.where((scenes.jump_times < NEVER).any(axis=-1), np.nan, away)
 
 
 def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:
@@ -399,8 +404,8 @@ def single_decision_times(
     In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
     """
     began, stopwatch = time.perf_counter(), _Stopwatch(method)
-    replanning = isinstance(simulation, EpisodeSimulation) and not hasattr(method, "execute")
-    alone = EpisodeSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
+    replanning = simulation.task.replanning and not hasattr(method, "execute")
+    alone = SceneSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
     with closing(alone) if alone else nullcontext():
         for row in range(min(most, len(scenes.start))):
             one = scenes.take(slice(row, row + 1))

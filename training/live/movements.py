@@ -3,173 +3,195 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.actions.via_points import Plan
+from viapoint.envs import Plan, ReachVectorEnv, Scenes, Task
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
-
-if TYPE_CHECKING:
-    from viapoint.envs.mdp.task import Task
-    from viapoint.envs.sim.outcome import Rollout
-    from viapoint.training.live.decisions import DecisionMaker
-    from viapoint.training.live.scene_file import LiveScene
+from viapoint.envs.common.types import Bool, Float, Observation
+from viapoint.envs.geometry.clearance import FAR, configuration_clearances
+from viapoint.envs.outcome import Rollout
+from viapoint.training.live.scene import LiveScene
 
 SAMPLES = 80
-"""Instants of a profile."""
+"""Instants of a profile and points of a drawn path."""
 DECISION_INTERVAL = 0.1
-"""Horizon of the decisions while a goal may be dragged, [s]."""
+"""Greatest horizon of decisions while a goal may be dragged, [s]."""
+APART = 0.02
+"""Least difference of a coordinate between the present position and a goal that begins a new movement."""
+
+Decide = Callable[[Observation], Float]
+"""Function that returns the action, shape (1, m), for an observation."""
 
 
 class Profile(NamedTuple):
-    """Speed, jerk and clearance over a movement, shape (T,) each."""
+    """Movement at T instants."""
 
     time: Float
-    """[s]."""
+    """Shape (T,), [s]."""
+    coordinates: Float
+    """Shape (T, D)."""
+    tool: Float
+    """Places of the tool, shape (T, 3), [m]."""
     speed: Float
-    """[m/s]."""
-    jerk: Float
-    """[m/s^3]."""
+    """Speed of the tool, shape (T,), [m/s]."""
     clearance: Float
-    """Clearance from the nearest obstacle, [m]; at most 1."""
+    """Clearance from the nearest obstacle and of the arm from itself, shape (T,), [m]; at most 1."""
 
 
 class Segment(NamedTuple):
     """Part of an executed movement."""
 
     time: Float
-    """Times since the beginning of the episode, shape (T,), [s]."""
+    """Times since the beginning of the movement, shape (T,), [s]."""
     joints: Float
-    """Joint angles, shape (T, J), [rad]."""
+    """Joint positions, shape (T, J), [rad]."""
     hand: Float
-    """Hand positions, shape (T, D), [m]."""
+    """Places of the tool, shape (T, 3), [m]."""
     contact: Bool
     """True where the arm touches something, shape (T,)."""
     clearance: Float
     """Clearance from the nearest obstacle, shape (T,), [m]."""
-    path: Float | None
-    """Path of the plan that is followed, shape (P, D), [m]; None where it is the one already known."""
+    plan: Plan | None
+    """Plan that is followed from now on; None where it is the one already known."""
+    scene: LiveScene
+    """Scene in which it moves."""
     info: Mapping[str, Any]
     """Metrics of the movement so far."""
     restarted: bool = False
     """True if a new movement begins with this segment."""
 
 
-def plan_profile(task: Task, scene: LiveScene, plan: Plan) -> Profile:
-    """Return the profile of a plan from rest among the obstacles of a scene, which may move."""
-    trajectory = plan.trajectory()
-    time = np.linspace(0.0, float(np.sum(plan.durations)), SAMPLES)
-    hand, velocity, jerk = (np.asarray(trajectory(time, nu)) for nu in (0, 1, 3))
-    scenes = scene.batch()
-    places = scenes.places(time[None])
-    each = task.collision_model.clearance_profile(hand[None], places, scenes.present)
-    return Profile(time, norm(velocity), norm(jerk), each[0].min(axis=-1, initial=1.0))
+def plan_profile(task: Task, scenes: Scenes, plan: Plan, samples: int = SAMPLES) -> Profile:
+    """Return the profile of a plan from rest in a batch of one scene, whose obstacles may move."""
+    arm, space = task.arm, task.space
+    time = np.linspace(0.0, float(plan.duration), samples)
+    coordinates = np.asarray(plan.trajectory()(time))
+    joints = space.joints(coordinates)
+    tool = arm.hand(joints)
+    obstacles = scenes.take(np.zeros(samples, np.int64)).obstacles_at(time)
+    each = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(samples))
+    speed = norm(np.gradient(tool, time, axis=0))
+    return Profile(time, coordinates, tool, speed, np.asarray(each.min(axis=-1)))
 
 
 def executed_profile(segments: list[Segment]) -> Profile:
-    """Return the profile of an executed movement; its jerk is not measured (NaN)."""
-    time, hand, clearance = (
-        np.concatenate([getattr(each, name) for each in segments]) for name in ("time", "hand", "clearance")
-    )
-    speed = norm(np.gradient(hand, time, axis=0)) if len(time) > 2 else np.zeros_like(time)
+    """Return the profile of an executed movement."""
+    time = np.concatenate([each.time for each in segments])
+    tool = np.concatenate([each.hand for each in segments])
+    joints = np.concatenate([each.joints for each in segments])
+    clearance = np.concatenate([each.clearance for each in segments])
+    speed = norm(np.gradient(tool, time, axis=0)) if len(time) > 2 else np.zeros_like(time)
     rows = np.unique(np.linspace(0, len(time) - 1, 2 * SAMPLES).astype(int))
-    return Profile(time[rows], speed[rows], np.full(len(rows), np.nan), clearance[rows])
+    return Profile(time[rows], joints[rows], tool[rows], speed[rows], clearance[rows])
 
 
-def execute_whole(env: Any, scene: LiveScene, plan: Plan) -> Iterator[Segment]:
-    """Execute a plan as one segment.
-
-    Args:
-        env: Vector environment of one environment, with whole movements as actions.
-        scene: Scene.
-        plan: Plan of one row without a batch dimension.
-    """
-    env.reset(options=scene.options(changing=False))
-    _, _, info = env.execute_plan(Plan(plan.waypoints[None], plan.durations[None]))
-    yield _segment(env.last_rollout[0], 0, None, info)
+def execute_whole(env: ReachVectorEnv, scene: LiveScene, plan: Plan) -> Iterator[Segment]:
+    """Execute a plan of one movement as one segment."""
+    env.reset(options=scene.options())
+    info = env.execute_plan(_batch(plan)).info
+    yield _segment(env.last_rollout[0], 0, scene, info)
 
 
-def execute_stepwise(env: Any, agent: Any, scene: LiveScene) -> Iterator[Segment]:
-    """Execute the velocity actions of an agent to the end of the episode, as one segment."""
-    observation, _ = env.reset(options=scene.options(changing=False))
+def execute_stepwise(env: ReachVectorEnv, agent: Any, scene: LiveScene) -> Iterator[Segment]:
+    """Execute the velocities of an agent to the end of the episode, as one segment."""
+    observation, _ = env.reset(options=scene.options())
     over = False
     while not over:
         actions, _ = agent.predict(observation, deterministic=True)
-        observation, _, info = env.execute_actions(actions)
-        over = bool(env.terminated[0] or env.truncated[0])
-    rollout = env.last_rollout[0]
-    yield _segment(rollout, 0, rollout.hand, info)
+        decision = env.execute_actions(actions)
+        observation = decision.observation
+        over = bool(decision.terminated[0] or decision.truncated[0])
+    yield _segment(env.last_rollout[0], 0, scene, decision.info)
 
 
 def execute_replanning(
-    env: Any,
-    decisions: DecisionMaker,
-    scene: LiveScene,
-    plan: Plan,
-    goal_of: Callable[[], Float],
-    checks: int = 0,
+    env: ReachVectorEnv, decide: Decide, scene: LiveScene, plan: Plan, goal_of: Callable[[], Float]
 ) -> Iterator[Segment]:
     """Execute an episode whose plan is revised, decision by decision.
 
+    When the arm has reached a goal that has been dragged away meanwhile, a new episode begins there.
+
     Args:
-        env: Vector environment of one environment with replanning.
-        decisions: Maker of the later decisions.
+        env: Batch of one environment with replanning.
+        decide: Function that makes the later decisions.
         scene: Scene.
         plan: First plan.
-        goal_of: Function that returns the present goal, which the user may drag, shape (D,), [m].
-        checks: Proposals that the agent checks with computed geometry.
+        goal_of: Function that returns the present goal, which the user may drag, shape (D,).
     """
-    env.reset(options=scene.options(changing=True))
-    goal = scene.goal
-    observation, _, info = env.execute_plan(Plan(plan.waypoints[None], plan.durations[None]))
-    known, done, offset, restarted = env.last_plan, 0, 0.0, False
+    env.reset(options=scene.options())
+    decision = env.execute_plan(_batch(plan))
+    done, known, offset, restarted = 0, 1, 0.0, False
     while True:
-        segment = _segment(env.last_rollout[0], done, None, info)
-        current, path = env.last_plan, None
-        if not all(np.array_equal(a, b) for a, b in zip(current, known, strict=True)):
-            moving = env.unwrapped.last_plans[0][-1][1]
-            known, path = current, np.asarray(moving.trajectory().sample(48, 0)[0][0])
-        done += len(segment.time)
-        yield segment._replace(time=segment.time + offset, path=path, restarted=restarted)
+        segment = _segment(env.last_rollout[0], done, scene, decision.info)
+        history = env.last_plans[0]
+        newest = history[-1][1].take(0) if len(history) != known else None
+        known, done = len(history), done + len(segment.time)
+        yield segment._replace(time=segment.time + offset, plan=newest, restarted=restarted)
         wanted, restarted = goal_of(), False
-        moved = norm(wanted - goal) > 0.0
-        if env.terminated[0]:
-            if not moved or not info["is_success"][0]:  # without a success, the segment may be empty
-                return
-            hand = segment.hand[-1]
-            if norm(wanted - hand) < MIN_GOAL_DISTANCE:
+        moved = not np.array_equal(wanted, scene.goal)
+        if decision.terminated[0] or decision.truncated[0]:
+            following = _following(env, scene, segment, wanted) if moved else None
+            if following is None or not decision.info["is_success"][0]:
                 return
             offset += float(segment.time[-1])
-            scene, done, restarted = scene._replace(start=hand, goal=wanted), 0, True
-            rest = scene.batch().places(np.array([[segment.time[-1]]]))[0, 0]
-            scene = scene._replace(obstacles=rest, jumps=scene.jumps[:0])
-            observation, _ = env.reset(options=scene.options(changing=True))
+            scene, done, known, restarted = following, 0, 0, True
+            observation, _ = env.reset(options=scene.options())
         elif moved:
             observation = env.move_goals(wanted[None])
-        goal = wanted
-        observation, _, info = env.execute_actions(decisions.action(observation, checks))
+        else:
+            observation = decision.observation
+        scene = scene._replace(goal=wanted)
+        decision = env.execute_actions(decide(observation))
 
 
-def _segment(rollout: Rollout, first: int, path: Float | None, info: Mapping[str, Any]) -> Segment:
+def _following(env: ReachVectorEnv, scene: LiveScene, segment: Segment, goal: Float) -> LiveScene | None:
+    """Return the scene of a movement from where the arm is, among obstacles at rest; None if it is there already."""
+    here = env.task.space.coordinates(segment.joints[-1])
+    if np.abs(here - goal).max() < APART:
+        return None
+    rest = LiveScene.of(env.scenes._replace(obstacles=_now(env)), env.task)  # type: ignore[union-attr]
+    return rest._replace(start=here, goal=goal, jumps=scene.jumps[:0], turns=0.0 * rest.turns)
+
+
+def _now(env: ReachVectorEnv) -> Any:
+    """Return the obstacles at their present places, at rest."""
+    assert env.scenes is not None
+    time = np.array([env.last_rollout[0].time[-1]])
+    now = env.scenes.obstacles_at(time)
+    return now._replace(velocity=np.zeros_like(now.velocity))
+
+
+def _segment(rollout: Rollout, first: int, scene: LiveScene, info: Mapping[str, Any]) -> Segment:
     """Return the states of a rollout from one on."""
     return Segment(
-        rollout.time[first:], rollout.joints[first:], rollout.hand[first:], rollout.contact[first:],
-        rollout.clearance[first:], path, info,
-    )  # fmt: skip
+        rollout.time[first:],
+        rollout.joints[first:],
+        rollout.hand[first:],
+        rollout.contact[first:],
+        rollout.clearance[first:],
+        None,
+        scene,
+        info,
+    )
 
 
-def describe_outcome(info: dict[str, Any]) -> str:
-    """Return one sentence on an executed movement."""
-    clearance = info["min_clearance"]
-    clear = "" if clearance >= 0.999 else f", least clearance {1e3 * clearance:.0f} mm"
-    if info["is_success"]:
-        error, duration = 1e3 * info["goal_error"], info["duration"]
-        return f"Success: at rest {error:.1f} mm from the goal after {duration:.2f} s{clear}."
-    if info["collision"]:
-        return f"Failure: the arm touches something after {info['first_contact_time']:.2f} s."
-    if not info["reachable"]:
+def _batch(plan: Plan) -> Plan:
+    """Return a plan as a batch of one."""
+    return Plan(plan.waypoints[None], plan.durations[None])
+
+
+def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
+    """Return one sentence on an executed movement of a batch of one."""
+    values = {name: np.asarray(value).reshape(-1)[0] for name, value in info.items()}
+    clearance = values["min_clearance"]
+    clear = "" if clearance >= 0.999 * FAR else f", least clearance {1e3 * clearance:.0f} mm"
+    error = f"{1e3 * values['goal_error']:.1f} {'mrad' if in_joints else 'mm'}"
+    if values["is_success"]:
+        return f"Success: at rest {error} from the goal after {values['duration']:.2f} s{clear}."
+    if values["collision"]:
+        return f"Failure: the arm touches something after {values['first_contact_time']:.2f} s."
+    if not values["reachable"]:
         return "Failure: the plan leaves the arm's reach, so the arm does not start."
-    return f"Failure: {1e3 * info['goal_error']:.0f} mm from the goal after {info['duration']:.2f} s{clear}."
+    return f"Failure: {error} from the goal after {values['duration']:.2f} s{clear}."

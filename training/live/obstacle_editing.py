@@ -3,153 +3,148 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space, quaternion_to
+from viapoint.envs import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.half_space import EXTENT, HalfSpace
-from viapoint.envs.geometry.rows import (
-    dimension_of,
-    obstacle_rows,
-    obstacles_from_rows,
-    quaternion_of_axes,
-    rotation_axes,
-    shape_columns,
-    shape_rows,
-)
-from viapoint.envs.geometry.shape import TALL, Shape
-from viapoint.envs.geometry.shapes import SHAPES, nearest_distance
 
 if TYPE_CHECKING:
-    from viapoint.training.live.scene_file import LiveScene
+    from viapoint.training.live.setting import Setting
 
+KINDS = {
+    True: ("post", "bar", "box", "wall"),
+    False: ("sphere", "capsule", "box", "cylinder", "wall"),
+}
+"""Names of new obstacles in the plane (True) and in space."""
 BOX_SIZES = ("half-depth", "half-width", "half-height")
 """Names of the half lengths of a box."""
-LEAST_SIZE = 1e-4
-"""Least size of an obstacle, [m]; a capsule of this half length has no direction."""
+ANGLES = ("heading", "elevation")
+"""Names of the sliders of directions."""
+LEAST_SIZE = 1e-3
+"""Least size of an obstacle, [m]."""
 STEEPEST = 89.99
 """Greatest elevation that is set, [deg]: the heading is kept."""
 WALL = 0.15
 """Distance of a new wall from the movement, [m]."""
-STEP, PLACES = 0.02, 16
+STEP, PLACES = 0.02, 20
 """Distance and number of the places to either side that are tried for a new obstacle, [m]."""
 
 
-class NewObstacle(NamedTuple):
-    """Shape and size of a new obstacle."""
-
-    shape: str
-    half: tuple[float, float, float]
-    """Half lengths of its box, [m]."""
-    across: bool = False
-    """True if its z axis lies across the movement, False if it is upright."""
-
-
-KINDS: dict[int, dict[str, NewObstacle]] = {
-    2: {
-        "post": NewObstacle("capsule", (0.025, 0.025, 0.025)),
-        "bar": NewObstacle("capsule", (0.025, 0.025, 0.085), across=True),
-        "box": NewObstacle("box", (0.03, 0.03, TALL)),
-        "wall": NewObstacle("half_space", (EXTENT, EXTENT, EXTENT)),
-    },
-    3: {
-        "sphere": NewObstacle("capsule", (0.035, 0.035, 0.035)),
-        "bar": NewObstacle("capsule", (0.035, 0.035, 0.115)),
-        "box": NewObstacle("box", (0.03, 0.03, 0.03)),
-        "cylinder": NewObstacle("cylinder", (0.03, 0.03, 0.06)),
-        "wall": NewObstacle("half_space", (EXTENT, EXTENT, EXTENT)),
-    },
-}
-"""Kinds of new obstacles by the dimension of the arm's space."""
-
-
-def new_obstacle(scene: LiveScene, kind: str) -> Float:
-    """Return the row of a new obstacle beside the middle of the movement, clear of the others if there is room.
+def new_obstacle(setting: Setting, start: Float, goal: Float, others: tuple[Shape, ...], kind: str) -> Shape:
+    """Return a new obstacle beside the middle of a movement, clear of the others if there is room.
 
     A half-space is a wall along the movement, on the side away from the base of the arm.
 
     Args:
-        scene: Scene.
-        kind: Key of :data:`KINDS` in the dimension of the scene.
+        setting: Arm and task.
+        start: Place of the tool at the start, shape (3,), [m].
+        goal: Place of the tool at the goal, shape (3,), [m].
+        others: Obstacles of the scene.
+        kind: One of :data:`KINDS`.
     """
-    d = len(scene.start)
-    line, middle = scene.goal - scene.start, 0.5 * (scene.start + scene.goal)
-    aside = np.zeros(3)
-    aside[:2] = -line[1], line[0]
+    line, middle = goal - start, 0.5 * (start + goal)
+    aside = np.array([-line[1], line[0], 0.0])
     aside /= max(float(np.linalg.norm(aside)), 1e-9)
-    shape, half, across = KINDS[d][kind]
-    if shape == HalfSpace.kind:
-        side = aside if aside[:d] @ middle >= 0.0 else -aside
-        wall = HalfSpace.facing(-side, in_space(middle) + WALL * side)
-        return np.asarray(obstacle_rows([wall], d, tuple(SHAPES))[0])
-    steps = np.outer(np.arange(1, PLACES) * STEP, aside[:d])
-    places = middle + np.stack((steps, -steps), axis=1).reshape(-1, d)
-    others = obstacles_from_rows(scene.obstacles)
-    free = nearest_distance(others, in_space(places), radius=max(half[:2]), most=1.0) > 0.0
-    centre = places[free.argmax()]
-    turn = quaternion_to(aside if across else (0.0, 0.0, 1.0))
-    (row,) = shape_rows(shape, centre[None], turn[None], np.array([half]))
-    return np.asarray(row)
+    if kind == "wall":
+        side = aside if aside @ middle >= 0.0 else -aside
+        return HalfSpace(position=middle + WALL * side, quaternion=quaternion_to(-side))
+    shape = _shape(setting, kind, quaternion_to(aside))
+    radius = float(np.min(shape.packed_size[:2])) if kind == "box" else float(shape.packed_size[0])
+    steps = np.arange(1, PLACES)[:, None] * STEP * aside
+    places = middle + np.stack((steps, -steps), axis=1).reshape(-1, 3)
+    free = np.ones(len(places), bool)
+    for other in others:
+        free &= other.distance(places, radius) > 0.0
+    return dataclasses.replace(shape, position=places[free.argmax()])
 
 
-def sizes_of(row: Float) -> dict[str, float]:
+def _shape(setting: Setting, kind: str, across: Float) -> Shape:
+    """Return a new obstacle at the origin; `across` is the orientation across the movement."""
+    if not setting.planar:
+        shapes: dict[str, Shape] = {
+            "sphere": Sphere(0.06),
+            "capsule": Capsule(0.035, 0.1, quaternion=across),
+            "box": Box((0.05, 0.05, 0.05)),
+            "cylinder": Cylinder(0.04, 0.08),
+        }
+        return shapes[kind]
+    height = setting.height
+    if kind == "post":
+        return Cylinder(0.025, height)
+    if kind == "box":
+        return Box((0.03, 0.03, height))
+    # A bar is a long box along the direction across the movement.
+    angle = np.arctan2(*_axes(across)[1::-1, 2])
+    return Box((0.09, 0.015, height), quaternion=_turn_about_z(angle))
+
+
+def sizes_of(shape: Shape, planar: bool) -> dict[str, float]:
     """Return the sizes of an obstacle, by the names of their sliders, [m] and [deg].
 
-    A shape that is round about its z axis has the direction of that axis, another one that of its first axis, seen from
-    above. A height that does not matter in the plane is left out.
+    Round shapes have the direction of their z axis; boxes have the heading of their first axis seen from above. In the
+    plane, the height does not matter and is left out.
     """
-    shape, sizes = _shape(row), dict[str, float]()
-    for name in shape.sizes:
-        value = np.atleast_1d(getattr(shape, name))
-        names = BOX_SIZES if len(value) == len(BOX_SIZES) else (name.replace("_", "-"),)
-        sizes |= dict(zip(names, map(float, value), strict=True))
-    first, _, third = rotation_axes(shape_columns(row).quaternion)
-    if sizes and dimension_of(row) == 2 and shape_columns(row).half[2] == TALL:
-        sizes.popitem()
-    if not shape.round:
-        sizes["heading"] = (_heading(first) + 90.0) % 180.0 - 90.0
-    elif sizes.get("half-length", 0.0) > LEAST_SIZE:
-        axis = third if third[0] > 0.0 or (third[0] == 0.0 and third[2] > 0.0) else -third
-        sizes["heading"] = _heading(axis)
-        if dimension_of(row) == 3:
-            sizes["elevation"] = float(np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0))))
-    return sizes
+    found: dict[str, float] = {}
+    if isinstance(shape, Sphere | Capsule | Cylinder):
+        found["radius"] = shape.radius
+    if isinstance(shape, Capsule | Cylinder) and not planar:
+        found["half-length"] = shape.half_length
+        axis = _axes(shape.quaternion)[:, 2]
+        axis = axis if axis[0] > 0.0 or (axis[0] == 0.0 and axis[2] > 0.0) else -axis
+        found["heading"] = _heading(axis)
+        found["elevation"] = float(np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0))))
+    if isinstance(shape, Box):
+        found |= dict(zip(BOX_SIZES[: 2 if planar else 3], map(float, shape.size), strict=False))
+    if isinstance(shape, Box | HalfSpace):
+        found["heading"] = (_heading(_axes(shape.quaternion)[:, _compass(shape)]) + 90.0) % 180.0 - 90.0
+    return found
 
 
-def resized(row: Float, name: str, value: float) -> Float:
-    """Return the row of an obstacle with another size or direction, see :func:`sizes_of`."""
-    d, shape, (number, centre, quaternion, _) = dimension_of(row), _shape(row), shape_columns(row)
-    before = {"heading": 0.0, "elevation": 90.0 if d == 3 else 0.0, **sizes_of(row)}
-    wanted = {**before, name: value}
-    parameters: dict[str, Any] = {}
-    for each in shape.sizes:
-        value_of = np.array(getattr(shape, each), dtype=np.float64)
-        names = BOX_SIZES if value_of.ndim else (each.replace("_", "-"),)
-        sizes = [wanted.get(part, old) for part, old in zip(names, np.atleast_1d(value_of), strict=True)]
-        parameters[each] = np.maximum(sizes, LEAST_SIZE).reshape(value_of.shape)
-    if not shape.round:
-        turn = np.radians(wanted["heading"] - before["heading"])
-        c, s = np.cos(turn), np.sin(turn)
-        first, second, _ = (np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ axis
-                            for axis in rotation_axes(quaternion))  # fmt: skip
-        quaternion = quaternion_of_axes(first, second)
-    elif "half-length" in before and (name in ("heading", "elevation") or d == 2):
-        heading, elevation = np.radians(
-            (wanted["heading"], np.clip(wanted["elevation"], -STEEPEST, STEEPEST))
-        )
-        flat = np.cos(elevation)
-        quaternion = quaternion_to((flat * np.cos(heading), flat * np.sin(heading), np.sin(elevation)))
-    _, half = dataclasses.replace(shape, **parameters).box()
-    (found,) = shape_rows(list(SHAPES)[int(number)], centre[None, :d], quaternion[None], half[None])
-    return np.asarray(found)
+def resized(shape: Shape, name: str, value: float, planar: bool) -> Shape:
+    """Return an obstacle with another size or direction, see :func:`sizes_of`."""
+    sizes = sizes_of(shape, planar)
+    if name not in ANGLES:
+        value = max(value, LEAST_SIZE)
+        if name in BOX_SIZES:
+            size = np.array(shape.size)  # type: ignore[attr-defined]
+            size[BOX_SIZES.index(name)] = value
+            return dataclasses.replace(shape, size=size)  # type: ignore[call-arg]
+        changed: dict[str, Any] = {name.replace("-", "_"): value}
+        return dataclasses.replace(shape, **changed)
+    if "elevation" not in sizes:
+        turn = _turn_about_z(np.radians(value - sizes["heading"]))
+        quaternion = np.empty(4)
+        mujoco.mju_mulQuat(quaternion, turn, np.array(shape.quaternion))
+        return dataclasses.replace(shape, quaternion=quaternion)
+    sizes[name] = value
+    heading = np.radians(sizes["heading"])
+    elevation = np.radians(np.clip(sizes["elevation"], -STEEPEST, STEEPEST))
+    flat = np.cos(elevation)
+    axis = flat * np.cos(heading), flat * np.sin(heading), np.sin(elevation)
+    return dataclasses.replace(shape, quaternion=quaternion_to(axis))
 
 
-def _shape(row: Float) -> Shape:
-    number, centre, quaternion, half = shape_columns(row)
-    return list(SHAPES.values())[int(number)].from_box(centre, quaternion, half)
+def _compass(shape: Shape) -> int:
+    """Return the axis of a shape whose heading is shown: the normal of a wall."""
+    return 2 if isinstance(shape, HalfSpace) else 0
+
+
+def _axes(quaternion: Float) -> Float:
+    """Return the axes of a frame as columns, shape (3, 3)."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, np.array(quaternion))
+    return axes.reshape(3, 3)
+
+
+def _turn_about_z(angle: float) -> Float:
+    """Return the quaternion of a turn about the vertical axis, [rad]."""
+    return np.array([np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)])
 
 
 def _heading(axis: Float) -> float:
+    """Return the direction of an axis seen from above, [deg]."""
     return float(np.degrees(np.arctan2(axis[1], axis[0])))

@@ -1,185 +1,159 @@
-"""Environments, agent and comparison of methods that all tabs of the live page share."""
+"""Environments and agent of the live page, which all tabs share."""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.common.types import Observation
-from viapoint.envs.mdp.task import Task
-from viapoint.envs.registration import STEP_TASKS
-from viapoint.envs.scenes.scene import Scenes, check_scenes
-from viapoint.training.agents.agent import Agent
+from viapoint.envs import ReachVectorEnv, Scenes, Task, inverse_kinematics
+from viapoint.envs.arms.kinematics import forward
+from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.clearance import configuration_clearances
+from viapoint.envs.geometry.obstacles import quaternions_of
+from viapoint.envs.scenes.options import draw_given
 from viapoint.training.live.decisions import DecisionMaker
-from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
-from viapoint.training.live.scene_draws import Draw, scene_kinds
-from viapoint.training.live.scene_file import SCENE_SHAPES, LiveScene, from_json
-from viapoint.training.planning.baselines import Method, agent_method, make_method
-from viapoint.training.rollouts.rollout import SceneSimulation, new_simulation, whole_task
+from viapoint.training.live.scene import LiveScene
 
-BASELINES = {"straight": "straight", "geometry search": "search512", "planner": "planner"}
-"""Compared methods by their names in the table."""
 MOST_SHOWN = 24
 """Greatest number of obstacles of a scene."""
+SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
+"""Shapes that the simulation takes."""
+ORIENTED = 6
+"""Least number of joints with which the tool can have any orientation."""
+NEAR_SEEDS = 8
+"""Seeds of the inverse kinematics of a tool that is dragged."""
 
-
-class MethodResult(NamedTuple):
-    """Simulated outcome of a method in one scene."""
-
-    name: str
-    success: bool
-    reward: float
-    clearance: float
-    """Least clearance of the executed movement, [m]."""
-    jerk_ratio: float
-    seconds: float
-    """Time of the decision, [s]."""
+Draw = Callable[[], tuple[LiveScene, str]]
+"""Function that returns the next scene of a kind, and a sentence on where it comes from."""
 
 
 class Setting:
-    """Environment, what decides in it (without an agent the geometry search), and a comparison of methods."""
+    """Task of the page with what decides in it: an agent, or the geometry search.
 
-    def __init__(self, env_id: str, agent: Agent | None, env_kwargs: Mapping[str, Any]) -> None:
-        self.env_id, self.agent, self.env_kwargs = env_id, agent, dict(env_kwargs)
-        self.whole_id, self.whole_kwargs = whole_task(env_id, self.env_kwargs)
-        env = self.make_env()
-        self.task: Task = env.task
-        self.model = env.model
-        env.close()
-        self._steps = agent is not None and env_id in STEP_TASKS
-        self.decisions = DecisionMaker(self.task, None if self._steps else agent)
-        self._simulation: SceneSimulation | None = None
-        self._methods: dict[str, Method] = {}
-        self.comparing = threading.Lock()
-        """Lock of the comparison, whose environments all tabs share."""
+    Args:
+        task: Task; where decisions are control steps, the page plans whole movements.
+        agent: Agent of that task; None for the geometry search.
+    """
 
-    def make_env(self) -> Any:
-        """Return a vector environment of one environment, whose actions are whole movements or revisions of them."""
-        kwargs = dict(self.whole_kwargs)
-        env: Any = gym.make_vec(self.whole_id, num_envs=1, threads=1, **kwargs)
-        if env.unwrapped.task.replanning and "horizon" not in kwargs:
-            env.close()
-            env = gym.make_vec(self.whole_id, num_envs=1, threads=1, **kwargs, horizon=DECISION_INTERVAL)
-        return env.unwrapped
+    def __init__(self, task: Task, agent: Any = None) -> None:
+        self.agent, self.stepwise = agent, task if task.stepwise else None
+        if task.stepwise:
+            weights = dataclasses.replace(task.weights, progress=0.0)
+            task = dataclasses.replace(task, decide_at="end", weights=weights)
+        if task.replanning:
+            task = dataclasses.replace(task, horizon=min(task.horizon, DECISION_INTERVAL))
+        self.task = task
+        self.sampler = task.sampler()
+        self.planar = task.arm.space == "hand"
+        """True if the arm moves in a horizontal plane."""
+        self.height = self.sampler.room.height
+        """Half height of obstacles in the plane, [m]."""
+        self.decisions = DecisionMaker(task, agent if self.stepwise is None else None)
 
-    def make_step_env(self) -> Any:
+    def make_env(self) -> ReachVectorEnv:
+        """Return a batch of one environment whose actions are whole movements or revisions of them."""
+        return make_env(self.task)
+
+    def make_step_env(self) -> ReachVectorEnv | None:
         """Return an environment for an agent that acts in every control step; None for other agents."""
-        if not self._steps:
+        if self.stepwise is None or self.agent is None:
             return None
-        env: Any = gym.make_vec(self.env_id, num_envs=1, threads=1, **self.env_kwargs)
-        return env.unwrapped
+        return make_env(self.stepwise)
 
-    def observe(self, scene: LiveScene, env: Any) -> Observation:
-        """Return the first observation in a scene, after a check of the scene.
+    def tool(self, coordinates: Float) -> Float:
+        """Return places of the tool, shape (..., 3), [m], for coordinates of shape (..., D)."""
+        arm = self.task.arm
+        if not self.task.space.of_hand:
+            return arm.hand(coordinates)
+        level = np.full(coordinates.shape[:-1], arm.hand(arm.home)[2])
+        return np.concatenate((coordinates, level[..., None]), axis=-1)
+
+    def moved(self, coordinates: Float, place: Float, scenes: Scenes | None, turn: Any = None) -> Float:
+        """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
 
         Args:
-            scene: Scene with the rows of this setting.
-            env: Environment of :meth:`make_env`.
+            coordinates: Present coordinates, shape (D,).
+            place: New place of the tool, shape (3,), [m].
+            scenes: Batch of one scene whose obstacles are avoided; None for none.
+            turn: New orientation of the tool, a quaternion; the present one by default.
 
         Raises:
-            ValueError: The scene is impossible, with the reason.
+            ValueError: The arm cannot reach the place.
         """
-        check_scenes(scene.batch(), self.task.collision_model)  # type: ignore[arg-type]
-        observation: Observation
-        if self.task.replanning:
-            observation = env.reset(options=scene.options(changing=True))[0]
-            return observation
-        rows = self._filled(scene)
-        joints = np.asarray(self.task.arm.inverse_kinematics(rows.start))
-        observation = self.task.observation.observe(joints, rows.start, rows)
-        return observation
+        arm = self.task.arm
+        if self.task.space.of_hand:
+            return np.array(place[:2])
+        if turn is None and len(coordinates) >= ORIENTED:
+            turn = self.orientation(coordinates)
+        found = inverse_kinematics(arm, place, turn, seed=coordinates, n_seeds=NEAR_SEEDS)
+        if scenes is None:
+            return np.asarray(found[0])
+        rows = scenes.obstacles.take(np.zeros(len(found), np.int64))
+        clearance = configuration_clearances(arm.chain, arm.spheres, found, rows, np.zeros(len(found)))
+        free = clearance.min(axis=-1) > 0.0
+        return np.asarray(found[int(free.argmax())])
 
-    def compare(self, scene: LiveScene, checks: int = 0) -> Iterator[tuple[str, Callable[[], MethodResult]]]:
-        """Yield the name of each method and a function that lets it decide in a scene and simulates its decision."""
-        if self.agent is not None:
-            ranks = hasattr(self.agent.policy, "checks")
-            method = agent_method("agent", self.agent, checks if ranks else None)
-            yield "agent", lambda: self._result("agent", method, scene)
-        for name, known in BASELINES.items():
-            yield name, lambda name=name, known=known: self._result(name, self._baseline(known), scene)  # type: ignore[misc]
-
-    def close(self) -> None:
-        """Close the environments of the comparison."""
-        if self._simulation is not None:
-            self._simulation.close()
-
-    def _baseline(self, name: str) -> Method:
-        if name not in self._methods:
-            self._methods[name] = make_method(name, self.whole_id, **self.whole_kwargs)
-        return self._methods[name]
-
-    def _result(self, name: str, method: Method, scene: LiveScene) -> MethodResult:
-        if self._simulation is None:
-            self._simulation = new_simulation(self.whole_id, 1, **self.whole_kwargs)
-        simulation, scenes = self._simulation, self._filled(scene)
-        observation = simulation.observe(scenes)
-        begin = time.perf_counter()
-        decisions = method.decide(observation, scenes)
-        seconds = time.perf_counter() - begin
-        results = simulation.play(method, scenes, decisions)
-        info = results.info
-        return MethodResult(
-            name=name, success=bool(results.success[0]), reward=float(results.reward[0]),
-            clearance=float(info["min_clearance"][0]), jerk_ratio=float(info["jerk_ratio"][0]), seconds=seconds,
-        )  # fmt: skip
-
-    def _filled(self, scene: LiveScene) -> Any:
-        """Return a scene as a batch of one, with as many rows of obstacles as the observation has."""
-        changing = scene.batch()
-        scenes: Any = changing if self.task.replanning else Scenes(*changing[:3])
-        missing = self.task.observation.n_rows - len(scene.obstacles)
-        names = [name for name in ("obstacles", "courses") if name in scenes._fields]
-        padded = {name: np.pad(getattr(scenes, name), ((0, 0), (0, missing), (0, 0))) for name in names}
-        return scenes._replace(**padded)
+    def orientation(self, coordinates: Float) -> Float:
+        """Return the orientation of the tool for joint positions, a quaternion."""
+        _, axes = forward(self.task.arm.chain, coordinates)
+        return quaternions_of(axes)
 
     def limit(self, scene: LiveScene) -> str:
-        """Return the limit of the environment that a scene exceeds, as part of a sentence; "" if it has room for it."""
-        known, most = self.task.scenes.shapes, self.task.observation.n_rows
-        others = [name for name in scene.shapes if name not in known]
-        others = [name for name in others if name != "sphere" or "capsule" not in known]
-        if not most and len(scene.obstacles):
+        """Return the limit of the task that a scene exceeds, as part of a sentence; "" if there is none."""
+        most = self.task.n_obstacles[1]
+        if not most and scene.obstacles:
             return "without obstacles"
+        others = [each.kind for each in scene.obstacles if each.kind not in self.task.shapes]
         if others:
             return f"without {others[0].replace('_', '-')} obstacles"
         return f"with at most {most} obstacles" if len(scene.obstacles) > most else ""
 
 
 class Shared:
-    """Settings, and everything else that is expensive to make, for all tabs; arguments as of :class:`LivePage`."""
+    """Settings of the agent and of other scenes, for all tabs.
 
-    def __init__(
-        self,
-        env_id: str,
-        agent: Agent | None,
-        *,
-        model_file: str | Path | None,
-        seed: int | None,
-        env_kwargs: Mapping[str, Any],
-    ) -> None:
-        self.own = Setting(env_id, agent, env_kwargs)
+    Args:
+        env_id: Id of the environment.
+        agent: Agent; None for the geometry search.
+        seed: Seed of the random scenes.
+        env_kwargs: Arguments of the environment.
+    """
+
+    def __init__(self, env_id: str, agent: Any, *, seed: int | None, env_kwargs: Mapping[str, Any]) -> None:
+        self.env_id, self.env_kwargs, self._seed = env_id, dict(env_kwargs), seed
+        env: Any = gym.make_vec(env_id, num_envs=1, **env_kwargs)
+        self.model = env.unwrapped.model
+        self.own = Setting(env.unwrapped.task, agent)
         """Setting of the agent."""
+        env.close()
         self._wide: Setting | None = None
         self._making = threading.Lock()
-        self._model_file, self._seed = model_file, seed
-        self.drawing()
 
     def setting_of(self, scene: LiveScene) -> Setting:
-        """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used."""
+        """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used.
+
+        Raises:
+            ValueError: The scene has too many obstacles, or some that cannot be simulated.
+        """
         if not self.own.limit(scene):
             return self.own
         if len(scene.obstacles) > MOST_SHOWN:
             raise ValueError(f"a scene has at most {MOST_SHOWN} obstacles, got {len(scene.obstacles)}")
+        for shape in scene.obstacles:
+            if shape.kind not in SIMULATED:
+                raise ValueError(f"obstacles must be one of {', '.join(SIMULATED)}, got {shape.kind}")
         with self._making:
             if self._wide is None:
-                room = {"shapes": SCENE_SHAPES, "n_obstacles": (0, MOST_SHOWN)}
-                self._wide = Setting(self.own.env_id, None, self.own.env_kwargs | room)
+                self._wide = Setting(
+                    dataclasses.replace(self.own.task, shapes=SIMULATED, n_obstacles=(0, MOST_SHOWN))
+                )
         return self._wide
 
     def read(self, content: bytes) -> LiveScene:
@@ -188,25 +162,53 @@ class Shared:
         Raises:
             ValueError: The file holds no scene, or an impossible one.
         """
-        scene = from_json(content, self.own.task.arm.dimension)
+        scene = LiveScene.from_json(content, self.own.task)
+        setting = self.setting_of(scene)
         try:
-            task = self.setting_of(scene).task
-            check_scenes(scene.with_shapes(task.scenes.shapes).batch(), task.collision_model)  # type: ignore[arg-type]
+            draw_given(scene.options(), setting.sampler, [np.random.default_rng(0)])
         except ValueError as error:
-            reason = str(error).removeprefix("scene 0: ")
-            raise ValueError(f"the scene file is impossible: {reason}") from None
+            raise ValueError(f"the scene file is impossible: {error}") from None
         return scene
-
-    def drawing(self) -> ArmDrawing:
-        """Return the parts of the arm."""
-        return ArmDrawing(self.own.task.arm, self.own.model, self._model_file)
 
     def scene_kinds(self) -> dict[str, Draw]:
         """Return functions that draw scenes, by the names of their buttons."""
-        return scene_kinds(self.own.whole_id, self.own.whole_kwargs, self.own.task, self._seed)
+        generator = np.random.default_rng(self._seed)
+        task = self.own.task
 
-    def close(self) -> None:
-        """Close the environments of the comparisons."""
-        for setting in (self.own, self._wide):
-            if setting is not None:
-                setting.close()
+        def random() -> tuple[LiveScene, str]:
+            return LiveScene.of(self.own.sampler([generator]), task), ""
+
+        kinds: dict[str, Draw] = {"Random": random}
+        for label, name in (("Test", "test"), ("Hard", "hard")):
+            scenes = frozen_scenes(name, self.env_id, self.env_kwargs)
+            if scenes is not None:
+                endless = _endless(scenes, task, name)
+                kinds[label] = lambda endless=endless: next(endless)  # type: ignore[misc]
+        return kinds
+
+
+def make_env(task: Task) -> ReachVectorEnv:
+    """Return a batch of one environment of a task."""
+    arguments = {**task.as_dict(), "arm": task.arm}
+    return ReachVectorEnv(1, **{name: _argument(value) for name, value in arguments.items()}, threads=1)
+
+
+def frozen_scenes(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> Scenes | None:
+    """Return the scenes of a shipped set of an environment; None if there is none for these arguments."""
+    from viapoint.training.scene_sets.scene_set import frozen_fit, load
+
+    if not frozen_fit(name, env_id, env_kwargs):
+        return None
+    scenes: Scenes = load(name, env_id).scenes
+    return scenes
+
+
+def _endless(scenes: Scenes, task: Task, name: str) -> Iterator[tuple[LiveScene, str]]:
+    """Yield the scenes of a set, again and again."""
+    for row in itertools.cycle(range(len(scenes.start))):
+        yield LiveScene.of(scenes, task, row), f"Scene {row} of the set {name}."
+
+
+def _argument(value: Any) -> Any:
+    """Return a value of a task as an argument of an environment."""
+    return tuple(value) if isinstance(value, list) else value

@@ -1,28 +1,22 @@
-"""Baselines and agents behind one protocol: observations and scenes in, actions out."""
+"""Methods that agents are compared with, and agents as such methods."""
 
 from __future__ import annotations
 
 import functools
 import re
-import sys
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from tqdm import tqdm
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.planning.cma_planner import Planner
 from viapoint.training.planning.ompl_planner import MotionPlanner
-from viapoint.training.planning.replanning_baselines import OpenLoopBaseline, ReplanningPlanner
-from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, new_simulation
+from viapoint.training.planning.search import GeometrySearch, registered_task
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.planning.candidates import candidate_actions
-from viapoint.training.planning.search import GeometrySearch, score_plans
-from viapoint.training.planning.plan_checks import CLEARANCE_MARGIN, REACH_MARGIN
 
 
 class Method(Protocol):
@@ -37,7 +31,7 @@ class Method(Protocol):
         """Name in tables of results."""
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return actions, shape (N, m), from first observations; planners that simulate use the scenes."""
+        """Return actions, shape (N, m), from observations; planners that simulate use the scenes."""
 
 
 class Straight:
@@ -53,25 +47,6 @@ class Straight:
         return np.zeros((len(scenes.start), self._size))
 
 
-class Constant:
-    """Action that succeeds in most scenes of the training distribution."""
-
-    name = "best constant action"
-    n_candidates = n_scenes = 256
-
-    def __init__(self, simulation: SceneSimulation) -> None:
-        generator = np.random.default_rng(0)
-        scenes = simulation.task.sampler()([generator] * self.n_scenes)
-        actions = generator.uniform(-1.0, 1.0, (self.n_candidates, simulation.task.action.size))
-        progress = tqdm(actions, desc=self.name, unit=" actions", file=sys.stderr, leave=False)
-        solved = [simulation(scenes, np.tile(each, (self.n_scenes, 1))).success.sum() for each in progress]
-        self._action = actions[np.argmax(solved)]
-
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return the same action for every scene, see :class:`Method`."""
-        return np.tile(self._action, (len(scenes.start), 1))
-
-
 class RandomVias:
     """Best of some random actions by simulated reward; a single one is not simulated."""
 
@@ -83,7 +58,7 @@ class RandomVias:
     @functools.cached_property
     def _for_one_scene(self) -> SceneSimulation:
         """Simulation of as many actions as there are: a larger one would simulate more movements."""
-        return new_simulation(self._simulation.env_id, self._count, **self._simulation.kwargs)
+        return SceneSimulation(self._simulation.env_id, self._count, **self._simulation.kwargs)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the best of the random actions, see :class:`Method`."""
@@ -97,41 +72,22 @@ class RandomVias:
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
 
 
-class RandomOrder:
-    """Best of some plans that are drawn at random for each scene and checked with computed geometry."""
+class OpenLoopBaseline:
+    """First decision of a method, which is never revised."""
 
-    def __init__(self, simulation: SceneSimulation, checks: int) -> None:
-        self.name, self._checks = f"random order, {checks} checks", checks
-        self._task = simulation.task
-        self._generator = np.random.default_rng(0)
+    def __init__(self, method: Method, simulation: SceneSimulation) -> None:
+        self.name, self._method = f"{method.name}, no revision", method
+        self._simulation = SceneSimulation(
+            simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()}
+        )
 
-    def decide(self, observation: Observation, scenes: Any) -> Float:
-        """Return the best of random plans that have the duration of the greatest reward."""
-        layout = candidate_actions(self._task, 2, replanning=False)[1]
-        number, size = len(observation["hand"]), self._task.action.size
-        duration = self._task.action.n_via * self._task.action.dimension
-        actions = self._generator.uniform(-1.0, 1.0, (number, self._checks, size)).astype(np.float32)
-        actions[..., duration] = layout[duration]
-        worth = score_plans(observation, actions, self._task, (CLEARANCE_MARGIN, REACH_MARGIN))
-        return np.asarray(actions[np.arange(number), worth.argmax(axis=1)], dtype=np.float64)
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return the decision of the method, see :class:`Method`."""
+        return self._method.decide(observation, scenes)
 
-
-class StoredSolutions:
-    """Solutions that the planner found when the scene set was made; `viapoint evaluate` runs the planner anew."""
-
-    name = "planner (stored)"
-    timed = False
-
-    def __init__(self, frozen: Any) -> None:
-        self._solutions = dict(zip(map(self._key, *frozen.scenes), frozen.solution, strict=True))
-
-    def decide(self, observation: Any, scenes: Scenes) -> Float:
-        """See :class:`Method`; the scenes must be of the set."""
-        return np.array([self._solutions[key] for key in map(self._key, *scenes)])
-
-    @staticmethod
-    def _key(*fields: Float) -> bytes:
-        return b"".join(field.tobytes() for field in fields)
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+        """Simulate one movement in each scene; it fails where the target has changed by its end."""
+        return self._simulation.episodes(scenes, decisions, None, single_decision=True)
 
 
 class AgentMethod:
@@ -170,7 +126,7 @@ def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
     env_id, env_kwargs = env_arguments(model.get_env())
-    if env_id in STEP_TASKS:
+    if registered_task(env_id, **env_kwargs).stepwise:
         return StepAgentMethod(name, model, env_id, env_kwargs)
     return AgentMethod(name, model, checks)
 
@@ -185,48 +141,45 @@ def refined_search(simulation: SceneSimulation, checks: int) -> Method:
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
     "search": refined_search,
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
-    "random_order": RandomOrder,
 }
 """Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
-FEWEST_CHECKS = {"search": 4, "sobol": 1, "random_order": 1}
+FEWEST_CHECKS = {"search": 4, "sobol": 1}
 
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
-    "constant": Constant,
     "random": lambda simulation: RandomVias(simulation, 1),
     "random16": lambda simulation: RandomVias(simulation, 16),
     "random80": lambda simulation: RandomVias(simulation, 80),
-    "planner": Planner,
     "ompl": MotionPlanner,
 }
 """Factories of baselines by their names on the command line."""
 
-REPLANNING_METHODS: dict[str, Callable[[Any], Method]] = {
+REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
-    "planner": ReplanningPlanner,
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
 }
 """Factories of baselines for replanning tasks."""
 
 
-def check_method(name: str, env_id: str) -> None:
-    """Check that a baseline of this name exists for an environment."""
-    factory(name, env_id)
+def check_method(name: str, task: Task) -> None:
+    """Check that a baseline of this name exists for a task."""
+    factory(name, task)
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """Return a baseline for an environment made with `kwargs`."""
-    return factory(name, env_id)(new_simulation(env_id, **kwargs))
+    simulation = SceneSimulation(env_id, **kwargs)
+    return factory(name, simulation.task)(simulation)
 
 
-def factory(name: str, env_id: str) -> Callable[[Any], Method]:
-    """Return the factory of a baseline for an environment.
+def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
+    """Return the factory of a baseline for a task.
 
     Raises:
         ValueError: There is no such baseline.
     """
-    known = REPLANNING_METHODS if env_id in REPLANNING_TASKS else METHODS
+    known = REPLANNING_METHODS if task.replanning else METHODS
     if name in known:
         return known[name]
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
@@ -234,4 +187,4 @@ def factory(name: str, env_id: str) -> Callable[[Any], Method]:
         make, checks = COUNTED[found[1]], int(found[2])
         return lambda simulation: make(simulation, checks)
     counted = [f"{each}N" for each in COUNTED]  # N plans are checked
-    raise ValueError(unknown_name(f"baseline in {env_id}", name, [*known, *counted, "untrained"]))
+    raise ValueError(unknown_name("baseline", name, [*known, *counted, "untrained"]))

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Observation, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.mdp.observation import is_replanning
 from viapoint.training.planning.candidates import OBSERVED, candidate_actions
-from viapoint.training.planning.plan_checks import check_plans
-from viapoint.training.planning.planned_movements import take_rows
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import plan_clearances
 
 if TYPE_CHECKING:
-    from viapoint.envs.mdp.task import Task
+    from viapoint.envs.task import Task
 
     VectorWrapper = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]
 else:
@@ -35,14 +34,14 @@ BOUND = 0.05
 def candidate_margins(observation: Mapping[str, NDArray[Any]], task: Task, number: int) -> Single:
     """Return the computed margins of fixed candidate plans, shape (B, number), [m].
 
-    The margin of a plan is the minimum of its clearance and its reach margin, clipped to +- BOUND. Candidate k is the
+    The margin of a plan is its clearance, clipped to +- BOUND; -BOUND where it leaves the reach. Candidate k is the
     same action in every observation, see :func:`~viapoint.training.planning.candidates.candidate_actions`; the first one
     is the zero action.
     """
-    actions = candidate_actions(task, number, replanning=is_replanning(observation))
+    actions = candidate_actions(task, number, replanning=task.replanning)
     every = np.broadcast_to(actions, (len(observation["hand"]), *actions.shape))
-    checks = check_plans(observation, every, task)
-    margin: Single = np.minimum(checks.clearance, checks.reach_margin).clip(-BOUND, BOUND).astype(np.float32)
+    found = plan_clearances(task, Problem.of_observation(observation, task), every, BOUND, -BOUND)
+    margin: Single = found.clip(-BOUND, BOUND).astype(np.float32)
     return margin
 
 
@@ -52,15 +51,16 @@ def with_candidates(observation: Mapping[str, NDArray[Any]], task: Task, number:
     if OBSERVED in parts:
         return parts
     single = parts["hand"].ndim == 1
-    margins = candidate_margins(take_rows(parts, None) if single else parts, task, number)
+    batch = {name: part[None] for name, part in parts.items()} if single else parts
+    margins = candidate_margins(batch, task, number)
     return {**parts, OBSERVED: margins[0] if single else margins}
 
 
 class ObserveCandidates(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Wrapper that adds the computed margins of fixed candidate plans to the observation of one environment.
 
-    The observation gets a part `candidates`, shape (n_candidates,), [m]: for each plan the minimum of clearance and
-    reach margin, clipped to +-0.05 m. The plans are the zero action and points of a Sobol sequence, the same ones in
+    The observation gets a part `candidates`, shape (n_candidates,), [m]: the clearance of each plan, clipped to
+    +-0.05 m. The plans are the zero action and points of a Sobol sequence, the same ones in
     every scene. So an algorithm that learns from observations alone gets what a search computes. After the end of an
     episode the part is zero. :class:`VectorObserveCandidates` wraps vector environments.
 

@@ -175,6 +175,47 @@ def merits(task: Task, problem: Problem, actions: Float) -> Float:
     return _merits(setting, table_of(task), problem.start, moves, worth, problem.obstacles, horizons, gain)
 
 
+def plan_clearances(task: Task, problem: Problem, actions: Float, most: float, least: float) -> Float:
+    """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
+
+    Args:
+        task: Task.
+        problem: B problems.
+        actions: Actions.
+        most: Greatest clearance of interest, [m].
+        least: Clearance below which the exact value does not matter, [m].
+    """
+    moves = moves_of(task, problem, actions)
+    setting = setting_of(task, problem.obstacles)
+    return np.asarray(
+        _clearances(setting, table_of(task), problem.start, moves, problem.obstacles, most, least)
+    )
+
+
+@compiled
+def _clearances(
+    setting: Setting,
+    table: MovementTable,
+    start: Float,
+    moves: Moves,
+    obstacles: Obstacles,
+    most: float,
+    least: float,
+) -> Float:
+    """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
+    number, plans = moves.duration.shape
+    found = np.empty((number, plans))
+    placed = memory(setting.chain, setting.spheres)
+    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
+    for b in range(number):
+        for h in range(plans):
+            found[b, h] = least_clearance(
+                setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
+                obstacles, b, most, least, HORIZONS[0], position, joints, placed,
+            )  # fmt: skip
+    return found
+
+
 @compiled
 def _merits(
     setting: Setting,

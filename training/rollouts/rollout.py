@@ -1,4 +1,4 @@
-"""Rollouts of actions and of methods in given scenes: whole movements, episodes, and actions in every control step."""
+"""Rollouts of actions and of methods in given scenes: whole movements, replanning, and actions in every control step."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.actions.via_points import Motion, Plan
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS, check_registered, twin_of
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes
+from viapoint.envs.plans import Plan
+from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.task import END
+from viapoint.training.planning.search import registered_task
 
 if TYPE_CHECKING:
-    from viapoint.envs.vector_env import Decision, ReachVectorEnv
-    from viapoint.envs.velocity_env import VelocityVectorEnv
+    from viapoint.envs.vector_env import ReachVectorEnv
+
+Decide = Callable[[Observation, Scenes], Float]
+"""Function of observations and scenes that returns actions, shape (N, m)."""
 
 
 class SimulationResults(NamedTuple):
@@ -39,165 +42,141 @@ class SimulationResults(NamedTuple):
 
 
 class SceneSimulation:
-    """Simulation of actions in given scenes, `num_envs` at a time."""
+    """Simulation of episodes in given scenes, `num_envs` at a time.
+
+    Args:
+        env_id: Id of a registered environment.
+        num_envs: Greatest number of scenes that are simulated together.
+        **kwargs: Keyword arguments of the environment.
+
+    Raises:
+        ValueError: There is no such environment, or an argument is not allowed.
+    """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
         check_registered(env_id)
         self.env_id, self.kwargs = env_id, kwargs
-        sizes = {num_envs, min(num_envs, 64)}
-        self._envs: dict[int, ReachVectorEnv] = {
-            size: gym.make_vec(env_id, num_envs=size, **kwargs)  # type: ignore[misc]
-            for size in sorted(sizes)
-        }
-        self.task = self._envs[num_envs].task
         self._capacity = num_envs
+        self._envs: dict[int, ReachVectorEnv] = {}
+        self.task = registered_task(env_id, **kwargs)
 
-    def draw(self, number: int, seed: int) -> Any:
+    def draw(self, number: int, seed: int) -> Scenes:
         """Sample scenes of the task, the same ones for the same seed."""
-        return self.task.sampler()([np.random.default_rng(seed)] * number)
+        return self.task.sampler()([np.random.default_rng((seed, each)) for each in range(number)])
 
     def observe(self, scenes: Scenes) -> Observation:
-        """Return first observations in N scenes, without a simulation."""
-        joints = np.asarray(self.task.arm.inverse_kinematics(scenes.start))
-        return self.task.observation.observe(joints, scenes.start, scenes)
+        """Return first observations in N scenes."""
+        pieces = [
+            {name: part[: rows.stop - rows.start] for name, part in self._begin(env, scenes, rows).items()}
+            for rows, env in self._groups(len(scenes.start))
+        ]
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
-        """Simulate one action in each of N scenes, N at least 1."""
-        return self._simulate(scenes, (actions,), lambda env, some: env.execute_actions(some))
+        """Simulate episodes that begin with one action in each of N scenes; all later actions are zero."""
+        return self.episodes(scenes, actions, None)
 
     def play(self, method: Any, scenes: Scenes, decisions: Float) -> SimulationResults:
-        """Simulate the decisions of a method in N scenes, by its own `execute` if it has one."""
-        results: SimulationResults = getattr(method, "execute", self)(scenes, decisions)
-        return results
+        """Simulate episodes that begin with the decisions of a method; it makes every later decision, too.
+
+        A method with `execute(scenes, decisions)` simulates them itself.
+        """
+        if hasattr(method, "execute"):
+            results: SimulationResults = method.execute(scenes, decisions)
+            return results
+        return self.episodes(scenes, decisions, method.decide)
+
+    def episodes(
+        self, scenes: Scenes, actions: Float, decide: Decide | None, *, single_decision: bool = False
+    ) -> SimulationResults:
+        """Simulate one episode in each of N scenes, N at least 1.
+
+        Args:
+            scenes: Scenes.
+            actions: First actions, shape (N, m).
+            decide: Function that makes the later decisions; None for zero actions.
+            single_decision: True to end after the first decision.
+        """
+        pieces = []
+        for rows, env in self._groups(len(scenes.start)):
+            self._begin(env, scenes, rows)
+            some = scenes.take(rows)
+            pieces.append(_episodes(env, some, actions[rows], decide, single_decision))
+        return SimulationResults.concatenate(pieces)
 
     def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
-        return self._simulate(scenes, plan, lambda env, *some: env.execute_plan(Plan(*some)))
-
-    def _simulate(
-        self, scenes: Scenes, arrays: tuple[Float, ...], act: Callable[..., Decision]
-    ) -> SimulationResults:
         pieces = []
-        for rows, env in self._groups(len(arrays[0])):
-            env.reset(options=_filled(scenes.take(rows), env.num_envs).as_options())
-            _, reward, info = act(env, *(repeated(each[rows], env.num_envs) for each in arrays))
+        for rows, env in self._groups(len(scenes.start)):
+            self._begin(env, scenes, rows)
             number = rows.stop - rows.start
-            pieces.append(
-                SimulationResults(reward[:number], {name: value[:number] for name, value in info.items()})
-            )
+            decision = env.execute_plan(plan.take(_filled(rows, env.num_envs)))
+            info = {name: value[:number] for name, value in decision.info.items()}
+            pieces.append(SimulationResults(decision.reward[:number], info))
         return SimulationResults.concatenate(pieces)
-
-    def _groups(self, number: int) -> Iterator[tuple[slice, Any]]:
-        """Yield rows of scenes with the smallest vector environment that takes them."""
-        for first in range(0, number, self._capacity):
-            rows = slice(first, min(first + self._capacity, number))
-            yield rows, self._envs[next(size for size in self._envs if size >= rows.stop - rows.start)]
 
     def close(self) -> None:
         """Close the environments."""
         for env in self._envs.values():
             env.close()
 
+    def _begin(self, env: ReachVectorEnv, scenes: Scenes, rows: slice) -> Observation:
+        """Start some scenes, the last one also in environments that are left over."""
+        return env.begin(scenes.take(_filled(rows, env.num_envs)))
 
-def repeated(values: Float, number: int) -> Float:
-    """Return values padded with copies of the first row to `number` rows."""
-    return np.concatenate((values, np.repeat(values[:1], number - len(values), axis=0)))
-
-
-class EpisodeSimulation(SceneSimulation):
-    """Simulation of whole episodes in given scenes, `num_envs` at a time."""
-
-    @property
-    def time_limit(self) -> float:
-        """Time limit of an episode, [s]."""
-        return float(self._envs[self._capacity].time_limit)  # type: ignore[attr-defined]
-
-    def draw(self, number: int, seed: int) -> ChangingScenes:
-        """Sample scenes of the task, the same ones for the same seed."""
-        env: Any = self._envs[min(self._envs)]
-        pieces = []
-        for first in range(0, number, env.num_envs):
-            env.reset(seed=[seed + first + i for i in range(env.num_envs)])
-            pieces.append(env.scenes)
-        together = ChangingScenes(*(np.concatenate(fields) for fields in zip(*pieces, strict=True)))
-        return together.take(slice(0, number))
-
-    def observe(self, scenes: Any) -> Observation:
-        """Return first observations in N scenes."""
-        pieces: list[Observation] = []
-        for rows, env in self._groups(len(scenes.start)):
-            observation, _ = env.reset(options=_filled(scenes.take(rows), env.num_envs).as_options())
-            pieces.append({name: part[: rows.stop - rows.start] for name, part in observation.items()})
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-
-    def __call__(self, scenes: Any, actions: Float) -> SimulationResults:
-        """Play episodes that begin with one action in each of N scenes; all later actions are zero."""
-        return self._play(scenes, actions, None)
-
-    def first(self, scenes: Any, actions: Float) -> SimulationResults:
-        """Simulate one decision in each of N scenes."""
-        return self._play(scenes, actions, None, single_decision=True)
-
-    def play(self, method: Any, scenes: Any, decisions: Float) -> SimulationResults:
-        """Play episodes that begin with the decisions of a method; it makes every later decision, too."""
-        if hasattr(method, "execute"):
-            return super().play(method, scenes, decisions)
-        return self._play(scenes, decisions, method)
-
-    def _play(
-        self, scenes: Any, actions: Float, method: Any, *, single_decision: bool = False
-    ) -> SimulationResults:
-        pieces = [
-            _episodes(env, scenes.take(rows), actions[rows], method, single_decision)
-            for rows, env in self._groups(len(scenes.start))
-        ]
-        return SimulationResults.concatenate(pieces)
+    def _groups(self, number: int) -> Iterator[tuple[slice, ReachVectorEnv]]:
+        """Yield rows of scenes with the smallest vector environment that takes them."""
+        for first in range(0, number, self._capacity):
+            rows = slice(first, min(first + self._capacity, number))
+            sizes = [1, min(64, self._capacity), self._capacity]
+            size = next(each for each in sizes if each >= rows.stop - rows.start)
+            if size not in self._envs:
+                made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
+                self._envs[size] = made.unwrapped
+            yield rows, self._envs[size]
 
 
-def new_simulation(env_id: str, num_envs: int = 512, **kwargs: Any) -> SceneSimulation:
-    """Return the simulation that an environment needs: of actions, or of whole episodes with replanning."""
-    return (EpisodeSimulation if env_id in REPLANNING_TASKS else SceneSimulation)(env_id, num_envs, **kwargs)
+def _filled(rows: slice, number: int) -> NDArray[np.int64]:
+    """Return indices of some rows, the last one repeated up to a number of them."""
+    return np.minimum(rows.start + np.arange(number), rows.stop - 1)
 
 
 def _episodes(
-    env: Any, scenes: Any, first_actions: Float, method: Any, single_decision: bool
+    env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None, single_decision: bool
 ) -> SimulationResults:
-    """Play one episode in each scene; environments that have ended go on with others, which do not count."""
-    number, size = len(first_actions), env.num_envs
-    env.reset(options=_filled(scenes, size).as_options())
-    actions, running, reward = repeated(first_actions, size), np.arange(size) < number, np.zeros(number)
+    """Play one episode in each scene; environments beyond them do not take part."""
+    number, size = len(first), env.num_envs
+    actions = np.zeros((size, first.shape[1]))
+    actions[:number] = first
+    running = np.arange(size) < number
+    reward, decisions = np.zeros(number), np.zeros(number)
     last: dict[str, NDArray[Any]] = {}
-    decisions = np.zeros(number)
     while running.any():
         now = running[:number].copy()
-        observation, earned, terminated, truncated, info = env.step(actions)
-        reward += np.where(now, earned[:number], 0.0)
+        decision = env.execute_actions(actions, running)
+        reward += np.where(now, decision.reward[:number], 0.0)
         decisions += now
-        for name in (name for name in info if not name.startswith(("_", "final_"))):
-            last[name] = np.where(now, info[name][:number], last.get(name, info[name][:number]))
-        running &= ~(terminated | truncated | single_decision)
-        actions, rows = np.zeros_like(actions), np.flatnonzero(running)
-        if method is not None and rows.size:
-            seen = {name: part[rows] for name, part in observation.items()}
-            actions[rows] = method.decide(seen, scenes.take(rows))
-    last["decisions"], last["duration"] = decisions, last["time"]
+        for name, values in decision.info.items():
+            last[name] = np.where(now, values[:number], last.get(name, values[:number]))
+        running &= ~(decision.terminated | decision.truncated | single_decision)
+        actions[:] = 0.0
+        rows = np.flatnonzero(running)
+        if decide is not None and rows.size:
+            seen = {name: part[rows] for name, part in decision.observation.items()}
+            actions[rows] = decide(seen, scenes.take(rows))
+    last["decisions"] = decisions
+    if not env.task.whole_movement:
+        last["duration"] = last["time"]
     return SimulationResults(reward, last)
 
 
-def _filled(scenes: Any, number: int) -> Any:
-    """Return scenes padded with copies of the first one to `number`."""
-    return type(scenes)(*(repeated(field, number) for field in scenes))
-
-
-def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return id and arguments of the equivalent task with whole movements as actions; of most tasks, their own."""
-    if env_id not in STEP_TASKS:
-        return env_id, dict(kwargs)
-    shared = {name: value for name, value in kwargs.items() if name != "control_step"}
-    if isinstance(shared.get("reward_weights"), Mapping):
-        weights = shared["reward_weights"]
-        shared["reward_weights"] = {name: value for name, value in weights.items() if name != "progress"}
-    return twin_of(env_id), shared
+def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments of an environment with which an action is a whole movement; of most tasks, the given ones."""
+    task = registered_task(env_id, **kwargs)
+    if not task.stepwise:
+        return dict(kwargs)
+    weights = {**vars(task.weights), "progress": 0.0}
+    return {**kwargs, "decide_at": END, "reward_weights": weights}
 
 
 class StepAgentMethod:
@@ -208,34 +187,16 @@ class StepAgentMethod:
     """
 
     def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
-        self.name, self._model, self._env_id, self._kwargs = name, model, env_id, dict(env_kwargs)
-        self._envs: dict[int, VelocityVectorEnv] = {}
+        self.name, self._model = name, model
+        self._simulation = SceneSimulation(env_id, 250, **env_kwargs)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
         if "time_left" not in observation:
-            env: Any = self._env(len(scenes.start))
-            rest, time = Motion.at_rest(scenes.start), np.zeros(len(scenes.start))
-            observation = env.observation_layout.moving(observation, scenes, rest, time)
+            observation = self._simulation.observe(scenes)
         actions, _ = self._model.predict(observation, deterministic=True)
         return np.asarray(actions, dtype=np.float64)
 
     def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Play every episode to its end, beginning with the given actions."""
-        env = self._env(len(decisions))
-        env.reset(options=scenes.as_options())
-        running, reward = np.ones(len(decisions), dtype=bool), np.zeros(len(decisions))
-        last: dict[str, NDArray[Any]] = {}
-        while running.any():
-            observation, earned, info = env.execute_actions(decisions)
-            reward += np.where(running, earned, 0.0)
-            last = {name: np.where(running, now, last.get(name, now)) for name, now in info.items()}
-            running &= ~(env.terminated | env.truncated)
-            decisions = self.decide(observation, scenes)
-        return SimulationResults(reward, last)
-
-    def _env(self, number: int) -> VelocityVectorEnv:
-        if number not in self._envs:
-            env: Any = gym.make_vec(self._env_id, num_envs=number, **self._kwargs)
-            self._envs[number] = env
-        return self._envs[number]
+        return self._simulation.episodes(scenes, decisions, self.decide)

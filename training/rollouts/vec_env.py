@@ -14,8 +14,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
-from viapoint.envs.mdp.rewards import RewardTerms
-from viapoint.envs.registration import ENV_IDS, check_registered
+from viapoint.envs.registration import check_registered
+from viapoint.envs.rewards import RewardTerms
 from viapoint.training.planning.candidates import OBSERVED
 from viapoint.training.planning.observe_candidates import VectorObserveCandidates
 
@@ -51,7 +51,7 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
     spec: Any = None if inner is None else inner.get_attr("spec", [0])[0]
-    if spec is None or spec.id not in ENV_IDS:
+    if spec is None or not hasattr(inner.get_attr("unwrapped", [0])[0], "task"):
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
@@ -66,8 +66,8 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
 class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
-    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy, and is 2 to 7 times as
-    fast (64 copies on two cores; `benchmarks/throughput.py` measures the ratio). Episodes may have one step or many,
+    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy; `benchmarks/speed.py`
+    measures how much faster it is. Episodes may have one step or many,
     and may end at different times.
 
     Args:
@@ -88,7 +88,7 @@ class ViaVecEnv(VecEnv):
         >>> env = ViaVecEnv("viapoint/PlanarObstacles-v0", 64, seed=0, n_obstacles=3)
         >>> observation = env.reset()
         >>> observation["hand"].shape, env.action_space.shape  # [m]
-        ((64, 2), (3,))
+        ((64, 3), (3,))
         >>> observation, reward, done, infos = env.step(np.zeros((64, 3), dtype=np.float32))
         >>> reward.shape, done.tolist() == [True] * 64, sorted(infos[0])[:3]
         ((64,), True, ['TimeLimit.truncated', 'collision', 'duration'])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import sys
 import zipfile
 from collections.abc import Mapping
@@ -16,25 +17,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import CAPSULES, SHAPE_SIZE, has_shapes
-from viapoint.envs.registration import OWN_ARM_TASKS, REPLANNING_TASKS
-from viapoint.envs.scenes.dynamic_scene import ChangingScenes
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import new_simulation
+from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
+from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER, Scenes
+from viapoint.envs.task import Task
 
 SETS = ("validation", "test", "hard", "uniform")
-"""Names of the sets; an environment need not have all."""
+"""Names of the sets; a task need not have all."""
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
 """Bands of the solution share, from easy to hard."""
 BAND_EDGES = (0.2, 0.05, 0.01)
 DRAWN = ""
-"""Family of the scenes that are drawn from the training distribution."""
-MEASURED = ("share", "solution")
-"""Measured values of each scene."""
-PER_SCENE = (*MEASURED, "family", "number")
-"""Fields of a set that have one entry for each scene, besides the scenes."""
+"""Family of the scenes that are drawn as in training."""
+SEEDS = {"validation": 1_000_003, "test": 2_000_003}
+"""Seeds of the sets that can be drawn, far from training seeds and from each other."""
+NUMBERS = {"validation": 500, "test": 1_000}
+"""Number of scenes of such a set."""
 LARGEST = 1 << 30
-"""Limit of the memory of a file's arrays, [bytes], enough for a million scenes: a small archive can claim any size."""
+"""Limit of the memory of a file's arrays, [bytes]: a small archive can claim any size."""
+CONTENT = (
+    "start", "goal", "kind", "centre", "rotation", "size", "velocity", "jumps", "turn_time", "turn_velocity",
+    "share", "family",
+)  # fmt: skip
+"""Arrays of a file, with one entry for each scene."""
+SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
+"""Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
@@ -48,24 +54,19 @@ class FrozenScenes:
 
     name: str
     """Name of the set, or path of its file."""
-    env_id: str
-    scenes: Any
-    """N :class:`~viapoint.envs.scenes.scene.Scenes`, or :class:`~viapoint.envs.scenes.dynamic_scene.ChangingScenes`."""
+    task: Mapping[str, Any]
+    """Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`."""
+    scenes: Scenes
+    """N scenes, without meshes and point clouds."""
     share: Float
-    """Solution share: the fraction of uniformly random actions that succeed in simulation, shape (N,); NaN if
-    unknown."""
-    solution: Float
-    """Actions that the planner found and the simulation confirmed, shape (N, m)."""
+    """Solution share: the fraction of uniformly random actions whose plan is clear, shape (N,); NaN if unknown."""
     family: Any = DRAWN
-    """Name of each scene's family, shape (N,), or one for all; DRAWN for the training distribution."""
-    number: Any = -1
-    """Numbers among the scenes drawn for the set, shape (N,); -1 if unknown."""
+    """Name of each scene's family, shape (N,), or one for all; DRAWN for the families of training."""
 
     def __post_init__(self) -> None:
-        """Expand names and numbers to all scenes."""
-        for name, kind in (("family", np.str_), ("number", np.int64)):
-            values = np.broadcast_to(np.asarray(getattr(self, name), dtype=kind), self.share.shape)
-            object.__setattr__(self, name, values)
+        """Expand the names of families to all scenes."""
+        names = np.broadcast_to(np.asarray(self.family, dtype=np.str_), self.share.shape)
+        object.__setattr__(self, "family", names)
 
     @property
     def band(self) -> NDArray[np.int64]:
@@ -74,30 +75,53 @@ class FrozenScenes:
 
     @property
     def sha256(self) -> str:
-        """Hash of scenes, shares and families; file compression and solutions do not count."""
-        digest = hashlib.sha256(self.env_id.encode())
-        content = self.arrays()
-        del content["solution"]
-        for name, array in content.items():
+        """Hash of task, scenes, shares and families; the compression of the file does not count."""
+        digest = hashlib.sha256(json.dumps(self.task, sort_keys=True).encode())
+        for name, array in self.arrays().items():
             digest.update(f"{name}{array.shape}".encode())
-            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
-        digest.update("\n".join(("family", *self.family)).encode())
+            numbers = array.dtype.kind != "U"
+            digest.update(
+                np.ascontiguousarray(array, dtype="<f8").tobytes() if numbers else "\n".join(array).encode()
+            )
         return digest.hexdigest()
 
-    def arrays(self) -> dict[str, Float]:
-        """Return the arrays by name."""
-        return {**self.scenes._asdict(), **{name: getattr(self, name) for name in MEASURED}}
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a file by name."""
+        obstacles = self.scenes.obstacles
+        parts = {**self.scenes._asdict(), **obstacles._asdict(), "share": self.share, "family": self.family}
+        return {name: np.asarray(parts[name]) for name in CONTENT}
 
     def save(self, path: Path) -> None:
-        """Write the set with its hash."""
-        names = ("env_id", "sha256", "family", "number")
-        rest = {name: np.array(getattr(self, name)) for name in names}
-        np.savez_compressed(path, **rest, **self.arrays())  # type: ignore[arg-type]
+        """Write the set with its hash; numbers that single precision represents take half the place.
+
+        Raises:
+            ValueError: A scene has a mesh or a point cloud.
+        """
+        if (self.scenes.obstacles.kind >= MESH).any():
+            raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
+        arrays = {name: _smallest(array) for name, array in self.arrays().items()}
+        about = {"task": np.array(json.dumps(self.task)), "sha256": np.array(self.sha256)}
+        np.savez_compressed(path, **about, **arrays)  # type: ignore[arg-type]
 
     def take(self, rows: Any) -> FrozenScenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
-        rest = {name: getattr(self, name)[rows] for name in PER_SCENE}
-        return dataclasses.replace(self, scenes=self.scenes.take(rows), **rest)
+        return dataclasses.replace(
+            self, scenes=self.scenes.take(rows), share=self.share[rows], family=self.family[rows]
+        )
+
+
+def rounded(scenes: Scenes) -> Scenes:
+    """Return scenes whose numbers single precision represents."""
+    obstacles = scenes.obstacles
+    single = {
+        name: getattr(obstacles, name).astype(np.float32).astype(np.float64)
+        for name in ("centre", "rotation", "size", "velocity")
+    }
+    others = {
+        name: getattr(scenes, name).astype(np.float32).astype(np.float64)
+        for name in ("start", "goal", "jumps", "turn_time", "turn_velocity")
+    }
+    return scenes._replace(obstacles=obstacles._replace(**single), **others)
 
 
 def shipped_path(name: str, env_id: str) -> Path:
@@ -107,35 +131,62 @@ def shipped_path(name: str, env_id: str) -> Path:
     return Path(str(files("viapoint.training") / "scenes" / f"{stem}_{name}.npz"))
 
 
-def load(name_or_path: str | Path, env_id: str) -> FrozenScenes:
+def shipped_set(name: str, task: Task) -> Path | None:
+    """Return the path of the shipped set whose scenes are those of a task, or None if there is none."""
+    folder = Path(str(files("viapoint.training") / "scenes"))
+    for path in sorted(folder.glob(f"*_{name}.npz")):
+        with np.load(path, allow_pickle=False) as archive:
+            frozen = json.loads(str(archive["task"]))
+        if _scene_key(frozen) == _scene_key(task.as_dict()):
+            return path
+    return None
+
+
+def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return what scenes of a task depend on."""
+    kinds = sorted(task["shapes"]), sorted(task["families"])
+    others = tuple(task[name] for name in SCENE_FIELDS)
+    changing = task["moving_obstacles"] or list(task["n_jumps"]) != [0, 0]
+    when = tuple(task["duration_range"]) if changing else ()
+    return (*(tuple(each) if isinstance(each, list) else each for each in (*kinds, *others)), when)
+
+
+def load(path: Path, name: str = "") -> FrozenScenes:
     """Load a set of scenes and check its hash.
 
-    Args:
-        name_or_path: One of SETS, or the path of a file.
-        env_id: Environment of the scenes.
-
     Raises:
-        ValueError: There is no such set, the file is not one, is damaged, or is for another environment.
+        ValueError: The file is not one of scenes, or is damaged.
     """
-    path = shipped_path(str(name_or_path), env_id) if str(name_or_path) in SETS else Path(name_or_path)
     if not path.is_file():
-        shipped = [name for name in SETS if shipped_path(name, env_id).is_file()]
-        raise ValueError(
-            f"scenes for {env_id} must be one of {', '.join(shipped)} or a file, got {name_or_path!s}"
-        )
-    kind, content = _read(path)
-    scenes = kind(*(content[name] for name in kind._fields))
-    rest: Any = {name: content[name] for name in PER_SCENE}
-    frozen = FrozenScenes(name=str(name_or_path), env_id=str(content["env_id"]), scenes=scenes, **rest)
+        raise ValueError(f"there is no file of scenes {path}")
+    content = _read(path)
+    obstacles = no_obstacles(*content["kind"].shape)._replace(
+        **{part: content[part] for part in ("kind", "centre", "rotation", "size", "velocity")}
+    )
+    own = {part: content[part] for part in ("start", "goal", "jumps", "turn_time", "turn_velocity")}
+    frozen = FrozenScenes(
+        name=name or str(path),
+        task=json.loads(str(content["task"])),
+        scenes=Scenes(obstacles=obstacles, **own),
+        share=content["share"],
+        family=content["family"],
+    )
     if frozen.sha256 != str(content["sha256"]):
         raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
-    if frozen.env_id != env_id:
-        raise ValueError(f"{path} holds scenes for {frozen.env_id}, not for {env_id}")
     return frozen
 
 
-def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """Return the kind of scenes of a file, and its arrays, whose shapes are consistent."""
+def _smallest(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array in the smallest type that holds its values."""
+    if array.dtype.kind == "f":
+        single = array.astype(np.float32)
+        same = (single.astype(np.float64) == array) | np.isnan(array)
+        return single if same.all() else array
+    return array.astype(np.int8) if array.dtype.kind == "i" else array
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file, whose shapes are consistent."""
     try:
         with path.open("rb") as file:
             if not zipfile.is_zipfile(file):
@@ -146,101 +197,109 @@ def _read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
                 raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
-                kind: Any = ChangingScenes if "jumps" in archive else Scenes
-                names = (*kind._fields, *PER_SCENE, "env_id", "sha256")
-                content = {name: archive[name] for name in names}
-        _check_content(kind, content)
+                content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
+        for name in CONTENT:
+            if content[name].dtype.kind == "f":
+                content[name] = content[name].astype(np.float64)
+        content["kind"] = content["kind"].astype(np.int64)
+        _check_content(content)
     except Exception as error:  # an archive can be broken in any of its layers
         raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
-    return kind, content
+    return content
 
 
-def _check_content(kind: Any, content: dict[str, NDArray[Any]]) -> None:
-    """Raise ValueError unless all arrays are of N > 0 scenes in the same D dimensions."""
-    number, d = content["start"].shape if content["start"].ndim == 2 else (0, 0)
-    obstacles = content["obstacles"].shape[1:2]
-    shapes = SHAPE_SIZE * (content["obstacles"].ndim == 3 and has_shapes(content["obstacles"]))
-    wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("start", "goal"), (number, d))
-    wanted |= {
-        "obstacles": (number, *obstacles, 2 * d + 1 + shapes),
-        "courses": (number, *obstacles, 2 * d + 1),
+def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError unless all arrays are of N > 0 scenes with n obstacles each."""
+    if content["start"].ndim != 2 or content["kind"].ndim != 2 or not len(content["start"]):
+        raise ValueError("it holds no scenes")
+    number, joints = content["start"].shape
+    rows = content["kind"].shape[1]
+    wanted: dict[str, tuple[int, ...]] = {
+        "start": (number, joints),
+        "goal": (number, joints),
+        "kind": (number, rows),
+        "centre": (number, rows, 3),
+        "rotation": (number, rows, 3, 3),
+        "size": (number, rows, 3),
+        "velocity": (number, rows, 3),
+        "jumps": (number, MOST_JUMPS, joints + 1),
+        "turn_time": (number, rows),
+        "turn_velocity": (number, rows, 3),
+        "share": (number,),
+        "family": (number,),
     }
-    wanted |= {"jumps": (number, *content.get("jumps", content["goal"]).shape[1:2], d + 1)}
-    wanted |= dict.fromkeys(("share", "family", "number"), (number,))
-    wanted |= {"solution": (number, *content["solution"].shape[1:2])}
-    for name in (*kind._fields, *PER_SCENE):
-        shape, numbers = content[name].shape, content[name].dtype.kind in "fi"
-        if shape != wanted[name] or not number or numbers is (name == "family"):
-            raise ValueError(f"{name} of {number} scenes is {content[name].dtype} of shape {shape}")
+    for name, shape in wanted.items():
+        numbers = content[name].dtype.kind in "fi"
+        if content[name].shape != shape or numbers is (name == "family"):
+            raise ValueError(
+                f"{name} of {number} scenes is {content[name].dtype} of shape {content[name].shape}"
+            )
+        if numbers and name != "share" and not np.isfinite(content[name]).all():
+            raise ValueError(f"{name} is not finite")
+    if not ((content["kind"] >= -1) & (content["kind"] < MESH)).all():
+        raise ValueError("an obstacle has an unknown kind")
     if not (np.isnan(content["share"]) | ((content["share"] >= 0.0) & (content["share"] <= 1.0))).all():
         raise ValueError("a solution share is not between 0 and 1")
 
 
-OTHER_ARGUMENTS = frozenset(
-    {"n_via", "timing", "reward_weights", "threads", "render_mode", "width", "height"}
-)
-"""Arguments of an environment with which frozen scenes remain scenes of it; without replanning, `duration_range` is
-another."""
-SEEDS = {"validation": 1_000_003, "test": 2_000_003}
-"""Seeds of the sets that can be drawn, far from training seeds and from each other."""
-NUMBERS = {"validation": 500, "test": 1_000}
-"""Number of scenes of such a set."""
+def drawn(name: str, task: Task, number: int) -> FrozenScenes:
+    """Draw a set without shares; equal arguments give equal scenes."""
+    generators = [np.random.default_rng((SEEDS[name], each)) for each in range(number)]
+    scenes = task.sampler()(generators)
+    return FrozenScenes(name="drawn", task=task.as_dict(), scenes=scenes, share=np.full(number, np.nan))
 
 
-def scene_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment with which frozen scenes are no scenes of it."""
-    others = OTHER_ARGUMENTS if env_id in REPLANNING_TASKS else OTHER_ARGUMENTS | {"duration_range"}
-    return {name: value for name, value in env_kwargs.items() if name not in others}
+def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) -> FrozenScenes:
+    """Return the named scenes; where no frozen ones are those of the task, draw them and print a line that says so.
 
-
-def frozen_fit(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> bool:
-    """Return True if a set is shipped for an environment with these arguments."""
-    return shipped_path(name, env_id).is_file() and not scene_arguments(env_id, env_kwargs)
-
-
-def drawn(name: str, env_id: str, env_kwargs: Mapping[str, Any], number: int) -> FrozenScenes:
-    """Draw a set without shares and solutions; equal arguments give equal scenes."""
-    simulation = new_simulation(env_id, 64 if env_id in REPLANNING_TASKS else 1, **env_kwargs)
-    scenes = simulation.draw(number, SEEDS[name])
-    simulation.close()
-    share, solution = np.full(number, np.nan), np.zeros((number, simulation.task.action.size))
-    return FrozenScenes(name="drawn", env_id=env_id, scenes=scenes, share=share, solution=solution)
-
-
-def scenes_for(name_or_path: str, env_id: str, env_kwargs: Mapping[str, Any]) -> FrozenScenes:
-    """Return the named scenes; where no frozen ones fit, draw them and print a line that says so.
+    Args:
+        name_or_path: One of SETS, or the path of a file.
+        task: Task.
+        number: Number of scenes that are drawn where no frozen ones fit.
 
     Raises:
-        ValueError: There is no such set, or its scenes cannot be those of the environment.
+        ValueError: There is no such set, or its scenes cannot be those of the task.
     """
-    others = scene_arguments(env_id, env_kwargs)
-    if name_or_path not in SETS:
-        frozen = load(name_or_path, env_id)
-        _check_shapes(frozen, env_kwargs)
-        return frozen
-    if frozen_fit(name_or_path, env_id, env_kwargs) or not (others or env_id in OWN_ARM_TASKS):
-        return load(name_or_path, env_id)
-    made = f"{env_id} with {', '.join(f'{name}={value}' for name, value in others.items())}"
-    where = made if others else env_id
-    if name_or_path not in SEEDS:
+    name = str(name_or_path)
+    if name not in SETS:
+        frozen = load(Path(name_or_path))
+        _check_fit(frozen, task)
+        return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows))
+    path = shipped_set(name, task)
+    if path is not None:
+        return load(path, name)
+    if name not in SEEDS:
         raise ValueError(
-            f"there are no {name_or_path} scenes for {where}; scenes must be {', '.join(SEEDS)}, which are drawn "
-            "for it, or a file"
+            f"no {name} scenes are shipped for this task; scenes must be {', '.join(SEEDS)}, which are drawn for it, "
+            "or a file"
         )
-    print(f"no frozen {name_or_path} scenes are for {where}: they are drawn", file=sys.stderr)
-    return drawn(name_or_path, env_id, env_kwargs, NUMBERS[name_or_path])
+    print(f"no frozen {name} scenes are those of this task: they are drawn", file=sys.stderr)
+    return drawn(name, task, NUMBERS[name] if number is None else number)
 
 
-def _check_shapes(frozen: FrozenScenes, env_kwargs: Mapping[str, Any]) -> None:
-    """Raise ValueError if the scenes of a file have another shape than those of the environment."""
-    simulation = new_simulation(frozen.env_id, 1, **env_kwargs)
-    layout, shapes = simulation.task.observation, simulation.task.scenes.shapes
-    simulation.close()
-    mine = layout.n_rows, layout.dimension
-    theirs = frozen.scenes.present.shape[1], frozen.scenes.start.shape[1]
-    kind = "several shapes" if has_shapes(frozen.scenes.obstacles) else "capsules"
-    if mine != theirs or (kind == "capsules") != (shapes == CAPSULES):
+def _padded(scenes: Scenes, rows: int) -> Scenes:
+    """Return scenes with room for a number of obstacles."""
+    number, present = scenes.obstacles.kind.shape
+    if present == rows:
+        return scenes
+    larger = no_obstacles(number, rows)
+    for name in ("kind", "centre", "rotation", "size", "velocity"):
+        getattr(larger, name)[:, :present] = getattr(scenes.obstacles, name)
+    turn_time = np.full((number, rows), NEVER)
+    turn_time[:, :present] = scenes.turn_time
+    turn_velocity = np.zeros((number, rows, 3))
+    turn_velocity[:, :present] = scenes.turn_velocity
+    return scenes._replace(obstacles=larger, turn_time=turn_time, turn_velocity=turn_velocity)
+
+
+def _check_fit(frozen: FrozenScenes, task: Task) -> None:
+    """Raise ValueError if the scenes of a file are none of a task."""
+    there, rows = frozen.scenes.obstacles.kind, task.observation.n_rows
+    kinds = {KINDS[kind] for kind in np.unique(there[there >= 0])}
+    joints = frozen.scenes.start.shape[1]
+    if joints != len(task.arm.joint_names) or there.shape[1] > rows or not kinds <= set(task.shapes):
         raise ValueError(
-            f"{frozen.name} holds scenes of at most {theirs[0]} obstacles, {kind}, in {theirs[1]} dimensions; the "
-            f"environment, made with {dict(env_kwargs)}, has {mine[0]} of {', '.join(shapes)} in {mine[1]}"
+            f"{frozen.name} holds scenes of an arm of {joints} joints with up to {there.shape[1]} obstacles "
+            f"({', '.join(sorted(kinds)) or 'none'}); the task has {len(task.arm.joint_names)} joints and up to {rows} "
+            f"obstacles ({', '.join(task.shapes)})"
         )
