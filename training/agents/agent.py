@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
+import gymnasium as gym
 import numpy as np
 import sb3_contrib
 import stable_baselines3
-from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.registration import ENV_IDS, REPLANNING_TASKS, STEP_TASKS
+from viapoint.envs.plans import Plan
+from viapoint.envs.scenes.options import draw_given
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
-from viapoint.training.planning.search import scene_from_rest
 from viapoint.training.planning.observe_candidates import with_candidates
-
-if TYPE_CHECKING:
-    from viapoint.envs.geometry.shape import Shape
 
 
 class Agent(BaseAlgorithm):
@@ -37,7 +32,8 @@ class Agent(BaseAlgorithm):
         >>> import numpy as np
         >>> from viapoint.training import load_agent
         >>> agent = load_agent("viapoint/PlanarObstacles-v0")
-        >>> plan = agent.plan(start=(-0.2, 0.3), goal=(0.1, 0.4), obstacles=[(-0.05, 0.35, 0.0, 0.0, 0.03)])
+        >>> post = {"shape": "cylinder", "radius": 0.03, "half_length": 0.04, "position": (-0.05, 0.35, 0.0)}
+        >>> plan = agent.plan(start=(-0.2, 0.3), goal=(0.1, 0.4), obstacles=[post])
         >>> plan.waypoints.shape  # start, via-point and goal, [m]
         (3, 2)
         >>> plan.trajectory()(np.linspace(0.0, plan.durations.sum(), 50)).shape  # positions of the hand, [m]
@@ -68,39 +64,34 @@ class Agent(BaseAlgorithm):
             observation = with_candidates(observation, task, number)
         return super().predict(observation, *args, **kwargs)
 
-    def plan(
-        self, start: ArrayLike, goal: ArrayLike, obstacles: ArrayLike | Sequence[Shape] | None = None
-    ) -> Plan:
+    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> Plan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.
 
         The plan is the one that an environment with this scene would execute after `predict`.
 
         Args:
-            start: Position of the hand, shape (D,), [m].
-            goal: Position of the target, shape (D,), [m].
-            obstacles: Rows (centre D, half-axis D, radius), shape (n, 2 D + 1), [m]; or a list of shapes of
-                :mod:`viapoint.envs` that the environment of the agent may have; None for none. At most as many as the
-                environment may have.
+            start: Start, as `reset` takes it: a position of the hand, joint positions, or a pose.
+            goal: Goal, likewise.
+            obstacles: Shapes or dictionaries, at most as many as the environment of the agent may have.
 
         Raises:
-            ValueError: An argument has another shape or is not finite, the scene is impossible, or an action of the
-                agent is not a whole movement.
+            ValueError: An argument is not allowed, the scene is impossible, or an action of the agent is not a whole
+                movement.
         """
-        env_id = self.env_id
-        if env_id in STEP_TASKS or env_id in REPLANNING_TASKS:
-            raise ValueError(
-                f"plan() needs an agent whose actions are whole movements; in {env_id} an action depends on the motion "
-                "under way: step the environment with predict()"
-            )
         (task,) = self.env.get_attr("task", [0])  # type: ignore[union-attr]
-        scene = scene_from_rest(task, start, goal, obstacles)
-        most, number = task.observation.n_rows, scene.obstacles.shape[1]
-        if number > most:
-            raise ValueError(f"obstacles must have at most {most} rows, as in {env_id}, got {number}")
-        scene = scene._replace(obstacles=np.pad(scene.obstacles, ((0, 0), (0, most - number), (0, 0))))
-        joints = np.asarray(task.arm.inverse_kinematics(scene.start))
-        actions, _ = self.predict(task.observation.observe(joints, scene.start, scene), deterministic=True)
-        plan: Plan = task.action.decode(np.asarray(actions, dtype=np.float64), scene.start, scene.goal)
+        if not task.whole_movement:
+            raise ValueError(
+                f"plan() needs an agent whose actions are whole movements; in {self.env_id} an action depends on the "
+                "motion under way: step the environment with predict()"
+            )
+        given = {"start": start, "goal": goal, "obstacles": obstacles}
+        scenes = draw_given(given, task.sampler(), [np.random.default_rng(0)])
+        arm = task.arm
+        goals = scenes.goal, arm.hand(scenes.goal)
+        seen = task.observation.observe(scenes.start, arm.hand(scenes.start), goals, scenes.obstacles)
+        actions, _ = self.predict(seen, deterministic=True)
+        ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
+        plan: Plan = task.action.decode(np.asarray(actions, dtype=np.float64), *ends)
         return plan.take(0)
 
     def save(self, path: str | Path) -> None:  # type: ignore[override]
@@ -201,10 +192,10 @@ def find_model(source: str | Path) -> Path:
         ValueError: It is none of them.
     """
     folder, known = Path(source), ", ".join(SHIPPED_IDS)
-    if str(source) in ENV_IDS:
-        if str(source) not in SHIPPED_IDS:
-            raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {known}")
+    if str(source) in SHIPPED_IDS:
         return SHIPPED / folder.name
+    if str(source) in gym.registry:
+        raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {known}")
     if folder.suffix == ".zip" and not folder.exists():
         folder = folder.with_suffix("")
     if (folder / "model.json").is_file():

@@ -25,8 +25,8 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from viapoint.envs.actions.via_points import MOST_VIAS
-from viapoint.envs.scenes.families import MOST_OBSTACLES
+from viapoint.envs.plans import MOST_VIAS
+from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import EXTRACTORS
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
@@ -58,6 +58,8 @@ LARGEST_ARGUMENTS = {
     "threads": 1024,
 }
 """Greatest values in a file of those arguments of an environment that memory and time grow with."""
+ANY_TASK = "viapoint/Obstacles-v0"
+"""Id of an environment that can be any task."""
 SPARE_PARAMETERS = 100_000
 """Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
@@ -184,7 +186,12 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         "viapoint": importlib.metadata.version("viapoint"),
         "algorithm": name,
         "policy": policies[model.policy_class],
-        "env": {"id": env_id, "kwargs": _encode(env_kwargs), **({"candidates": number} if number else {})},
+        "env": {
+            "id": env_id,
+            "kwargs": _encode(env_kwargs),
+            "task": model.get_env().get_attr("task", [0])[0].as_dict(),  # type: ignore[union-attr]
+            **({"candidates": number} if number else {}),
+        },
         "num_timesteps": model.num_timesteps,
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
     }
@@ -222,19 +229,24 @@ def _digest(path: Path) -> str:
 
 
 def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
-    """Return one copy of the environment that a file names by `id` and `kwargs`.
+    """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
+
+    The id of a user's own environment need not be registered where the model is loaded.
 
     Raises:
-        ValueError: The id is not registered, or an argument is not one that files may give.
+        ValueError: There is neither, or an argument is not one that files may give.
     """
-    if record["id"] not in gym.registry:  # never lets Gymnasium import a module named in a file
-        raise ValueError(f"environment {record['id']!r} is not known")
+    env_id, kwargs = record["id"], record["kwargs"]
+    if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
+        if "task" not in record:
+            raise ValueError(f"environment {env_id!r} is not known")
+        env_id, kwargs = ANY_TASK, record["task"]
     for name, most in LARGEST_ARGUMENTS.items():
-        value = record["kwargs"].get(name, 0)
+        value = kwargs.get(name, 0)
         for each in value if isinstance(value, list | tuple) else (value,):
             if isinstance(each, int | float) and each > most:
                 raise ValueError(f"{name} may be at most {most} in a file, got {each}")
-    return ViaVecEnv(record["id"], 1, observe_candidates=record.get("candidates", 0), **record["kwargs"])
+    return ViaVecEnv(env_id, 1, observe_candidates=record.get("candidates", 0), **kwargs)
 
 
 @contextmanager

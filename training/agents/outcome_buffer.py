@@ -115,10 +115,10 @@ def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -
     unknown = (np.nan,) * len(Outcomes._fields)
     if not all(name in info for name in TERMS):
         return unknown
-    success, collision, clearance, goal_error, smoothness, duration = (float(info[name]) for name in TERMS)
-    total = success + collision + clearance + goal_error + smoothness + duration
-    if abs(total - reward) > REWARD_TOLERANCE:
+    terms = [float(info[name]) for name in TERMS]
+    if abs(sum(terms) - reward) > REWARD_TOLERANCE:
         return unknown
+    success, collision, clearance, goal_error, smoothness, duration, _ = terms
     succeeded = bool(info.get("is_success", success > 0.0))
     contact = bool(info.get("collision", collision < 0.0))
     first = bool(np.isnan(before))

@@ -20,9 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 from torch.nn import functional
 
-from viapoint.envs.arms import ARMS
-from viapoint.envs.mdp.rewards import StepRewardWeights
-from viapoint.envs.mdp.task import Task
+from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
@@ -30,8 +28,9 @@ from viapoint.training.agents.viaq_critic import Values
 from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.problem import Problem
 
-FIXED_PARTS = ("arm", "whole_arm", "action")
+FIXED_PARTS = ("arm", "space", "n_via", "timing", "duration_range", "shapes")
 """Parts of the task that agent and environment must share, because the policy plans with them."""
 CLEARANCE_SCALE = 0.4
 """Unit of errors of the clearance term, as a share of the weight of the term: 2 cm."""
@@ -161,9 +160,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         return prepared
 
     def _check_env(self, env: VecEnv) -> None:
-        mine, theirs = (
-            task.as_dict() for task in (Task.from_dict(self.policy_kwargs["task"], ARMS), task_of(env))
-        )
+        mine, theirs = Task.from_dict(self.policy_kwargs["task"]).as_dict(), task_of(env).as_dict()
         others = [name for name in FIXED_PARTS if mine[name] != theirs[name]]
         if others:
             raise ValueError(
@@ -200,9 +197,9 @@ class ViaQ(Agent, OffPolicyAlgorithm):
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
         policy, critic = self.policy, self.policy.critic
-        inputs = policy.inputs(batch.observations, batch.actions[:, None])
-        if policy.replanning:
-            inputs = inputs._replace(until=torch.from_numpy(batch.elapsed)[:, None])
+        until = batch.elapsed[:, None].astype(np.float64) if policy.replanning else None
+        problem = Problem.of_observation(batch.observations, policy.task)
+        inputs = policy.inputs(problem, batch.actions[:, None], until)
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
         ended = torch.from_numpy(batch.ended)
@@ -255,7 +252,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         shape = len(batch.ended), self.next_candidates
         chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
         chosen[:, 0] = 0
-        values = critic(policy.inputs(batch.next_observations, every[chosen]))
+        values = critic(policy.inputs(Problem.of_observation(batch.next_observations, policy.task), every[chosen]))
         worth = critic.value(values)
         worth[:, 0] += KEEP
         best = worth.argmax(dim=1, keepdim=True)
@@ -275,7 +272,8 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         candidates = np.random.uniform(-1.0, 1.0, (n_envs, self.explore_candidates, size))  # noqa: NPY002
         candidates[:, 0] = 0.0
         candidates = candidates.astype(np.float32)
-        values = self.policy.values(observation, candidates) / self.temperature
+        values = self.policy.values(Problem.of_observation(observation, self.policy.task), candidates)
+        values = values / self.temperature
         # The argmax of values plus Gumbel noise is a sample of their softmax (Gumbel-max trick).
         noisy = values + np.random.gumbel(size=values.shape)  # noqa: NPY002
         chosen = candidates[np.arange(n_envs), noisy.argmax(axis=1)]
@@ -300,7 +298,7 @@ def task_of(env: VecEnv) -> Task:
         task = env.get_attr("task", indices=0)[0]
     except AttributeError:
         task = None
-    if not isinstance(task, Task) or isinstance(task.weights, StepRewardWeights):
+    if not isinstance(task, Task) or task.stepwise:
         raise ValueError(
             "ViaQ needs an environment of this package in which an action is a whole movement, such as "
             f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from viapoint.envs.geometry.rows import CAPSULES
-from viapoint.envs.mdp.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
-from viapoint.training.agents.obstacle_parts import Parts, Poses, ShapePairs
-from viapoint.training.agents.pair_networks import PairMinimum, dense, networks_of
+from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.training.agents.pairs import PairNetwork, Pairs
 
 if TYPE_CHECKING:
-    from viapoint.envs.mdp.task import Task
+    from viapoint.envs.task import Task
 
 EFFORT = 4
 """Number of effort features: log jerk, duration, log duration, and spare time if time is limited."""
 IN_TIME = 20.0
 """Logits of arrival for each second of spare time in tasks with a time limit, [1/s]."""
+OUTSIDE = 20.0
+"""Logits of arrival that a movement beyond reach or joint ranges loses: it is not executed."""
 UNLIKELY = 10.0
 """Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q."""
 
@@ -38,29 +39,17 @@ class Values(NamedTuple):
     """Predicted sum of the terms for smoothness and duration."""
 
 
-class SceneInputs(NamedTuple):
-    """Inputs of the critic that depend on B scenes only."""
-
-    ends: Tensor
-    """Start, goal and, in replanning tasks, the present motion, shape (B, E)."""
-    parts: Parts
-    """Parts of the obstacles."""
-
-
 class PlanInputs(NamedTuple):
     """Inputs of the critic for H plans in each of B scenes."""
 
-    scene: SceneInputs
+    ends: Tensor
+    """Start, goal and, in replanning tasks, the present motion, shape (B, E)."""
     actions: Tensor
     """Shape (B, H, m)."""
     effort: Tensor
     """Shape (B, H, EFFORT)."""
-    reach: Tensor
-    """Minimum reach margin of the planned hand, shape (B, H), [m]; negative if the plan leaves the reach of the arm."""
-    poses: Poses
-    """Planned poses of the arm."""
-    until: Tensor | None = None
-    """Time after which contact does not count, shape (B, H), [s]; None if plans are executed to their end."""
+    pairs: Pairs
+    """Nearest pairs of spheres and obstacles."""
 
 
 class _Saturated(torch.autograd.Function):
@@ -80,58 +69,46 @@ class _Saturated(torch.autograd.Function):
 
 
 class ViaQCritic(nn.Module):
-    """Network that predicts the value of plans from their margin, reach and effort.
+    """Network that predicts the value of plans from their margin and effort.
 
-    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pair_networks`). The reach margin r(a) of the
-    planned hand does not depend on obstacles and is computed:
+    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement stays
+    within reach and joint ranges, and how far the arm is from itself, s(a):
 
-        P(clear) = sigmoid(k m + b),  P(success) = P(clear) sigmoid(l r + d + c(s, a)),
-        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(m) + e(s, a)
+        c = min(m, s),  P(clear) = sigmoid(k c + b),  P(success) = P(clear) sigmoid(d + r(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(c) + e(s, a)
 
     Args:
         task: Task of the environment.
-        replanning: True if an episode consists of several decisions.
-        width: Width of the hidden layers of the pair networks.
+        width: Width of the hidden layers of the pair network.
     """
 
-    def __init__(self, task: Task, *, replanning: bool, width: int) -> None:
+    def __init__(self, task: Task, *, width: int) -> None:
         super().__init__()
-        d, size = task.arm.dimension, task.action.size
-        ends = (4 * d + 3) if replanning else (2 * d + 1)
-        self.replanning = replanning
-        networks, shapes = networks_of(task), task.scenes.shapes
-        geometry = None if shapes == CAPSULES else ShapePairs(len(shapes), bool(networks))
-        self.pairs = PairMinimum(d, networks, width, geometry=geometry)
-        self.reach = nn.Parameter(torch.tensor([5.0, 0.0]))
-        """Logarithm of l [1/m], and d."""
-        self.rest = dense(ends + EFFORT + (0 if replanning else size), 64, 64, 2)
+        dimension, size = task.space.dimension, task.action.size
+        ends = (4 * dimension + 3) if task.replanning else (2 * dimension + 1)
+        self.replanning = task.replanning
+        self.pairs = PairNetwork(len(task.shapes), width)
+        self.arrival = nn.Parameter(torch.tensor(2.0))
+        """Logit d of arrival of a movement within reach."""
+        self.rest = dense(ends + EFFORT + (0 if task.replanning else size), 64, 64, 2)
         for parameter in self.rest[-1].parameters():
             nn.init.zeros_(parameter)
-        self.linear = nn.Parameter(torch.tensor([-task.weights.smoothness, -task.weights.duration, 0.0, 0.0]))
+        weights = task.weights
+        self.linear = nn.Parameter(torch.tensor([-weights.smoothness, -weights.duration, 0.0, 0.0]))
         """Weights of the effort features, initialised from the reward weights."""
         self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
         """Logarithm of k [1/m], and b."""
-        weights = task.weights
         self.scales = nn.Parameter(
             torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
         )
         """w_s, w_c, w_g and w_m, initialised from the reward weights and adapted to the rewards."""
 
-    def forward(self, inputs: PlanInputs, *, near: float | None = None) -> Values:
-        """Return the predictions for each plan.
-
-        Args:
-            inputs: Inputs of the plans.
-            near: Gap up to which pairs are evaluated, without gradients, see :meth:`PairMinimum.of_near_pairs`, [m];
-                None for all pairs.
-        """
-        if near is None:
-            margin = self.pairs(inputs.poses, inputs.scene.parts, inputs.until)
-        else:
-            margin = self.pairs.of_near_pairs(inputs.poses, inputs.scene.parts, near)
-        reach = inputs.reach.clamp(-0.1, 0.1) * torch.exp(self.reach[0]) + self.reach[1]
+    def forward(self, inputs: PlanInputs) -> Values:
+        """Return the predictions for each plan."""
+        margin = torch.minimum(self.pairs(inputs.pairs), inputs.pairs.self_clearance)
+        reach = self.arrival - OUTSIDE * (~inputs.pairs.inside).to(margin.dtype)
         # Keeping a plan and planning the same movement again have the same value, so the action itself is not an input.
-        ends = inputs.scene.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         known = ends if self.replanning else torch.cat((ends, inputs.actions), dim=-1)
         rest = self.rest(torch.cat((known, inputs.effort), dim=-1))
         low, high = CLEARANCE_RANGE
@@ -162,3 +139,11 @@ class ViaQCritic(nn.Module):
         success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
         merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
         return merit
+
+
+def dense(*sizes: int) -> nn.Sequential:
+    """Return linear layers with ReLU between them."""
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in itertools.pairwise(sizes):
+        layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])

@@ -13,30 +13,20 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import is_vectorized_observation
 from torch import Tensor
 
-from viapoint.envs.actions.via_points import frame
-from viapoint.envs.arms import ARMS
-from viapoint.envs.geometry.rows import has_shapes
-from viapoint.envs.mdp.observation import is_replanning
-from viapoint.envs.mdp.task import Task
-from viapoint.envs.sim.outcome import SETTLING
-from viapoint.training.agents.obstacle_parts import Poses, cut_obstacles, whole_obstacles
-from viapoint.training.agents.viaq_critic import PlanInputs, SceneInputs, ViaQCritic
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Int
+from viapoint.envs.outcome import SETTLING
+from viapoint.envs.plans import turned
+from viapoint.envs.task import Task
+from viapoint.training.agents.pairs import pairs_of
+from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
-from viapoint.training.planning.search import best_actions, score_plans
-from viapoint.training.planning.plan_checks import (
-    CLEARANCE_MARGIN,
-    INFEASIBLE,
-    REACH_MARGIN,
-    reward_bounds,
-)
-from viapoint.training.planning.planned_movements import (
-    Observation,
-    direction,
-    plan_movements,
-    take_rows,
-)
+from viapoint.training.planning.movements import INSTANTS
+from viapoint.training.planning.problem import Problem, moves_of
+from viapoint.training.planning.search import INFEASIBLE, merits
 
+Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
 
 KEEP = 0.1
@@ -49,12 +39,10 @@ PROPOSALS = 32
 """Greatest number of proposals that are checked; all further checks are of plans around the best of them."""
 LOCAL_ROUNDS = 4
 """Rounds of checks around the best checked plans."""
-CHECKED_INSTANTS = 16
-"""Number of instants, for each via-point, at which plans are evaluated if the best of them are checked exactly."""
-SHORTEST_AXIS = 1e-9
-"""Length below which the axis of a capsule is that of a sphere, [m]."""
-POSITIONS = 1 << 16
-"""Planned positions that are computed together, so that temporary arrays stay in the cache."""
+BLOCK = 64
+"""Scenes that are decided together."""
+MOTION_SCALES = (1.0, 0.1)
+"""Scales of velocity and acceleration at the input of the critic."""
 
 
 class ViaQPolicy(BasePolicy):
@@ -64,14 +52,11 @@ class ViaQPolicy(BasePolicy):
         observation_space: Observation space of the environment.
         action_space: Action space of the environment.
         lr_schedule: Learning rate as a function of the remaining progress.
-        task: Task of the environment as plain values, see :meth:`viapoint.envs.mdp.task.Task.as_dict`.
-        width: Width of the hidden layers of the pair networks. The default is 32 if every link must clear obstacles,
-            and 16 if only the hand must.
-        instants: Instants of a plan at which the pair networks are evaluated. The default is 16 if every link must
-            clear obstacles, and 32 if only the hand must.
+        task: Task of the environment as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
+        width: Width of the hidden layers of the pair network.
+        instants: Instants of a plan at which the arm is looked at, 2 to 64.
         candidates: Number of Sobol points in the action space.
-        refinements: Rounds of candidates around the best ones. If plans are checked, one round may have the candidates
-            of all, see :meth:`propose`.
+        refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
         checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
     """
@@ -83,8 +68,8 @@ class ViaQPolicy(BasePolicy):
         lr_schedule: Any,
         *,
         task: Mapping[str, Any],
-        width: int | None = None,
-        instants: int | None = None,
+        width: int = 32,
+        instants: int = 22,
         candidates: int = 256,
         refinements: int = 2,
         per_refinement: int = 64,
@@ -93,17 +78,15 @@ class ViaQPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(
-            ViaQPolicy,
-            {
-                "width": width,
-                "instants": instants,
-                "candidates": candidates,
-                "refinements": refinements,
-                "per_refinement": per_refinement,
-                "checks": checks,
-            },
-        )
+        own = {
+            "width": width,
+            "instants": instants,
+            "candidates": candidates,
+            "refinements": refinements,
+            "per_refinement": per_refinement,
+            "checks": checks,
+        }
+        check_arguments(ViaQPolicy, own)
         super().__init__(
             observation_space,
             action_space,
@@ -111,13 +94,11 @@ class ViaQPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
-        self.task = Task.from_dict(task, ARMS)
-        self.replanning = is_replanning(observation_space.spaces)
+        self.task = Task.from_dict(task)
+        self.replanning = self.task.replanning
         self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
         self.checks = checks
-        self.instants = instants or (16 if self.task.whole_arm else 32)
-        self.shares = instants_of(self.instants)
-        self.width = width or (32 if self.task.whole_arm else 16)
+        self.width, self.instants = width, instants
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
         if self.critic_target is not None:
@@ -131,7 +112,7 @@ class ViaQPolicy(BasePolicy):
 
     def make_critic(self) -> ViaQCritic:
         """Return a new critic for the task."""
-        return ViaQCritic(self.task, replanning=self.replanning, width=self.width)
+        return ViaQCritic(self.task, width=self.width)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -146,167 +127,103 @@ class ViaQPolicy(BasePolicy):
             "checks": self.checks,
         }
 
-    def scene(self, observation: Observation) -> SceneInputs:
-        """Return the inputs of the critic that depend on B scenes only."""
-        ends = seen_ends(observation)
-        if "obstacles" in observation:
-            whole: Any = self.task.observation.scene_rows(observation["obstacles"])
-            velocity = observation.get("obstacle_velocities")
-            moving = None if velocity is None else velocity.reshape(*whole.shape[:2], -1)
-            if has_shapes(whole):
-                parts = whole_obstacles(whole, self.task.scenes.shapes, moving)
-            else:
-                parts = cut_obstacles(whole, whole[..., -1] > 0.0, moving)
-        else:
-            none = np.zeros((len(ends), 1, 2 * self.task.arm.dimension + 1))
-            parts = cut_obstacles(none, np.zeros((len(ends), 1), dtype=bool))
-        return SceneInputs(_tensor(ends), parts)
+    @property
+    def shown_instants(self) -> Int:
+        """Instants of a plan at which the arm is looked at."""
+        return np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
 
-    def inputs(
-        self,
-        observation: Observation,
-        actions: Numbers,
-        scene: SceneInputs | None = None,
-        shares: Numbers | None = None,
-        *,
-        coarse: bool = False,
-    ) -> PlanInputs:
-        """Return the critic's inputs for H actions in each of B scenes.
+    def inputs(self, problem: Problem, actions: Numbers, until: Float | None = None) -> PlanInputs:
+        """Return the critic's inputs for H actions in each of B problems.
 
         Args:
-            observation: Parts of B observations, shape (B, .) each.
+            problem: B problems.
             actions: Shape (B, H, m).
-            scene: Inputs that belong to the scenes; computed if not given.
-            shares: Fractions of the duration at which the pair networks are evaluated; those of training if not given.
-            coarse: See :func:`plan_movements`.
+            until: Time after which contact does not count, shape (B, H), [s].
         """
-        shares = self.shares if shares is None else shares
-        moves = plan_movements(observation, actions, self.task, shares, coarse=coarse)
-        relative = moves.duration / self.task.action.centre_duration
-        spare = np.zeros_like(relative)
-        if self.replanning:
-            spare = np.clip(observation["time_left"] - moves.duration - SETTLING, -0.2, 0.2)
-        effort = np.stack((moves.effort, relative - 1.0, np.log(relative), spare), axis=-1)
-        reach = np.asarray(self.task.arm.reach_margin(moves.path)).min(axis=-1)
-        poses = planned_poses(self.task, moves.path, moves.duration[..., None] * shares)
-        scene = scene or self.scene(observation)
-        return PlanInputs(scene, _tensor(actions), _tensor(effort), _tensor(reach), poses)
+        moves = moves_of(self.task, problem, actions)
+        spare = np.zeros_like(moves.duration)
+        if problem.time_left is not None:
+            spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -0.2, 0.2)
+        effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
+        pairs = pairs_of(self.task, problem, moves, self.shown_instants, until)
+        ends = seen_ends(self.task, problem)
+        return PlanInputs(_tensor(ends), _tensor(actions), _tensor(effort), pairs)
 
     @torch.inference_mode()
-    def values(
-        self,
-        observation: Observation,
-        actions: Numbers,
-        scene: SceneInputs | None = None,
-        *,
-        near: float | None = None,
-        coarse: bool = False,
-    ) -> Numbers:
-        """Return the ranking criterion of H actions in each of B scenes, shape (B, H); see :meth:`ViaQCritic.merit`.
+    def values(self, problem: Problem, actions: Numbers) -> Numbers:
+        """Return the ranking criterion of H actions in each of B problems, shape (B, H); see :meth:`ViaQCritic.merit`.
 
         In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
-
-        Args:
-            observation: Parts of B observations, shape (B, .) each.
-            actions: Shape (B, H, m).
-            scene: Inputs that belong to the scenes; computed if not given.
-            near: See :meth:`ViaQCritic.forward`.
-            coarse: Evaluate the pair networks at no more than CHECKED_INSTANTS instants a via-point.
         """
-        fewer = max(self.instants // (CHECKED_INSTANTS * max(self.task.action.n_via, 1)), 1)
-        shares = self.shares[::fewer] if coarse else self.shares
-        inputs = self.inputs(observation, actions, scene, shares, coarse=coarse)
-        values: Numbers = self.critic.merit(self.critic(inputs, near=near)).numpy()
+        values: Numbers = self.critic.merit(self.critic(self.inputs(problem, actions))).numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
 
-    def propose(self, observation: Observation) -> tuple[Numbers, Numbers]:
-        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero.
-
-        Checks make up for a second round of refinement where this was measured: in single movements with one via-point
-        of which only the hand must clear obstacles.
-        """
-        block = max(POSITIONS // (self.candidates * self.instants), 1)
-        number = len(observation["hand"])
-        if number > block:
-            pieces = [
-                self.propose(take_rows(observation, slice(i, i + block))) for i in range(0, number, block)
-            ]
-            actions, values = (np.concatenate(each) for each in zip(*pieces, strict=True))
-            return actions, values
+    def propose(self, problem: Problem) -> tuple[Numbers, Numbers]:
+        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero."""
         spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
-        actions, scene = np.broadcast_to(spread, (number, *spread.shape)), self.scene(observation)
-        coarse, rounds, size = self.checks > 0, self.refinements, self.per_refinement
-        if coarse and rounds and self.task.action.n_via <= 1 and not (self.task.whole_arm or self.replanning):
-            rounds, size = 1, rounds * size
-        geometry = self.critic.pairs.geometry
-        near = geometry.near_coarse if coarse else geometry.near
-        values = self.values(observation, actions, scene, near=near, coarse=coarse)
-        for each in range(rounds):
-            some = self._near(actions, values, each, size)
+        actions = np.broadcast_to(spread, (len(problem.start), *spread.shape))
+        values = self.values(problem, actions)
+        for each in range(self.refinements):
+            best = min(N_ELITES, actions.shape[1])
+            top = np.argpartition(-values, best - 1, axis=1)[:, :best]
+            some = self._around(np.take_along_axis(actions, top[..., None], axis=1), each)
             actions = np.concatenate((actions, some), axis=1)
-            others = self.values(observation, some, scene, near=near, coarse=coarse)
-            values = np.concatenate((values, others), axis=1)
+            values = np.concatenate((values, self.values(problem, some)), axis=1)
         return actions, values
 
-    def _near(self, actions: Numbers, values: Numbers, each: int, size: int) -> Numbers:
-        """Return `size` candidates around the best ones, shape (B, size, m)."""
-        best = min(N_ELITES, actions.shape[1])
-        top = np.argpartition(-values, best - 1, axis=1)[:, :best]
-        return self._around(np.take_along_axis(actions, top[..., None], axis=1), each, size)
-
-    def _around(self, centres: Numbers, each: int, size: int) -> Numbers:
-        """Return `size` candidates of a round around some of shape (B, ., m), shape (B, size, m)."""
-        steps = normal_steps(size, self.task.action.size, each) * (SPREAD * 0.5**each)
-        around = centres[:, np.arange(size) % centres.shape[1]]
+    def _around(self, centres: Numbers, each: int) -> Numbers:
+        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
+        number = self.per_refinement
+        steps = normal_steps(number, self.task.action.size, each) * (SPREAD * 0.5**each)
+        around = centres[:, np.arange(number) % centres.shape[1]]
         return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
     def decide(self, observation: Observation) -> Numbers:
-        """Return the chosen actions, shape (B, m)."""
-        actions, values = self.propose(observation)
+        """Return the chosen actions, shape (B, m), for parts of B observations."""
+        number = len(observation["joints"])
+        pieces = []
+        for first in range(0, number, BLOCK):
+            some = {name: part[first : first + BLOCK] for name, part in observation.items()}
+            pieces.append(self._chosen(Problem.of_observation(some, self.task)))
+        return np.concatenate(pieces)
+
+    def _chosen(self, problem: Problem) -> Numbers:
+        """Return the chosen actions of B problems, shape (B, m)."""
+        actions, values = self.propose(problem)
         every = np.arange(len(actions))
         if not self.checks:
             return np.asarray(actions[every, values.argmax(axis=1)])
         count = min(self.checks, values.shape[1])
         local = max(count - PROPOSALS, 0)
-        checked = np.take_along_axis(actions, self._promising(values, count - local)[..., None], axis=1)
-        worth = self._score(observation, checked)
-        best: Numbers = checked[every, worth.argmax(axis=1)]
+        promising = self._promising(values, count - local)
+        checked = np.take_along_axis(actions, promising[..., None], axis=1)
+        worth = merits(self.task, problem, checked)
         unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
+        best: Numbers = checked[every, worth.argmax(axis=1)].copy()
         some = every if self.replanning else unsolved
         if local and len(some):
-            best[some] = self._improved(take_rows(observation, some), checked[some], worth[some], local)
-        return np.asarray(best)
+            best[some] = self._improved(problem.take(some), checked[some], worth[some], local)
+        return best
 
-    def _improved(self, observation: Observation, checked: Numbers, worth: Numbers, count: int) -> Numbers:
-        """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m).
-
-        Around plans that are clear, those with the greatest reward without obstacles are checked, and around others an
-        even selection.
-        """
+    def _improved(self, problem: Problem, checked: Numbers, worth: Numbers, count: int) -> Numbers:
+        """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m)."""
         for each in range(LOCAL_ROUNDS):
             share = (count + each) // LOCAL_ROUNDS
             if share:
-                near = self._around(best_actions(checked, worth)[0], each, self.per_refinement)
-                _, bound = reward_bounds(observation, near, self.task, REACH_MARGIN)
-                clear = worth.max(axis=1, keepdims=True) > 0.5 * INFEASIBLE
-                top = np.argsort(np.where(clear, -bound, 0.0), axis=1, kind="stable")[:, :share]
-                near = np.take_along_axis(near, top[..., None], axis=1)
+                top = np.argsort(-worth, axis=1, kind="stable")[:, :4]
+                near = self._around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
                 checked = np.concatenate((checked, near), axis=1)
-                worth = np.concatenate((worth, self._score(observation, near)), axis=1)
+                worth = np.concatenate((worth, merits(self.task, problem, near)), axis=1)
         return np.asarray(checked[np.arange(len(checked)), worth.argmax(axis=1)])
-
-    def _score(self, observation: Observation, actions: Numbers) -> Numbers:
-        """Return the merit of actions by computed geometry, shape (B, H)."""
-        return score_plans(observation, actions, self.task, (CLEARANCE_MARGIN, REACH_MARGIN))
 
     def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
         """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
 
         Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
         """
-        if self.replanning:  # the action that keeps the plan is always checked
+        if self.replanning:  # the action that keeps the plan is always checked, and first
             values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
         refined = min(count // 2, values.shape[1] - self.candidates)
         spread = min(count - refined, self.candidates)
@@ -350,45 +267,28 @@ class ViaQPolicy(BasePolicy):
         for name, each in observation.items():
             if not np.isfinite(np.asarray(each)).all():
                 raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
-        apart = np.asarray(observation["goal"]) != np.asarray(observation["hand"])
+        here, there = ("joints", "goal_joints") if "goal_joints" in observation else ("hand", "goal")
+        apart = np.asarray(observation[here]) != np.asarray(observation[there])
         if not self.replanning and not apart.any(axis=-1).all():
-            raise ValueError("hand and goal must differ: no movement leads from a point to itself")
+            raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
-def planned_poses(task: Task, path: Numbers, time: Numbers) -> Poses:
-    """Return the planned poses of the arm for paths of the hand, shape (B, H, T, D), [m]."""
-    if not task.whole_arm:
-        return Poses(_tensor(np.moveaxis(path, -1, 0)[None]), None, _tensor(time))
-    links = np.asarray(task.arm.links(task.arm.inverse_kinematics(path)))
-    first, last = (np.moveaxis(links[..., end, :], (-2, -1), (0, 1)) for end in (0, 1))
-    axis = last - first
-    length = np.sqrt((axis * axis).sum(axis=1, keepdims=True))
-    axis = axis / np.maximum(length, SHORTEST_AXIS)  # zero for spheres
-    sizes = _tensor(0.5 * length[:, 0, 0, 0, 0]), _tensor(task.arm.link_radii)
-    return Poses(_tensor(0.5 * (first + last)), _tensor(axis), _tensor(time), *sizes)
-
-
-def seen_ends(observation: Observation) -> Numbers:
+def seen_ends(task: Task, problem: Problem) -> Float:
     """Return start, goal, distance and, in replanning tasks, the present motion, scaled to order one, shape (B, E).
 
-    Velocity and acceleration of the hand are in the frame of the line from hand to goal.
+    In hand space, velocity and acceleration are in the frame of the line from hand to goal.
     """
-    line = direction(observation)
-    distance = np.sqrt((line * line).sum(axis=-1, keepdims=True))
-    ends = [2.0 * observation["hand"], 2.0 * observation["goal"], 2.0 * distance]
-    if is_replanning(observation):
-        axes = np.stack(frame(line), axis=-1)
-        for name, scale in (("velocity", 1.0), ("acceleration", 0.1)):
-            ends.append((observation[name][:, None] @ axes)[:, 0] * scale)
-        ends += [observation["remaining"], observation["time_left"]]
+    scale = 2.0 if task.space.of_hand else 0.5
+    line = problem.goal - problem.start
+    ends = [scale * problem.start, scale * problem.goal, scale * norm(line)[:, None]]
+    if problem.remaining is not None and problem.time_left is not None:
+        for part, size in zip((problem.velocity, problem.acceleration), MOTION_SCALES, strict=True):
+            if task.space.of_hand:
+                mirrored = np.where(norm(line)[:, None] > 0.0, line * (1.0, -1.0), (1.0, 0.0))
+                part = turned(part, mirrored)
+            ends.append(size * part)
+        ends += [problem.remaining[:, None], problem.time_left[:, None]]
     return np.concatenate(ends, axis=-1)
-
-
-def instants_of(number: int) -> NDArray[np.float32]:
-    """Return fractions of the duration of a movement, shape (number,), denser where the hand is fast."""
-    share = np.linspace(0.0, 1.0, 2001)
-    gone = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    return np.interp((np.arange(number) + 0.5) / number, 0.7 * gone + 0.3 * share, share).astype(np.float32)
 
 
 def _tensor(values: Any) -> Tensor:

@@ -15,7 +15,7 @@ import numpy as np
 from typeguard import TypeCheckError, check_type
 
 from viapoint.envs.common.validation import is_number, whole_number
-from viapoint.envs.registration import ENV_IDS
+from viapoint.envs.registration import check_registered
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -48,9 +48,10 @@ def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
 
 
 def check_env(env: str) -> None:
-    """Check that an id is one of this package's."""
-    if env not in ENV_IDS:
-        raise ValueError(unknown_name("env", env, ENV_IDS))
+    """Check that an id is registered."""
+    if not isinstance(env, str):
+        raise ValueError(f"env must be the id of an environment, got {env!r}")
+    check_registered(env)
 
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:

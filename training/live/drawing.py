@@ -12,16 +12,18 @@ import trimesh
 from mjviser.conversions import get_geom_texture_id, merge_geoms
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.mjcf import joint_frames
-from viapoint.envs.common.arrays import in_space, norm
+from viapoint.envs import Arm, Box, Capsule, ConvexMesh, Cylinder, HalfSpace, PointCloud, Shape, Sphere
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import dimension_of, shape_columns
-from viapoint.envs.geometry.shapes import SHAPES
 
 SIDES = 8
 """Sides of a tube."""
-LOW, TALL = 0.030, 0.060
-"""Height of obstacles in the plane, [m]: below links that pass above them, and where links collide."""
+ROUND = 40
+"""Sides of a cylinder."""
+WALL = 1.0, 0.02
+"""Half length and half thickness of the plate that stands for a half-space, [m]."""
+MOST_POINTS = 2_000
+"""Greatest number of points of a cloud that are drawn."""
 VISUAL_GROUPS = 3
 """Geoms of this group and higher ones are hidden by MuJoCo's viewers: they only collide."""
 
@@ -76,42 +78,43 @@ def _tube_faces(number: int) -> NDArray[np.integer[Any]]:
     return np.concatenate((walls, begin, end))
 
 
-def obstacle_mesh(row: Float, floor: float, height: float) -> Triangles:
-    """Return the mesh of an obstacle about its centre, in the plane a wall with its footprint.
-
-    In space, the vertices are the farthest points of the shape in the directions of a sphere's vertices. The mesh of a
-    half-space is that of its box.
+def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> Triangles:
+    """Return the mesh of an obstacle around its position, turned as it is in the world.
 
     Args:
-        row: Row with shapes, see :mod:`viapoint.envs.geometry.rows`, [m].
-        floor: Height of the table of a planar arm, [m].
-        height: Height up to which an obstacle of the plane rises, [m].
+        shape: Obstacle.
+        levels: Least and greatest height of an obstacle in the plane, which is cut off there, [m]; None for space.
     """
-    kind, centre, quaternion, half = shape_columns(row)
-    name = list(SHAPES)[int(kind)]
-    shape = SHAPES["box" if name == "half_space" else name].from_box(centre, quaternion, half)
-    if dimension_of(row) == 2:
-        (outline,) = shape.footprint()
-        return _prism(outline - centre[:2], floor, height)
-    directions, faces = _sphere()
-    return Triangles(shape.support(directions) @ shape.rotation.T, faces)
+    mesh = _mesh(shape)
+    vertices = np.asarray(mesh.vertices) @ shape.rotation.T
+    if levels is not None:
+        vertices[:, 2] = np.clip(vertices[:, 2] + shape.position[2], *levels) - shape.position[2]
+    return Triangles(vertices, np.asarray(mesh.faces))
 
 
-@functools.cache
-def _sphere() -> tuple[Float, NDArray[np.integer[Any]]]:
-    """Return vertices and faces of a unit sphere with vertices on all axes."""
-    mesh = trimesh.creation.icosphere(subdivisions=3)
-    return np.round(mesh.vertices, 12), np.asarray(mesh.faces)
-
-
-def _prism(outline: Float, low: float, high: float) -> Triangles:
-    """Return an upright prism with a convex outline, shape (n, 2), [m]."""
-    n = len(outline)
-    vertices = np.concatenate([in_space(outline, level) for level in (low, high, high)])  # sharp upper edge
-    ring, following = np.arange(n), (np.arange(n) + 1) % n
-    walls = np.stack((ring, following, following + n, ring, following + n, ring + n), axis=-1).reshape(-1, 3)
-    fan = np.stack((np.zeros(n - 2, dtype=int), np.arange(1, n - 1), np.arange(2, n)), axis=-1) + 2 * n
-    return Triangles(vertices, np.concatenate((walls, fan)))
+def _mesh(shape: Shape) -> Any:
+    """Return the mesh of a shape in its own frame."""
+    create = trimesh.creation
+    match shape:
+        case Sphere():
+            return create.icosphere(subdivisions=3, radius=shape.radius)
+        case Capsule():
+            return create.capsule(height=2.0 * shape.half_length, radius=shape.radius, count=(ROUND, ROUND))
+        case Cylinder():
+            return create.cylinder(radius=shape.radius, height=2.0 * shape.half_length, sections=ROUND)
+        case Box():
+            return create.box(extents=2.0 * np.asarray(shape.size))
+        case HalfSpace():
+            length, thick = WALL
+            plate = create.box(extents=(2.0 * length, 2.0 * length, 2.0 * thick))
+            return plate.apply_translation((0.0, 0.0, -thick))
+        case ConvexMesh():
+            return trimesh.convex.convex_hull(np.reshape(shape.vertices, (-1, 3)))
+        case PointCloud():
+            ball = create.icosphere(subdivisions=1, radius=shape.radius)
+            points = shape.points[:: -(-len(shape.points) // MOST_POINTS)]
+            return trimesh.util.concatenate([ball.copy().apply_translation(point) for point in points])
+    raise ValueError(f"obstacles of the shape {shape.kind} cannot be drawn")
 
 
 class ArmDrawing:
@@ -123,17 +126,16 @@ class ArmDrawing:
         model_file: MJCF file that the arm was loaded from; its visible geoms replace the capsules.
     """
 
-    def __init__(self, arm: Any, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
-        self._offset, names = np.zeros(3), getattr(arm, "joint_names", ())
+    def __init__(self, arm: Arm, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
+        self._offset = np.zeros(3)
         if model_file is not None:
-            frames = joint_frames(model, names)
+            own = _first_anchor(model, arm)
             model = _read(model_file)
-            self._offset = frames[0][1] - joint_frames(model, names)[0][1]
+            self._offset = own - _first_anchor(model, arm)
         self._model, self._data = model, mujoco.MjData(model)
         if model_file is not None and model.nkey:
             mujoco.mj_resetDataKeyframe(model, self._data, 0)
-        every = [model.joint(name).qposadr[0] for name in names] or range(len(arm.joint_range))
-        self._joints = np.array(every, dtype=np.int64)
+        self._joints = np.array([model.joint(name).qposadr[0] for name in arm.joint_names])
         self.parts = tuple(self._find_parts(own=model_file is not None))
         """Parts of the arm."""
 
@@ -163,6 +165,15 @@ class ArmDrawing:
         model, body = self._model, self._model.geom_bodyid[geom]
         plane = model.geom_type[geom] in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         return not plane and model.body_mocapid[body] < 0 and model.geom_rgba[geom, 3] > 0.0
+
+
+def _first_anchor(model: mujoco.MjModel, arm: Arm) -> Float:
+    """Return the place of the first joint in a model, [m]."""
+    data = mujoco.MjData(model)
+    joint = model.joint(arm.joint_names[0])
+    data.qpos[joint.qposadr[0]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    return np.array(data.xanchor[joint.id])
 
 
 def _read(path: str | Path) -> mujoco.MjModel:

@@ -36,6 +36,8 @@ class Profile(NamedTuple):
     """Places of the tool, shape (T, 3), [m]."""
     speed: Float
     """Speed of the tool, shape (T,), [m/s]."""
+    jerk: Float
+    """Jerk of the plan, shape (T,), [m/s^3] or [rad/s^3]; NaN for executed movements."""
     clearance: Float
     """Clearance from the nearest obstacle and of the arm from itself, shape (T,), [m]; at most 1."""
 
@@ -67,13 +69,15 @@ def plan_profile(task: Task, scenes: Scenes, plan: Plan, samples: int = SAMPLES)
     """Return the profile of a plan from rest in a batch of one scene, whose obstacles may move."""
     arm, space = task.arm, task.space
     time = np.linspace(0.0, float(plan.duration), samples)
-    coordinates = np.asarray(plan.trajectory()(time))
+    trajectory = plan.trajectory()
+    coordinates = np.asarray(trajectory(time))
     joints = space.joints(coordinates)
     tool = arm.hand(joints)
     obstacles = scenes.take(np.zeros(samples, np.int64)).obstacles_at(time)
     each = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(samples))
     speed = norm(np.gradient(tool, time, axis=0))
-    return Profile(time, coordinates, tool, speed, np.asarray(each.min(axis=-1)))
+    jerk = norm(np.asarray(trajectory(time, 3)))
+    return Profile(time, coordinates, tool, speed, jerk, np.asarray(each.min(axis=-1)))
 
 
 def executed_profile(segments: list[Segment]) -> Profile:
@@ -84,7 +88,8 @@ def executed_profile(segments: list[Segment]) -> Profile:
     clearance = np.concatenate([each.clearance for each in segments])
     speed = norm(np.gradient(tool, time, axis=0)) if len(time) > 2 else np.zeros_like(time)
     rows = np.unique(np.linspace(0, len(time) - 1, 2 * SAMPLES).astype(int))
-    return Profile(time[rows], joints[rows], tool[rows], speed[rows], clearance[rows])
+    unknown = np.full(len(rows), np.nan)
+    return Profile(time[rows], joints[rows], tool[rows], speed[rows], unknown, clearance[rows])
 
 
 def execute_whole(env: ReachVectorEnv, scene: LiveScene, plan: Plan) -> Iterator[Segment]:

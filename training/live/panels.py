@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from viapoint.training.live.decisions import Proposal
     from viapoint.training.live.movements import Profile
-    from viapoint.training.live.setting import MethodResult, Setting
+    from viapoint.training.live.session import MethodResult
+    from viapoint.training.live.setting import Setting
 
 WIDTH = 330
 """Width of a panel, [pixels]."""
@@ -27,6 +28,8 @@ SHOWN_CLEARANCE = 0.25
 """Greatest clearance in the plot, [m]."""
 SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
 """Speeds of the playback."""
+JOINT_DURATIONS = 0.3, 6.0
+"""Least and greatest duration of the slider in joint space, [s]."""
 MOST_VIAS = 4
 """Greatest number of via-points of the slider."""
 RESET = "Reset"
@@ -43,6 +46,7 @@ class Panels:
     Args:
         client: Tab.
         setting: Setting of the agent.
+        env_id: Id of the environment.
         scene_kinds: Names of the buttons that draw scenes.
         act: Function that is called with the name of a control and its values.
     """
@@ -51,6 +55,7 @@ class Panels:
         self,
         client: viser.ClientHandle,
         setting: Setting,
+        env_id: str,
         scene_kinds: Sequence[str],
         act: Callable[..., None],
     ) -> None:
@@ -58,7 +63,7 @@ class Panels:
         self._task = setting.task
         self._quiet = False
         self._build_decision()
-        self._build_controls(scene_kinds)
+        self._build_controls(env_id, scene_kinds)
 
     def tell(self, text: str, colour: str = PLAIN, remark: str = "") -> None:
         """Show one sentence, and a remark on the scene below it."""
@@ -72,8 +77,8 @@ class Panels:
         rows = [
             (
                 "you" if not each.rank else str(each.rank),
-                f"{each.reward:.2f}",
-                "-" if each.predicted is None else _millimetres(each.predicted),
+                "fails" if each.reward is None else f"{each.reward:.2f}",
+                "-" if each.predicted is None else f"{each.predicted:.2f}",
                 _millimetres(each.clearance) if each.reachable else "out of reach",
                 f"{each.duration:.2f}",
             )
@@ -83,7 +88,7 @@ class Panels:
         if not proposals:
             self._table.content = _note("There is no plan in this scene.")
             return
-        names = ("rank", "expected reward", "predicted clearance", "computed clearance", "time")
+        names = ("rank", "reward", "agent's value", "clearance", "time")
         units = ("", "", "mm", "mm", "s")
         self._table.content = _table(names, units, rows, bold=picked) + _note(
             f"{maker}, decided in {1e3 * seconds:.0f} ms"
@@ -99,7 +104,7 @@ class Panels:
             if executed is not None and name != "jerk":
                 lines.append((executed.time, getattr(executed, name), "executed", PALETTE.executed))
             data, series = _lines(lines)
-            if name == "clearance":
+            if name == "clearance" and lines:
                 data = (data[0], *(np.minimum(1e3 * y, 1e3 * SHOWN_CLEARANCE) for y in data[1:]))
             if len(handle.series) != len(series):
                 handle.data, handle.series = data, series
@@ -130,8 +135,8 @@ class Panels:
         """Set the sliders to a decision."""
         self._quiet = True
         try:
-            low, high = self._task.action.duration_range
-            self._duration.value = float(np.clip(round(duration, 2), low, high))
+            slider = self._duration
+            slider.value = float(np.clip(round(duration, 2), slider.min, slider.max))
             self._vias.value = n_via
         finally:
             self._quiet = False
@@ -190,7 +195,7 @@ class Panels:
                 )
                 for name, title in (
                     ("speed", "speed of the hand [m/s]"),
-                    ("jerk", "jerk of the hand [m/s³]"),
+                    ("jerk", f"jerk of the plan [{'m' if self._task.space.of_hand else 'rad'}/s³]"),
                     ("clearance", "clearance [mm]"),
                 )
             }  # fmt: skip
@@ -206,9 +211,9 @@ class Panels:
         panel.set_width(WIDTH)
         self.show_comparison(())
 
-    def _build_controls(self, scene_kinds: Sequence[str]) -> None:
+    def _build_controls(self, env_id: str, scene_kinds: Sequence[str]) -> None:
         gui, setting, act = self._gui, self._setting, self._act
-        title = setting.env_id.removeprefix("viapoint/")
+        title = env_id.removeprefix("viapoint/")
         subtitle = "no agent: the geometry search decides"
         if setting.agent is not None:
             subtitle = f"agent: {type(setting.agent).__name__}"
@@ -228,6 +233,9 @@ class Panels:
             kinds.on_click(lambda event: act("scene", event.target.value))
         with gui.add_folder("Decision"):
             self._build_decision_controls()
+        if not setting.planar:
+            turn = gui.add_checkbox("Turn the goal", False, hint="Rings turn the tool at the goal")
+            turn.on_update(lambda event: act("rings", event.target.value))
         with gui.add_folder("Obstacles"):
             self._build_obstacle_controls()
         with gui.add_folder("Files", expand_by_default=False):
@@ -238,19 +246,19 @@ class Panels:
             gui.add_button("Save picture (PNG)").on_click(lambda _: act("picture"))
         gui.add_button("Reset the view").on_click(lambda _: act("view"))
         drag = "Drag start, goal, via-point and obstacles with the mouse."
-        drag += " Hold Shift to move them up and down." if self._task.spatial else ""
+        drag += "" if setting.planar else " Hold Shift to move them up and down."
         gui.add_html(_note(drag))
 
     def _build_decision_controls(self) -> None:
         gui, act, action = self._gui, self._act, self._task.action
-        low, high = action.duration_range
+        low, high = action.duration_range if self._task.space.of_hand else JOINT_DURATIONS
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
         self._duration.on_update(self._unless_quiet(lambda event: act("duration", event.target.value)))
         most = action.n_via if self._task.replanning else max(MOST_VIAS, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via)
         self._vias.disabled = most == action.n_via
         self._vias.on_update(self._unless_quiet(lambda event: act("vias", int(event.target.value))))
-        if self._setting.decisions.ranks:
+        if self._setting.decisions.checks:
             checks = gui.add_dropdown(
                 "Exact checks", tuple(CHECKS), hint="Proposals whose clearance is computed"
             )
@@ -258,7 +266,7 @@ class Panels:
         gui.add_button("Decide anew").on_click(lambda _: act("decide"))
 
     def _build_obstacle_controls(self) -> None:
-        gui, act = self._gui, self._act
+        gui, act, setting = self._gui, self._act, self._setting
         self._selected = gui.add_html("")
         bounds = {"radius": (0.01, 0.1, 0.001), "half-length": (0.0, 0.3, 0.005)}
         bounds |= dict.fromkeys(BOX_SIZES, (0.005, 0.5, 0.005))
@@ -271,7 +279,7 @@ class Panels:
         for name, slider in self._sizes.items():
             resize = functools.partial(act, "resize", name)
             slider.on_update(self._unless_quiet(lambda event, resize=resize: resize(event.target.value)))  # type: ignore[misc]
-        add = gui.add_button_group("Add", tuple(KINDS[self._task.arm.dimension]))
+        add = gui.add_button_group("Add", tuple(KINDS[setting.planar]))
         add.on_click(lambda event: act("add", event.target.value))
         self._remove = gui.add_button("Remove the selected one", disabled=True)
         self._remove.on_click(lambda _: act("remove"))

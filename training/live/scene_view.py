@@ -7,21 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from viapoint.envs.common.arrays import in_space
+from viapoint.envs import Capsule, PointCloud, Shape, Sphere
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import shape_columns
-from viapoint.envs.geometry.shapes import SHAPES
-from viapoint.training.live.drawing import LOW, TALL, ArmDrawing, Triangles, obstacle_mesh, tube
+from viapoint.training.live.drawing import ArmDrawing, Triangles, obstacle_mesh, tube
 
 if TYPE_CHECKING:
     import viser
 
-    from viapoint.envs.mdp.task import Task
-    from viapoint.training.live.scene_file import LiveScene
+    from viapoint.training.live.setting import Setting
 
 Drag = Callable[[str, Float], None]
-"""Function that is called with a handle's name and its new position, shape (D,), [m]."""
+"""Function that is called with a handle's name and its new place, shape (3,), [m]."""
 
 FADE_STEPS = 8
 """Steps in which an old plan fades."""
@@ -30,22 +27,24 @@ PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032
 SHRUNK = 0.05
 """Factor of the vertices of proposals, which their nodes undo. The client outlines what the pointer is over; it merges
 the vertices of meshes with radii above 0.1 in cubes of 0.01, which leaves gaps in the outline of a thin tube."""
-RADII = {"start": 0.012, "goal": 0.017, "via": 0.012}
+BELOW, ABOVE = np.array([0.0, 0.0, -0.002]), np.array([0.0, 0.0, 0.004])
+"""Shifts of proposals and of the executed path, so that the plan stays visible, [m]."""
+RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}
 """Radii of the handles, [m]."""
-OPACITY = 0.45
-"""Opacity of a planar arm, which hides what is below it."""
+OPACITY, GHOST = 0.45, 0.16
+"""Opacity of a planar arm, which hides what is below it, and of the arm at the goal in space."""
 NARROW = 0.75
 """Ratio of width and height of a window in which the first view just shows everything."""
 SEE_THROUGH = 0.45
 """Opacity of large obstacles in space, which would hide the others."""
 LARGE = 0.16
-"""Greatest half length of obstacles in space that are not large, [m]."""
+"""Greatest size of obstacles in space that are not large, [m]."""
+LOW, TALL = 0.030, 0.060
+"""Height of obstacles in the plane, [m]: below links that pass above them, and where links collide."""
 GRID = 0.1
 """Distance of the lines on the table, [m]."""
-LEVEL = 0.0
-"""Height of paths in the plane, [m]."""
-PLANAR_LIMITS, SPATIAL_LIMITS = (-0.75, 0.75), (-0.95, 0.95)
-"""Least and greatest coordinate to which something can be dragged, [m]."""
+FARTHEST = 1.2
+"""Greatest coordinate to which something can be dragged, [m]."""
 
 
 class SceneView:
@@ -53,39 +52,47 @@ class SceneView:
 
     Args:
         client: Tab.
-        task: Task of the environment.
+        setting: Task of the page.
         drawing: Parts of the arm.
         floor: Height of the table, [m].
         on_drag: Function that is called while a handle is dragged.
         on_pick: Function that is called with the index of a proposal that is clicked.
         on_select: Function that is called with the row of an obstacle that is clicked.
+        on_turn: Function that is called with the orientation of the goal while it is turned, a quaternion.
     """
 
     def __init__(
         self,
         client: viser.ClientHandle,
-        task: Task,
+        setting: Setting,
         drawing: ArmDrawing,
         floor: float,
         *,
         on_drag: Drag,
         on_pick: Callable[[int], None],
         on_select: Callable[[int], None],
+        on_turn: Callable[[Float], None],
     ) -> None:
-        self._client, self._task, self._drawing, self._floor = client, task, drawing, floor
+        self._client, self._drawing, self._floor = client, drawing, floor
         self._on_drag, self._on_pick, self._on_select = on_drag, on_pick, on_select
-        self._planar = not task.spatial
-        self._arm: list[Any] = []
+        self._planar = setting.planar
+        top = TALL if setting.task.whole_arm else LOW
+        self._levels = (floor, top) if self._planar else None
         self._handles: dict[str, Any] = {}
         self._drops: dict[str, Any] = {}
-        self._obstacles: list[tuple[Any, Float]] = []
+        self._obstacles: list[tuple[Any, Shape]] = []
         self._paths: dict[str, Any] = {}
         self._count = 0
         self._thin: list[Any] = []
         self._fading: list[tuple[Any, int]] = []
         self._grab: dict[str, Float] = {}
         self._table()
-        self._add_arm()
+        self._arm = self._add_arm("/arm", OPACITY if self._planar else None)
+        self._ghost = [] if self._planar else self._add_arm("/ghost", GHOST)
+        self._rings = client.scene.add_transform_controls(
+            "/turn", scale=0.2, disable_axes=True, disable_sliders=True, visible=False
+        )
+        self._rings.on_update(lambda _: on_turn(np.array(self._rings.wxyz)))
         self.look_at_everything()
 
     def look_at_everything(self) -> None:
@@ -95,7 +102,7 @@ class SceneView:
         if self._planar:
             view: Any = ((-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0)
         else:
-            view = ((1.75, -1.30, 1.25), (0.28, 0.0, 0.30), (0.0, 0.0, 1.0), 34.0)
+            view = ((2.15, -1.60, 1.55), (0.12, 0.0, 0.34), (0.0, 0.0, 1.0), 34.0)
         target = np.array(view[1])
         camera.up_direction = view[2]
         camera.position = target + away * (np.array(view[0]) - target)
@@ -104,46 +111,55 @@ class SceneView:
 
     def pose(self, joints: Float) -> None:
         """Show the arm in a configuration, shape (J,), [rad]."""
-        for handle, (turn, position) in zip(self._arm, self._drawing.poses(joints), strict=True):
-            handle.wxyz, handle.position = turn, position
+        self._place_arm(self._arm, joints)
 
-    def show_scene(self, scene: LiveScene, selected: int | None = None) -> None:
-        """Show start, goal and obstacles."""
-        for name, point in (("start", scene.start), ("goal", scene.goal)):
-            self._place_handle(name, point)
-        self.show_obstacles(scene.obstacles, selected)
+    def show_ends(self, start: Float, goal: Float, joints: Float) -> None:
+        """Show start and goal, shape (3,) each, [m], and the arm at the goal, joint positions of shape (J,), [rad]."""
+        self._place_handle("start", start)
+        self._place_handle("goal", goal)
+        self._place_arm(self._ghost, joints)
+        self._rings.position = goal
 
-    def show_obstacles(self, rows: Float, selected: int | None = None) -> None:
+    def show_rings(self, orientation: Float | None) -> None:
+        """Show the rings that turn the goal, a quaternion, or hide them (None)."""
+        self._rings.visible = orientation is not None
+        if orientation is not None:
+            self._rings.wxyz = orientation
+
+    def show_obstacles(self, shapes: Sequence[Shape], selected: int | None = None) -> None:
         """Show obstacles; those whose shape is the same only move."""
-        d = self._task.arm.dimension
-        while len(self._obstacles) > len(rows):
+        while len(self._obstacles) > len(shapes):
             self._obstacles.pop()[0].remove()
-        for i, row in enumerate(rows):
+        for i, shape in enumerate(shapes):
             colour = _rgb(PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle))
             if i < len(self._obstacles):
-                handle, shape = self._obstacles[i]
-                if not np.array_equal(shape, row[d:]):
-                    mesh = self._obstacle(row)
-                    handle.vertices, handle.faces = _single(mesh)
+                handle, before = self._obstacles[i]
+                if not _same_mesh(before, shape):
+                    handle.vertices, handle.faces = _single(obstacle_mesh(shape, self._levels))
                 if tuple(handle.color) != colour:
                     handle.color = colour
             else:
-                handle = self._add_mesh(f"/obstacles/{i}", self._obstacle(row), colour)
+                handle = self._add_mesh(f"/obstacles/{i}", obstacle_mesh(shape, self._levels), colour)
                 self._make_draggable(handle, f"obstacle {i}")
                 handle.on_click(lambda _, row=i: self._on_select(row))
-                self._obstacles.append((handle, row[d:]))
-            kind, _, _, half = shape_columns(row)
-            handle.flat_shading = not list(SHAPES.values())[int(kind)].round
-            handle.opacity = SEE_THROUGH if not self._planar and half.max() > LARGE else None
-            handle.position = in_space(row[:d], 0.0)
-            self._obstacles[i] = handle, row[d:].copy()
+                self._obstacles.append((handle, shape))
+            handle.flat_shading = not isinstance(shape, Sphere | Capsule | PointCloud)
+            large = shape.kind == "half_space" or float(shape.packed_size.max()) > LARGE
+            handle.opacity = SEE_THROUGH if large and not self._planar else None
+            handle.position = np.array(shape.position)
+            self._obstacles[i] = handle, shape
+
+    def move_obstacles(self, places: Float) -> None:
+        """Move the obstacles to other places, shape (n, 3), [m]."""
+        for (handle, _), place in zip(self._obstacles, places, strict=False):
+            handle.position = place
 
     def show_plan(self, path: Float | None, vias: Float, *, clear: bool) -> None:
         """Show a plan; the one before fades.
 
         Args:
-            path: Shape (P, D), [m]; None for no plan.
-            vias: Via-points, shape (K, D), [m].
+            path: Shape (P, 3), [m]; None for no plan.
+            vias: Via-points, shape (K, 3), [m].
             clear: False if the plan touches something, which is shown in red.
         """
         old = self._paths.pop("plan", None)
@@ -158,9 +174,10 @@ class SceneView:
             self._place_handle(f"via {i}", via)
         if path is not None:
             self._count += 1
-            colour = PALETTE.plan if clear else PALETTE.contact
-            mesh = tube(in_space(path, LEVEL), PLAN)
-            self._paths["plan"] = self._add_mesh(f"/plans/{self._count}", mesh, _rgb(colour), shadow=False)
+            colour = _rgb(PALETTE.plan if clear else PALETTE.contact)
+            self._paths["plan"] = self._add_mesh(
+                f"/plans/{self._count}", tube(path, PLAN), colour, shadow=False
+            )
 
     def show_proposals(self, paths: Sequence[Float], clear: Sequence[bool] = ()) -> None:
         """Show proposals as thin lines that can be clicked, those that touch something in red.
@@ -171,7 +188,7 @@ class SceneView:
             handle.remove()
         del self._thin[len(paths) :]
         for i, (path, free) in enumerate(zip(paths, clear, strict=False)):
-            mesh = tube(SHRUNK * in_space(path, LEVEL - 0.002), SHRUNK * PROPOSAL)
+            mesh = tube(SHRUNK * (path + BELOW), SHRUNK * PROPOSAL)
             colour = _rgb(_lighter(PALETTE.plan if free else PALETTE.contact))
             if i == len(self._thin):
                 handle = self._add_mesh(f"/proposals/{i}", mesh, colour, opacity=0.8, shadow=False)
@@ -182,15 +199,15 @@ class SceneView:
                 self._thin[i].vertices, self._thin[i].color = _single(mesh)[0], colour
 
     def show_executed(self, hand: Float | None, *, contact: bool = False) -> None:
-        """Show the executed path, shape (T, D), [m]; None for none."""
+        """Show the executed path, shape (T, 3), [m]; None for none."""
         handle = self._paths.pop("executed", None)
         if handle is not None and hand is None:
             handle.remove()
         if hand is None or len(hand) < 2:
             return
         rows = np.unique(np.linspace(0, len(hand) - 1, 40).astype(int))
-        mesh = tube(in_space(hand[rows], LEVEL + 0.004), DONE)
         colour = _rgb(PALETTE.contact if contact else PALETTE.executed)
+        mesh = tube(hand[rows] + ABOVE, DONE)
         self._paths["executed"] = self._add_mesh("/executed", mesh, colour, shadow=False)
 
     def fade(self) -> bool:
@@ -207,41 +224,50 @@ class SceneView:
         self._fading = left
         return bool(left)
 
-    def move_handle(self, name: str, point: Float) -> None:
-        """Move a handle to a position, shape (D,), [m]."""
-        place = in_space(point, LEVEL)
+    def move_handle(self, name: str, place: Float) -> None:
+        """Move a handle to a place, shape (3,), [m]."""
         self._handles[name].position = place
         if name in self._drops:
             foot = np.array([*place[:2], self._floor])
             self._drops[name].points = np.stack((place, foot))[None].astype(np.float32)
 
     def _table(self) -> None:
-        scene, planar = self._client.scene, self._planar
-        centre = (-0.03, 0.35) if planar else (0.35, 0.0)
-        width, depth = (1.7, 1.5) if planar else (1.4, 1.6)
+        scene = self._client.scene
+        centre = (-0.03, 0.35) if self._planar else (0.0, 0.0)
+        width, depth = (1.7, 1.5) if self._planar else (2.0, 2.0)
         scene.add_box(
-            "/table", dimensions=(width, depth, 0.01), color=_rgb(PALETTE.table), cast_shadow=False,
-            receive_shadow=False, position=(*centre, self._floor - 0.008),
-        )  # fmt: skip
-        ends = [
-            ((x, -depth / 2, 0.0), (x, depth / 2, 0.0)) for x in np.arange(-width / 2, width / 2 + 1e-9, GRID)
-        ]
-        ends += [
-            ((-width / 2, y, 0.0), (width / 2, y, 0.0)) for y in np.arange(-depth / 2, depth / 2 + 1e-9, GRID)
-        ]
-        scene.add_line_segments(
-            "/grid", np.array(ends), (214, 214, 218), thickness=0.0016, position=(*centre, self._floor)
+            "/table",
+            dimensions=(width, depth, 0.01),
+            color=_rgb(PALETTE.table),
+            cast_shadow=False,
+            receive_shadow=False,
+            position=(*centre, self._floor - 0.008),
         )
+        ends = []
+        for x in np.arange(-width / 2, width / 2 + 1e-9, GRID):
+            ends.append(((x, -depth / 2, 0.0), (x, depth / 2, 0.0)))
+        for y in np.arange(-depth / 2, depth / 2 + 1e-9, GRID):
+            ends.append(((-width / 2, y, 0.0), (width / 2, y, 0.0)))
+        place = (*centre, self._floor)
+        scene.add_line_segments("/grid", np.array(ends), (214, 214, 218), thickness=0.0016, position=place)
 
-    def _add_arm(self) -> None:
-        opacity = OPACITY if self._planar else None
+    def _add_arm(self, name: str, opacity: float | None) -> list[Any]:
+        """Add the parts of the arm, and return them."""
+        handles: list[Any] = []
         for i, part in enumerate(self._drawing.parts):
-            name = f"/arm/{i}"
-            if part.colour is None:
-                self._arm.append(self._client.scene.add_mesh_trimesh(name, part.mesh))
-            else:
-                mesh = Triangles(part.mesh.vertices, part.mesh.faces)
-                self._arm.append(self._add_mesh(name, mesh, part.colour, opacity=opacity))
+            if part.colour is None and opacity is None:
+                handles.append(self._client.scene.add_mesh_trimesh(f"{name}/{i}", part.mesh))
+                continue
+            mesh = Triangles(part.mesh.vertices, part.mesh.faces)
+            colour = part.colour or _rgb(PALETTE.arm)
+            shadow = opacity != GHOST
+            handles.append(self._add_mesh(f"{name}/{i}", mesh, colour, opacity=opacity, shadow=shadow))
+        return handles
+
+    def _place_arm(self, handles: list[Any], joints: Float) -> None:
+        """Move the parts of an arm to a configuration."""
+        for handle, (turn, position) in zip(handles, self._drawing.poses(joints), strict=False):
+            handle.wxyz, handle.position = turn, position
 
     def _add_mesh(
         self,
@@ -257,16 +283,12 @@ class SceneView:
             name, vertices, faces, color=colour, opacity=opacity, cast_shadow=shadow, receive_shadow=shadow
         )
 
-    def _obstacle(self, row: Float) -> Triangles:
-        return obstacle_mesh(row, self._floor, TALL if self._task.whole_arm else LOW)
-
-    def _place_handle(self, name: str, point: Float) -> None:
+    def _place_handle(self, name: str, place: Float) -> None:
         if name not in self._handles:
             kind = name.split()[0]
             colour = {"start": PALETTE.start, "goal": PALETTE.goal, "via": PALETTE.via}[kind]
-            radius = max(RADII[kind], 1.1 * self._task.arm.hand_radius if kind == "start" else 0.0)
             handle = self._client.scene.add_icosphere(
-                f"/handles/{name}", radius=radius, color=_rgb(colour), subdivisions=3, cast_shadow=False
+                f"/handles/{name}", radius=RADII[kind], color=_rgb(colour), subdivisions=3, cast_shadow=False
             )
             self._make_draggable(handle, name)
             self._handles[name] = handle
@@ -274,7 +296,7 @@ class SceneView:
                 self._drops[name] = self._client.scene.add_line_segments(
                     f"/drops/{name}", np.zeros((1, 2, 3)), _rgb(_lighter(colour)), thickness=0.003
                 )
-        self.move_handle(name, point)
+        self.move_handle(name, place)
 
     def _make_draggable(self, handle: Any, name: str) -> None:
         """Make a handle draggable: horizontally, or vertically in space while Shift is held."""
@@ -308,10 +330,15 @@ class SceneView:
             return
         point = eye + share * ray - grab
         if upright:
-            point = np.array([*place[:2], max(point[2], 0.0)])
-        low, high = PLANAR_LIMITS if self._planar else SPATIAL_LIMITS
-        point = np.clip(point, low, high)
-        self._on_drag(name, point[: self._task.arm.dimension])
+            point = np.array([*place[:2], max(point[2], self._floor)])
+        self._on_drag(name, np.clip(point, -FARTHEST, FARTHEST))
+
+
+def _same_mesh(first: Shape, second: Shape) -> bool:
+    """Return True for shapes that differ in their place and motion only."""
+    alike = type(first) is type(second) and first.mesh is second.mesh and first.cloud is second.cloud
+    sizes = np.array_equal(first.packed_size, second.packed_size)
+    return alike and sizes and np.array_equal(first.quaternion, second.quaternion)
 
 
 def _single(mesh: Triangles) -> tuple[Any, Any]:

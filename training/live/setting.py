@@ -15,7 +15,7 @@ from viapoint.envs import ReachVectorEnv, Scenes, Task, inverse_kinematics
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.clearance import configuration_clearances
-from viapoint.envs.geometry.obstacles import quaternions_of
+from viapoint.envs.geometry.obstacles import KINDS, quaternions_of
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.movements import DECISION_INTERVAL
@@ -110,7 +110,8 @@ class Setting:
         most = self.task.n_obstacles[1]
         if not most and scene.obstacles:
             return "without obstacles"
-        others = [each.kind for each in scene.obstacles if each.kind not in self.task.shapes]
+        known = {name if name in KINDS else "convex_mesh" for name in self.task.shapes}
+        others = [each.kind for each in scene.obstacles if each.kind not in known]
         if others:
             return f"without {others[0].replace('_', '-')} obstacles"
         return f"with at most {most} obstacles" if len(scene.obstacles) > most else ""
@@ -146,14 +147,14 @@ class Shared:
             return self.own
         if len(scene.obstacles) > MOST_SHOWN:
             raise ValueError(f"a scene has at most {MOST_SHOWN} obstacles, got {len(scene.obstacles)}")
-        for shape in scene.obstacles:
-            if shape.kind not in SIMULATED:
-                raise ValueError(f"obstacles must be one of {', '.join(SIMULATED)}, got {shape.kind}")
         with self._making:
             if self._wide is None:
-                self._wide = Setting(
-                    dataclasses.replace(self.own.task, shapes=SIMULATED, n_obstacles=(0, MOST_SHOWN))
-                )
+                task = self.own.task
+                shapes = (*SIMULATED, *(name for name in task.shapes if name not in SIMULATED))
+                self._wide = Setting(dataclasses.replace(task, shapes=shapes, n_obstacles=(0, MOST_SHOWN)))
+        others = [each.kind for each in scene.obstacles if self._wide.limit(scene)]
+        if others:
+            raise ValueError(f"obstacles must be one of {', '.join(SIMULATED)}, got {', '.join(others)}")
         return self._wide
 
     def read(self, content: bytes) -> LiveScene:

@@ -142,6 +142,44 @@ def position_at(
 
 
 @kernel
+def place_arm(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    instant: int,
+    start: Float,
+    offsets: Float,
+    position: Float,
+    joints: Float,
+    placed: Placed,
+) -> bool:
+    """Place the arm at an instant of a movement, and return True within reach and joint ranges.
+
+    `position`, shape (D,), `joints`, shape (J,), and `placed` are memory; the other arguments are those of
+    :func:`least_clearance`.
+    """
+    position_at(table, times, instant, start, offsets, position)
+    if setting.of_hand:
+        if not solve_planar(setting.chain, setting.joint_range, position[0], position[1], joints):
+            return False
+    else:
+        for j in range(len(joints)):
+            joints[j] = position[j]
+            if joints[j] < setting.joint_range[j, 0] or joints[j] > setting.joint_range[j, 1]:
+                return False
+    if setting.hand_alone:
+        placed.ball[0, 0] = position[0]
+        placed.ball[0, 1] = position[1]
+        placed.ball[0, 2] = 0.0
+        for axis in range(3):
+            placed.centre[0, axis] = placed.ball[0, axis]
+        placed.known[0] = True
+    else:
+        place(setting.chain, setting.spheres, joints, placed)
+    return True
+
+
+@kernel
 def least_clearance(
     setting: Setting,
     table: MovementTable,
@@ -183,42 +221,14 @@ def least_clearance(
         time = duration * instant / (INSTANTS - 1)
         if time > until:
             continue
-        position_at(table, times, instant, start, offsets, place_of_hand)
-        if setting.hand_alone:
-            placed.ball[0, 0] = place_of_hand[0]
-            placed.ball[0, 1] = place_of_hand[1]
-            placed.ball[0, 2] = 0.0
-            placed.centre[0, 0], placed.centre[0, 1], placed.centre[0, 2] = (
-                place_of_hand[0],
-                place_of_hand[1],
-                0.0,
-            )
-            placed.known[0] = True
-        else:
-            if setting.of_hand:
-                if not solve_planar(
-                    setting.chain, setting.joint_range, place_of_hand[0], place_of_hand[1], joints
-                ):
-                    return OUTSIDE
-            else:
-                for j in range(len(joints)):
-                    joints[j] = place_of_hand[j]
-                    if joints[j] < setting.joint_range[j, 0] or joints[j] > setting.joint_range[j, 1]:
-                        return OUTSIDE
-            place(setting.chain, setting.spheres, joints, placed)
+        if not place_arm(setting, table, times, instant, start, offsets, place_of_hand, joints, placed):
+            return OUTSIDE
         least = obstacle_clearance(setting.spheres, placed, obstacles, scene, time, least, floor)
         if least < floor:
             return least
         least = self_clearance(setting.spheres, placed, least, floor)
         if least < floor:
             return least
-    if setting.hand_alone:
-        for instant in range(len(table.order)):
-            position_at(table, times, instant, start, offsets, place_of_hand)
-            if not solve_planar(
-                setting.chain, setting.joint_range, place_of_hand[0], place_of_hand[1], joints
-            ):
-                return OUTSIDE
     return least
 
 
