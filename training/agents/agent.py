@@ -18,8 +18,8 @@ from viapoint.envs.scenes.options import draw_given
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
-from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
 from viapoint.training.planning.observe_candidates import with_candidates
+from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
 
 
 class Agent(BaseAlgorithm):

@@ -116,7 +116,8 @@ def _box_gap(
         largest = max(largest, over)
         if over > 0.0:
             outside += over * over
-    return np.sqrt(outside) + min(largest, 0.0)
+    distance: float = np.sqrt(outside) + min(largest, 0.0)
+    return distance
 
 
 @compiled

@@ -10,11 +10,11 @@ import gymnasium as gym
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import check_baselines, evenly_spread, task_of
+from viapoint.training.evaluation.evaluator import check_baselines, environment_of, evenly_spread
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.rollouts.rollout import whole_task
+from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import SETS, FrozenScenes, scenes_for
@@ -45,9 +45,10 @@ def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     agent = None if config.agent is None else load_agent(config.agent)
     run = Run(str(config.agent)) if config.agent and (Path(config.agent) / "config.json").is_file() else None
-    env_id, env_kwargs = task_of(agent, config.env, None)
-    check_baselines(config.baselines, agent, env_id)
-    whole = scenes_for(config.scenes, env_id, env_kwargs)
+    env_id, env_kwargs = environment_of(agent, config.env, None)
+    task = registered_task(env_id, **env_kwargs)
+    check_baselines(config.baselines, agent, task)
+    whole = scenes_for(config.scenes, task, config.n_scenes)
     scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
     with report.progress_bar() as progress:
         given: Any = {"checks": config.checks, "baselines": config.baselines, "progress": progress}
@@ -77,7 +78,7 @@ def play(config: PlayConfig) -> None:
     from viapoint.training.plotting.video import record_video
 
     agent = load_agent(str(config.agent))
-    scenes = scenes_for(config.scenes, *whole_task(agent.env_id, agent.env_kwargs)).scenes
+    scenes = scenes_for(config.scenes, registered_task(agent.env_id, **agent.env_kwargs)).scenes
     rows = evenly_spread(len(scenes.start), config.n_scenes)
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     method = agent_method(

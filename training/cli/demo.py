@@ -16,13 +16,14 @@ from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
 from viapoint.training.io.files import BadFileError, check_ours, read_json
-from viapoint.training.planning.baselines import Method, StoredSolutions, agent_method, make_method
+from viapoint.training.planning.baselines import Method, agent_method, make_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import Entry, gallery, play
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, load
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
 BASELINES = ("search16", "search512", "straight", "random")
 FILES = (
@@ -52,7 +53,7 @@ def run(config: DemoConfig) -> None:
     trained = _trained(config)
     model_folder = find_model(folder)
     agent = load_agent(model_folder)
-    frozen = load("test", config.env)
+    frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
     frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
     record = _measured(config, agent, frozen)
     heading = f"The agent alone in {frozen.name} scenes, easy to hard"
@@ -134,7 +135,6 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         agent_method(f"agent, {config.checks} checks", agent, config.checks),
         agent_method("untrained", untrained(agent), 0),
         *(make_method(name, config.env) for name in BASELINES),
-        StoredSolutions(frozen),
     ]
     with report.progress_bar() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shlex
 from collections.abc import Mapping
@@ -13,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 import tyro
 
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS, OWN_ARM_TASKS, REPLANNING_TASKS, STEP_TASKS
+from viapoint.envs.registration import ENV_IDS
+from viapoint.envs.task import Task
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
@@ -25,8 +27,9 @@ from viapoint.training.config.checks import (
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
 from viapoint.training.io.files import parse_yaml
+from viapoint.training.planning.search import registered_task
 
-ENV = tyro.conf.arg(metavar="ID", help=f"Id of the environment, one of {', '.join(ENV_IDS)}.")
+ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {', '.join(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
     metavar="AGENT",
     help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
@@ -182,17 +185,18 @@ class TrainConfig(Config):
         check_env(self.env)
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        if self.env in STEP_TASKS and self.algo not in STEP_PRESETS:
+        check_env_kwargs(self.env_kwargs)
+        stepwise = self.task.stepwise
+        if stepwise and self.algo not in STEP_PRESETS:
             raise ValueError(
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        if self.observe_candidates and (self.algo == "viaq" or self.env in STEP_TASKS):
+        if self.observe_candidates and (self.algo == "viaq" or stepwise):
             raise ValueError(
                 "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
                 f"control step, got {self.observe_candidates} for {self.algo} on {self.env}"
             )
-        check_env_kwargs(self.env_kwargs)
         if not isinstance(self.hyperparameters, Mapping):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
         share = self.stop_when_stalled
@@ -210,10 +214,22 @@ class TrainConfig(Config):
                 f"got {self.total_timesteps}"
             )
 
+    @functools.cached_property
+    def task(self) -> Task:
+        """Task of the environment.
+
+        Raises:
+            ValueError: An argument of the environment is unknown or has a value that is not allowed.
+        """
+        try:
+            return registered_task(self.env, **self.env_kwargs)
+        except TypeError as error:
+            raise ValueError(f"env_kwargs of {self.env}: {error}") from error
+
     @property
     def preset(self) -> Preset:
         """Settings for everything that is not given."""
-        return preset_of(self.env, self.algo)
+        return preset_of(self.task, self.algo)
 
     @property
     def total_timesteps(self) -> int:
@@ -284,13 +300,13 @@ class AgentConfig(Config):
 class EvaluateConfig(AgentConfig):
     """Evaluate an agent and baselines on the same scenes.
 
-    Example: viapoint evaluate runs/first --baselines straight planner --scenes test
+    Example: viapoint evaluate runs/first --baselines straight search512 --scenes test
     """
 
-    baselines: tuple[str, ...] = ("straight", "random", "planner")
-    """Some of straight, constant, random, random16, random80, planner, ompl, search512 or another number (the best of
-    that many computed plans), sobol512 (of fixed plans), random_order512; with an agent, untrained (its network before
-    training); in tasks with replanning, unrevised (the first plan alone)."""
+    baselines: tuple[str, ...] = ("straight", "random", "search512")
+    """Some of straight, random, random16, random80, ompl, search512 or another number (the best of that many computed
+    plans), sobol512 (of fixed plans); with an agent, untrained (its network before training); in tasks with replanning,
+    unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
@@ -410,11 +426,8 @@ class DemoConfig(Config):
 
     def _check(self) -> None:
         check_env(self.env)
-        if self.env in {*STEP_TASKS, *REPLANNING_TASKS, *OWN_ARM_TASKS}:
-            like = STEP_TASKS.get(self.env) or OWN_ARM_TASKS.get(self.env, DEFAULT_ENV)
-            raise ValueError(
-                f"env must have frozen scenes and whole movements as actions, {like} for one, got {self.env!r}"
-            )
+        if not registered_task(self.env).whole_movement:
+            raise ValueError(f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}")
         check_folder("out", self.out)
 
     @property

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs.common.types import Float, Int
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.inverse_kinematics import solve_planar
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.kernels import kernel

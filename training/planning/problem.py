@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.replanning import NEARBY, revised_waypoints
@@ -22,6 +23,8 @@ from viapoint.training.planning.movements import (
     shortest_durations,
     table_costs,
 )
+
+Numbers = NDArray[np.floating[Any]]
 
 NEAR = 0.05
 """Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
@@ -83,7 +86,8 @@ class Problem(NamedTuple):
 
     def take(self, rows: Any) -> Problem:
         """Return some of the problems, by indices, mask or slice."""
-        return Problem(*(None if part is None else _some(part, rows) for part in self))
+        parts: list[Any] = [None if part is None else _some(part, rows) for part in self]
+        return Problem(*parts)
 
 
 class Moves(NamedTuple):
@@ -101,11 +105,11 @@ class Moves(NamedTuple):
     """Durations relative to that of the zero action, shape (B, H)."""
 
 
-def moves_of(task: Task, problem: Problem, actions: Float) -> Moves:
+def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
     """Return the plans of actions of shape (B, H, m)."""
     layout, table = task.action, movement_table(task.n_via)
-    start, goal = problem.start[:, None], problem.goal[:, None]
     actions = np.asarray(actions, dtype=np.float64)
+    start, goal = problem.start[:, None], problem.goal[:, None]
     batch = actions.shape[:2]
     columns, dimension = task.n_via + 3, layout.dimension
     offsets = np.zeros((*batch, columns, dimension))

@@ -20,7 +20,15 @@ from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.movements import MovementTable, Setting, least_clearance
-from viapoint.training.planning.problem import Moves, Problem, moves_of, setting_of, table_of, worth_of
+from viapoint.training.planning.problem import (
+    Moves,
+    Numbers,
+    Problem,
+    moves_of,
+    setting_of,
+    table_of,
+    worth_of,
+)
 
 CLEARANCE_MARGIN = 0.001
 """Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
@@ -157,7 +165,7 @@ class GeometrySearch:
         return np.insert(sobol_actions(self.per_round + 1, size - 1)[1:], at, 0.0, axis=1)
 
 
-def merits(task: Task, problem: Problem, actions: Float) -> Float:
+def merits(task: Task, problem: Problem, actions: Numbers) -> Float:
     """Return the merit of actions of shape (B, H, m), by which the best one has the greatest, shape (B, H).
 
     The merit of a clear plan is its reward if the physics follows it, and that of others is near INFEASIBLE. It is a
@@ -175,7 +183,7 @@ def merits(task: Task, problem: Problem, actions: Float) -> Float:
     return _merits(setting, table_of(task), problem.start, moves, worth, problem.obstacles, horizons, gain)
 
 
-def plan_clearances(task: Task, problem: Problem, actions: Float, most: float, least: float) -> Float:
+def plan_clearances(task: Task, problem: Problem, actions: Numbers, most: float, least: float) -> Float:
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
     Args:

@@ -138,7 +138,8 @@ class SceneSimulation:
 
 def _filled(rows: slice, number: int) -> NDArray[np.int64]:
     """Return indices of some rows, the last one repeated up to a number of them."""
-    return np.minimum(rows.start + np.arange(number), rows.stop - 1)
+    indices: NDArray[np.int64] = np.minimum(rows.start + np.arange(number), rows.stop - 1)
+    return indices
 
 
 def _episodes(

@@ -50,7 +50,9 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     inner = env.unwrapped if env is not None else None
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
-    spec: Any = None if inner is None else inner.get_attr("spec", [0])[0]
+    if inner is None:
+        raise ValueError("the environment must be one of this package, made by its id, got none")
+    spec: Any = inner.get_attr("spec", [0])[0]
     if spec is None or not hasattr(inner.get_attr("unwrapped", [0])[0], "task"):
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"

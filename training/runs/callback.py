@@ -17,10 +17,11 @@ from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, drawn, frozen_fit, load
+from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
 LOG_EVERY = 1_000
 """Decisions between two entries of the log."""
@@ -213,8 +214,8 @@ class RunCallback(BaseCallback):
             result = evaluate_methods(
                 [agent_method("agent", self.model)],
                 frozen,
-                frozen.env_id,
-                env_kwargs=whole_task(self.config.env, self.config.env_kwargs)[1],
+                self.config.env,
+                env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
                 time_decisions=False,
             ).results[0]
         if result.partial:
@@ -297,7 +298,5 @@ def _timestep(env: Any) -> float:
 def validation_scenes(run: Run) -> FrozenScenes:
     """Return the shipped validation scenes of a run's environment, or reproducibly sampled ones if none fit."""
     config = run.config
-    env_id, env_kwargs = whole_task(config.env, config.env_kwargs)
-    if frozen_fit("validation", env_id, env_kwargs):
-        return load("validation", env_id).take(slice(0, config.eval_scenes))
-    return drawn("validation", env_id, env_kwargs, config.eval_scenes)
+    frozen = scenes_for("validation", registered_task(config.env, **config.env_kwargs), config.eval_scenes)
+    return frozen.take(slice(0, config.eval_scenes))

@@ -161,7 +161,11 @@ def load(path: Path, name: str = "") -> FrozenScenes:
         raise ValueError(f"there is no file of scenes {path}")
     content = _read(path)
     obstacles = no_obstacles(*content["kind"].shape)._replace(
-        **{part: content[part] for part in ("kind", "centre", "rotation", "size", "velocity")}
+        kind=content["kind"],
+        centre=content["centre"],
+        rotation=content["rotation"],
+        size=content["size"],
+        velocity=content["velocity"],
     )
     own = {part: content[part] for part in ("start", "goal", "jumps", "turn_time", "turn_velocity")}
     frozen = FrozenScenes(

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS, STEP_TASKS
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_hyperparameters
 from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
@@ -25,7 +24,8 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import preset_of
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
-from viapoint.training.scene_sets.scene_set import SETS, shipped_path
+from viapoint.training.planning.search import registered_task
+from viapoint.training.scene_sets.scene_set import SETS, shipped_set
 
 Values = Mapping[str, Any]
 Made = TypeVar("Made")
@@ -67,8 +67,6 @@ class Trial:
     """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
     untrained: bool = False
     """True to measure the network before training, too."""
-    step_wise: bool = False
-    """True to train in the environment with an action in every control step."""
     method: str = ""
     """Name of a baseline; empty for an agent."""
     resources: Values = field(default_factory=lambda: {"cpu": 1})
@@ -80,16 +78,15 @@ class Trial:
 
     def config(self, out: Path) -> TrainConfig:
         """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
-        twins = {whole: step for step, whole in STEP_TASKS.items()}
-        env_id = twins[self.env.id] if self.step_wise else self.env.id
         given = dict(self.training)
+        given["env_kwargs"] = {**self.env.env_kwargs, **given.get("env_kwargs", {})}
         hyperparameters = dict(given.pop("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
-            usual = preset_of(env_id, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
+            task = registered_task(self.env.id, **given["env_kwargs"])
+            usual = preset_of(task, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
-        given["env_kwargs"] = {**self.env.env_kwargs, **given.get("env_kwargs", {})}
         return TrainConfig(
-            env=env_id,
+            env=self.env.id,
             seed=self.seed,
             out=self.folder(out),
             progress=False,
@@ -287,11 +284,9 @@ def _environment(
 ) -> Environment:
     """Return an environment with its sets of scenes: by default those that are shipped for it."""
     env_id = id or name
-    whole = [each for each in ENV_IDS if each not in STEP_TASKS]
-    if env_id not in whole:
-        raise ValueError(unknown_name("id", env_id, whole))
     kwargs = env_kwargs or {}
     check_env_kwargs(kwargs)
+    task = registered_task(env_id, **kwargs)
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes, 1)
     # Models are selected on `validation`, so it is measured only where it is asked for.
@@ -299,13 +294,13 @@ def _environment(
     for each in [name for name in SETS if name != "validation"] if scenes is None else scenes:
         if each in SETS:
             drawn = each in ("test", "validation")  # the other sets exist only where they are shipped
-            places += [each] if drawn or shipped_path(each, env_id).is_file() else []
+            places += [each] if drawn or shipped_set(each, task) is not None else []
         elif (folder / each).is_file():
             places.append(str((folder / each).absolute()))
         else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
-        there = [each for each in SETS if shipped_path(each, env_id).is_file()]
+        there = [each for each in SETS if shipped_set(each, task) is not None]
         raise ValueError(
             f"no set among {', '.join(scenes or SETS)} is shipped for {env_id}; there are {', '.join(there)}"
         )
@@ -319,13 +314,10 @@ def _agent(
     seeds: list[int],
     checks: list[int] | None = None,
     untrained: bool = False,
-    step_wise: bool = False,
     resources: dict[str, float] | None = None,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
-    if step_wise and env.id not in STEP_TASKS.values():
-        raise ValueError(f"there is no step-wise twin of {env.id}")
     numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
     if any(numbers) and training.get("algo", "viaq") != "viaq":
         raise ValueError(f"checks are those of viaq; {training['algo']} has no proposals to check")
@@ -337,7 +329,6 @@ def _agent(
         training=training,
         checks=numbers,
         untrained=untrained,
-        step_wise=step_wise,
         resources={"cpu": 1, **(resources or {})},
     )
     trials = [dataclasses.replace(shared, seed=seed) for seed in seeds]
@@ -349,8 +340,7 @@ def _agent(
 
 def _baseline(env: Environment, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    if (method or row) != "stored":  # the planner's solutions, which the files of scenes hold
-        check_method(method or row, env.id)
+    check_method(method or row, registered_task(env.id, **env.env_kwargs))
     return [Trial(env=env, row=row, method=method or row)]
 
 

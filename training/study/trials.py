@@ -13,7 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from viapoint.training.agents.model_io import load_model, untrained
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import read_json, write_json
-from viapoint.training.planning.baselines import Method, StoredSolutions, agent_method, make_method
+from viapoint.training.planning.baselines import Method, agent_method, make_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
@@ -37,10 +38,7 @@ def run_trial(trial: Trial, out: Path) -> Record:
     """
     record: Record = {"viapoint": "study", "asked": asked(trial)}
     if trial.method:
-        stored = trial.method == "stored"
-        method = (
-            None if stored else make_method(trial.method, trial.env.id, **trial.env.env_kwargs, threads=1)
-        )
+        method = make_method(trial.method, trial.env.id, **trial.env.env_kwargs, threads=1)
         record["rows"] = measured(trial, {"": method}, trial.env.env_kwargs)
     else:
         config = trial.config(out)
@@ -51,7 +49,7 @@ def run_trial(trial: Trial, out: Path) -> Record:
             other = untrained(model, trial.seed)
             for checks in trial.checks:
                 methods[f"/untrained{_suffix(checks)}"] = agent_method("untrained", other, checks)
-        record["rows"] = measured(trial, methods, whole_task(config.env, config.env_kwargs)[1])
+        record["rows"] = measured(trial, methods, whole_task(config.env, config.env_kwargs))
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
         record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
         for line in record["rows"]:
@@ -97,17 +95,13 @@ class ReportCallback(BaseCallback):
         return True
 
 
-def measured(trial: Trial, methods: Mapping[str, Method | None], env_kwargs: Values) -> list[Record]:
-    """Return one line for each method, by the end of its row's name, and each set of scenes.
-
-    None stands for the planner's solutions, which the files of scenes hold.
-    """
+def measured(trial: Trial, methods: Mapping[str, Method], env_kwargs: Values) -> list[Record]:
+    """Return one line for each method, by the end of its row's name, and each set of scenes."""
     kwargs = {**env_kwargs, "threads": int(trial.resources["cpu"])}  # other trials have the other cores
     lines: list[Record] = []
     for suffix, method in methods.items():
         for name, frozen in _sets(trial.env).items():
-            chosen = StoredSolutions(frozen) if method is None else method
-            (result,) = evaluate_methods([chosen], frozen, trial.env.id, env_kwargs=kwargs).results
+            (result,) = evaluate_methods([method], frozen, trial.env.id, env_kwargs=kwargs).results
             if result.interrupted:
                 raise KeyboardInterrupt
             summary = result.summary()
@@ -121,9 +115,9 @@ def measured(trial: Trial, methods: Mapping[str, Method | None], env_kwargs: Val
 
 def _sets(env: Environment) -> dict[str, FrozenScenes]:
     """Return the sets of scenes of an environment."""
-    found = {}
+    task, found = registered_task(env.id, **env.env_kwargs), {}
     for name in env.scenes:
-        found[name] = scenes_for(name, env.id, env.env_kwargs).take(slice(0, env.n_scenes))
+        found[name] = scenes_for(name, task, env.n_scenes).take(slice(0, env.n_scenes))
     return found
 
 

@@ -1,0 +1,243 @@
+"""Frozen sets of scenes of every task, made anew.
+
+    python -m viapoint.training.scene_sets.make                       # all sets; those that exist are left as they are
+    python -m viapoint.training.scene_sets.make --env viapoint/PlanarObstacles-v0 --sets test hard
+    python -m viapoint.training.scene_sets.make --check               # make them in memory, and compare their hashes
+
+Scenes are drawn one after the other, each with a generator of its own. The solution share of a scene is the share of
+random actions whose plan is clear. A scene is kept where its band of shares is still wanted, and where the search finds
+a movement that succeeds in physics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.registration import ENV_IDS, twin_of
+from viapoint.envs.scenes.families_registry import scene_families
+from viapoint.envs.scenes.sampler import is_planar
+from viapoint.envs.scenes.scene import Scenes, check_scenes
+from viapoint.envs.task import Task
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import CLEARANCE_MARGIN, GeometrySearch, plan_clearances, registered_task
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.scene_sets.scene_set import (
+    BANDS,
+    DRAWN,
+    SETS,
+    FrozenScenes,
+    bands,
+    load,
+    rounded,
+    shipped_path,
+)
+
+SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}
+"""First part of the seeds of scenes; the second is the number of the scene."""
+NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}
+"""Number of scenes of each set."""
+FEWER = {"validation": 200, "test": 250}
+"""The same in tasks without obstacles at rest, which have no other sets."""
+MOST_DRAWN = 40
+"""Greatest number of drawn scenes for each one that is wanted."""
+TOGETHER = 250
+"""Scenes that are drawn together."""
+RANDOM_ACTIONS = 512
+"""Number of random actions for the solution share."""
+HARD_SHARE = 0.01
+"""Solution share below which scenes are hard."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MakeConfig:
+    """Make the frozen sets of scenes."""
+
+    env: tuple[str, ...] = tuple(dict.fromkeys(twin_of(each) for each in ENV_IDS))
+    """Ids of environments."""
+    sets: tuple[str, ...] = SETS
+    """Names of sets."""
+    check: bool = False
+    """Make the sets that ship again, and compare their hashes."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Drawn scenes with their solution shares."""
+
+    scenes: Scenes
+    share: Float
+    family: str
+
+
+class Maker:
+    """Maker of the sets of one environment."""
+
+    def __init__(self, env_id: str) -> None:
+        self.env_id = env_id
+        self.task = registered_task(env_id)
+        self._simulation = SceneSimulation(env_id, TOGETHER)
+        self._search = GeometrySearch(self.task, 2048, refinements=4, per_round=128)
+
+    def numbers(self) -> dict[str, int]:
+        """Return the number of scenes by the names of the sets that the task has."""
+        return NUMBERS if self.task.whole_movement and self.task.n_obstacles[1] else FEWER
+
+    def make(self, name: str) -> FrozenScenes:
+        """Return a set."""
+        number = self.numbers()[name]
+        if name == "hard":
+            kept = self._hard(number)
+        elif name == "uniform" or not self.task.n_obstacles[1]:
+            kept = self._first(name, number)
+        else:
+            kept = self._by_band(name, number)
+        family = np.concatenate([np.full(len(each.share), each.family) for each in kept])
+        return FrozenScenes(
+            name=name,
+            task=self.task.as_dict(),
+            scenes=Scenes.together([each.scenes for each in kept]),
+            share=np.concatenate([each.share for each in kept]),
+            family=family,
+        )
+
+    def _first(self, name: str, number: int) -> list[Candidates]:
+        """Return the first scenes that are solved."""
+        kept, found = [], 0
+        for drawn in self._drawn(name, self.task, DRAWN, number):
+            some = _take(drawn, self._solved(drawn))
+            kept.append(_take(some, np.arange(len(some.share)) < number - found))
+            found += len(kept[-1].share)
+            if found == number:
+                break
+        return kept
+
+    def _by_band(self, name: str, number: int) -> list[Candidates]:
+        """Return as many solved scenes from each band of the solution share, as far as there are."""
+        wanted = np.full(len(BANDS), number // len(BANDS))
+        kept, spare = [], []
+        for drawn in self._drawn(name, self.task, DRAWN, number):
+            rank = np.zeros(len(drawn.share), np.int64)
+            band = bands(drawn.share)
+            solved = self._solved(drawn, wanted[band] > 0)
+            for each in range(len(BANDS)):
+                rows = np.flatnonzero(solved & (band == each))
+                rank[rows] = np.arange(len(rows))
+            fits = solved & (rank < wanted[band])
+            kept.append(_take(drawn, fits))
+            spare.append(_take(drawn, solved & ~fits))
+            wanted -= np.bincount(band[fits], minlength=len(BANDS))
+            if not wanted.any():
+                break
+        # Where a band has too few scenes, the hardest of the others stand in.
+        missing = int(wanted.sum())
+        if missing:
+            kept.append(_hardest(spare, missing))
+        return kept
+
+    def _hard(self, number: int) -> list[Candidates]:
+        """Return solved scenes with the least shares, as many of each family."""
+        plane = is_planar(self.task.arm)
+        families = [
+            name
+            for name, family in scene_families(plane).items()
+            if set(family.kinds) <= set(self.task.shapes) and family.n_obstacles <= self.task.n_obstacles[1]
+        ]
+        kept = []
+        for place, name in enumerate(families):
+            share = number * (place + 1) // len(families) - number * place // len(families)
+            task = dataclasses.replace(self.task, families=(name,))
+            found: list[Candidates] = []
+            for drawn in self._drawn("hard", task, name, share):
+                found.append(_take(drawn, self._solved(drawn, drawn.share < 0.05)))
+                if sum((each.share < HARD_SHARE).sum() for each in found) >= share:
+                    break
+            kept.append(_hardest(found, share))
+        return kept
+
+    def _drawn(self, name: str, task: Task, family: str, number: int) -> Iterator[Candidates]:
+        """Yield drawn scenes, whose numbers are rounded to what a file holds."""
+        sampler = task.sampler()
+        for first in range(0, MOST_DRAWN * number, TOGETHER):
+            seeds = [(SEEDS[name], *family.encode(), first + each) for each in range(TOGETHER)]
+            scenes = rounded(sampler([np.random.default_rng(seed) for seed in seeds]))
+            scenes = scenes.take([row for row in range(TOGETHER) if self._is_possible(scenes.take([row]))])
+            yield Candidates(scenes, self._share(scenes), family)
+
+    def _is_possible(self, scene: Scenes) -> bool:
+        """Return True for one scene that rounding left possible."""
+        try:
+            check_scenes(scene, self.task.arm)
+        except ValueError:
+            return False
+        return True
+
+    def _share(self, scenes: Scenes) -> Float:
+        """Return the solution shares of scenes, shape (N,)."""
+        number = len(scenes.start)
+        if not self.task.n_obstacles[1]:
+            return np.ones(number)
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_ACTIONS, self.task.action.size))
+        every = np.broadcast_to(actions, (number, *actions.shape))
+        problem = Problem.of_scenes(scenes, self.task)
+        clearance = plan_clearances(self.task, problem, every, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+        return np.asarray((clearance >= CLEARANCE_MARGIN).mean(axis=-1))
+
+    def _solved(self, drawn: Candidates, wanted: Bool | None = None) -> Bool:
+        """Return True for scenes, of those that are wanted, in which a movement of the search succeeds."""
+        solved = np.zeros(len(drawn.share), bool)
+        rows = np.arange(len(solved)) if wanted is None else np.flatnonzero(wanted)
+        if rows.size:
+            scenes = drawn.scenes.take(rows)
+            decided = self._search.decide(self._simulation.observe(scenes))
+            solved[rows] = self._simulation.play(self._search, scenes, decided).success
+        return solved
+
+
+def _take(candidates: Candidates, rows: Bool) -> Candidates:
+    """Return some of the candidates."""
+    return dataclasses.replace(
+        candidates, scenes=candidates.scenes.take(rows), share=candidates.share[rows]
+    )
+
+
+def _hardest(found: list[Candidates], number: int) -> Candidates:
+    """Return the candidates with the least shares."""
+    scenes = Scenes.together([each.scenes for each in found])
+    share = np.concatenate([each.share for each in found])
+    rows = np.sort(np.argsort(share, kind="stable")[:number])
+    return Candidates(scenes.take(rows), share[rows], found[0].family)
+
+
+def main() -> None:
+    """Make or check the sets, and print what was made."""
+    config = tyro.cli(MakeConfig)
+    different = 0
+    for env_id in config.env:
+        maker = Maker(env_id)
+        for name in [each for each in config.sets if each in maker.numbers()]:
+            path = shipped_path(name, env_id)
+            if path.is_file() and not config.check:
+                continue
+            made = maker.make(name)
+            counts = np.bincount(made.band, minlength=len(BANDS))
+            told = ", ".join(f"{band}: {count}" for band, count in zip(BANDS, counts, strict=True))
+            if config.check:
+                same = path.is_file() and load(path).sha256 == made.sha256
+                different += not same
+                print(f"{path.name}: {'as it ships' if same else 'DIFFERENT'} ({told})", flush=True)
+            else:
+                path.parent.mkdir(exist_ok=True)
+                made.save(path)
+                print(f"{path.name}: {len(made.share)} scenes ({told})", flush=True)
+    sys.exit(bool(different))
+
+
+if __name__ == "__main__":
+    main()
