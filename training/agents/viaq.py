@@ -34,6 +34,8 @@ FIXED_PARTS = ("arm", "space", "n_via", "timing", "duration_range", "shapes")
 """Parts of the task that agent and environment must share, because the policy plans with them."""
 CLEARANCE_SCALE = 0.4
 """Unit of errors of the clearance term, as a share of the weight of the term: 2 cm."""
+OWN_SHARE = 0.02
+"""Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm."""
 KEEP_PROBABILITY = 0.5
 """Probability that a random decision in a replanning task keeps the plan."""
 CONTACT_WEIGHT = 0.1
@@ -212,7 +214,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             effort = effort + goes_on * following.effort_terms
         carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
         losses = {
-            "clearance": self._clearance_loss(values.clearance, outcomes, known),
+            "clearance": self._clearance_loss(values, outcomes, known),
             "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
             "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
             "effort": 10.0
@@ -229,15 +231,18 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             )
         return losses
 
-    def _clearance_loss(self, predicted: Tensor, outcomes: Outcomes, known: Tensor) -> Tensor:
+    def _clearance_loss(self, values: Values, outcomes: Outcomes, known: Tensor) -> Tensor:
         """Return the loss of the predicted clearance of the executed part of each plan.
 
-        The environment reports the lowest clearance of the episode so far. If an earlier decision set it, it is a lower
-        bound for this decision, and only predictions below it count as errors.
+        The environment reports the lowest clearance of the episode so far. If an earlier decision or the arm itself set
+        it, it is a lower bound for the obstacles, and only predictions below it count as errors.
         """
-        scale = CLEARANCE_SCALE * max(float(self.policy.task.weights.clearance), 1e-3)
-        apart = (predicted - outcomes.clearance) / scale
-        apart = torch.where(outcomes.lower > 0.5, apart, apart.clamp(max=0.0))
+        weight = max(float(self.policy.task.weights.clearance), 1e-3)
+        critic = self.policy.critic
+        apart = (critic.clearance_term(values.margin) - outcomes.clearance) / (CLEARANCE_SCALE * weight)
+        own = critic.clearance_term(values.self_clearance).detach()
+        obstacles = (outcomes.lower > 0.5) & (outcomes.clearance < own - OWN_SHARE * weight)
+        apart = torch.where(obstacles, apart, apart.clamp(max=0.0))
         return _mean(
             functional.smooth_l1_loss(apart, torch.zeros_like(apart), beta=0.2, reduction="none"), known
         )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.agents.pairs import PairNetwork, Pairs
@@ -28,7 +29,9 @@ class Values(NamedTuple):
     """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
 
     margin: Tensor
-    """Predicted clearance, [m]."""
+    """Predicted clearance from obstacles, [m]."""
+    self_clearance: Tensor
+    """Computed clearance of the arm from itself, [m]."""
     no_contact: Tensor
     """Logit of the probability of no contact."""
     arrival: Tensor
@@ -74,8 +77,8 @@ class ViaQCritic(nn.Module):
     The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement stays
     within reach and joint ranges, and how far the arm is from itself, s(a):
 
-        c = min(m, s),  P(clear) = sigmoid(k c + b),  P(success) = P(clear) sigmoid(d + r(s, a)),
-        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(c) + e(s, a)
+        P(clear) = sigmoid(k m + b) sigmoid(k' s + b'),  P(success) = P(clear) sigmoid(d + r(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(min(m, s)) + e(s, a)
 
     Args:
         task: Task of the environment.
@@ -98,6 +101,8 @@ class ViaQCritic(nn.Module):
         """Weights of the effort features, initialised from the reward weights."""
         self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
         """Logarithm of k [1/m], and b."""
+        self.self_slope = nn.Parameter(torch.tensor([6.0, 2.0]))
+        """Logarithm of k' [1/m], and b'."""
         self.scales = nn.Parameter(
             torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
         )
@@ -105,22 +110,29 @@ class ViaQCritic(nn.Module):
 
     def forward(self, inputs: PlanInputs) -> Values:
         """Return the predictions for each plan."""
-        margin = torch.minimum(self.pairs(inputs.pairs), inputs.pairs.self_clearance)
+        margin, own = self.pairs(inputs.pairs), inputs.pairs.self_clearance
         reach = self.arrival - OUTSIDE * (~inputs.pairs.inside).to(margin.dtype)
         # Keeping a plan and planning the same movement again have the same value, so the action itself is not an input.
         ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
         known = ends if self.replanning else torch.cat((ends, inputs.actions), dim=-1)
         rest = self.rest(torch.cat((known, inputs.effort), dim=-1))
-        low, high = CLEARANCE_RANGE
-        clip: Any = _Saturated.apply
-        clearance = clip(margin, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        obstacles = margin * torch.exp(self.slope[0]) + self.slope[1]
+        itself = own * torch.exp(self.self_slope[0]) + self.self_slope[1]
         return Values(
             margin,
-            margin * torch.exp(self.slope[0]) + self.slope[1],
+            own,
+            both(obstacles, itself),
             reach + rest[..., 1] + IN_TIME * inputs.effort[..., 3],
-            clearance,
+            torch.minimum(self.clearance_term(margin), self.clearance_term(own)),
             rest[..., 0] + inputs.effort @ self.linear,
         )
+
+    def clearance_term(self, clearance: Tensor) -> Tensor:
+        """Return the clearance term of the reward for a clearance, [m]."""
+        low, high = CLEARANCE_RANGE
+        clip: Any = _Saturated.apply
+        term: Tensor = clip(clearance, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        return term
 
     def value(self, values: Values) -> Tensor:
         """Return Q, shape (B, H)."""
@@ -139,6 +151,13 @@ class ViaQCritic(nn.Module):
         success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
         merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
         return merit
+
+
+def both(first: Tensor, second: Tensor) -> Tensor:
+    """Return the logit of the product of two probabilities that are given as logits."""
+    log = functional.logsigmoid(first) + functional.logsigmoid(second)
+    log = log.clamp(max=-1e-6)
+    return log - torch.log(-torch.expm1(log))
 
 
 def dense(*sizes: int) -> nn.Sequential:
