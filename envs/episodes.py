@@ -26,6 +26,8 @@ LIMIT_INSTANTS = 64
 """Instants at which the limits of a plan are checked."""
 PROLONGED, ENOUGH = 6, 1.0
 """Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor."""
+MOST_PROLONGED = 1.5
+"""Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
 History = list[tuple[float, Plan]]
 """Plans of an episode with the times at which they began, [s]."""
@@ -266,8 +268,9 @@ class Episodes:
         """Return plans that are slow enough, how much slower they are, and True where they keep the limits."""
         needed = self._slowdown(plan)
         stretch = np.maximum(needed, 1.0)
-        slower = plan._replace(durations=plan.durations * stretch[:, None])
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
+        stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
+        slower = plan._replace(durations=plan.durations * stretch[:, None])
         rows = np.flatnonzero(moving & (needed > ENOUGH))
         for _ in range(PROLONGED):
             if not rows.size:
@@ -275,7 +278,7 @@ class Episodes:
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
             again = self._slowdown(slower.take(rows))
-            rows, again = rows[again > ENOUGH], again[again > ENOUGH]
+            rows, again = rows[again > ENOUGH], np.minimum(again[again > ENOUGH], MOST_PROLONGED)
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
         within = np.ones(len(stretch), bool)

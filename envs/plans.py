@@ -200,7 +200,7 @@ class ActionLayout:
         goal = finite_array("goal", goal, (..., self.dimension))
         waypoints = self.waypoints(action, start, goal)
         factor = self.centre * np.exp(action[..., self.n_via * self.dimension] * self.log_half_range)
-        shares = self._shares(waypoints, action)
+        shares = self.shares(waypoints, action)
         unit = factor if self.space == "hand" else factor * self.shortest(waypoints, shares)
         return Plan.at_rest(waypoints, shares * unit[..., None])
 
@@ -258,8 +258,8 @@ class ActionLayout:
         relative = np.abs(velocity) / np.array(self.rate_limit)
         return np.asarray(np.maximum(relative.max(axis=(-2, -1)), SHORTEST_DURATION))
 
-    def _shares(self, waypoints: Float, action: Float) -> Float:
-        """Return the shares of the duration of the segments, shape (..., K + 1)."""
+    def shares(self, waypoints: Float, action: Float) -> Float:
+        """Return the shares of the duration of the segments that actions choose, shape (..., K + 1)."""
         if self.timing == "optimal":
             return np.asarray(primitives.passage_durations(waypoints, np.ones(waypoints.shape[:-2])))
         split = action[..., self.n_via * self.dimension + 1 :]

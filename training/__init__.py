@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
+    from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
+    from viapoint.training.planning.search import GeometrySearch
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
     from viapoint.training.runs.trainer import train
-    from viapoint.training.planning.search import GeometrySearch
-    from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
     from viapoint.training.study.config import Study
     from viapoint.training.study.run import run_study
 else:

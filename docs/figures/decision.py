@@ -20,10 +20,10 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import load_agent
-from viapoint.training.plotting.top_view import draw_movement
-from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.planning.plan_checks import check_plans
 from viapoint.training.planning.planned_movements import plan_movements
+from viapoint.training.plotting.top_view import draw_movement
+from viapoint.training.scene_sets.scene_set import load
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 1
 """Environment, and row of its `validation` set."""

@@ -13,7 +13,7 @@ import numpy as np
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import forward, inverse_dynamics
 from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle

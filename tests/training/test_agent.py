@@ -11,9 +11,9 @@ from viapoint.envs.mdp.task import Task
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_policy import ViaQPolicy
+from viapoint.training.planning.candidates import sobol_actions
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.planning.candidates import sobol_actions
 
 IDS = (
     "viapoint/PlanarReach-v0",

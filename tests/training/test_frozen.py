@@ -12,10 +12,10 @@ from scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
 from viapoint.envs.scenes.sampler import UniformSampler
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planning.cma_planner import Planner, PlannerBudget, screen
+from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import BANDS, bands, load
-from viapoint.training.planning.search import GeometrySearch
 
 ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 SHIPPED = [(env_id, name) for env_id, names in SETS.items() for name in names]

@@ -6,11 +6,8 @@ import pytest
 
 from viapoint.envs.common.validation import MIN_GOAL_DISTANCE
 from viapoint.envs.registration import REPLANNING_TASKS
-from viapoint.training.planning.baselines import factory
-from viapoint.training.rollouts.rollout import new_simulation
-from viapoint.training.scene_sets.scene_set import load
 from viapoint.training.planning import geometry_search
-from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.planning.baselines import factory
 from viapoint.training.planning.plan_checks import (
     MAX_REFINED,
     MIN_REFINED,
@@ -20,6 +17,9 @@ from viapoint.training.planning.plan_checks import (
     pruned_merit,
 )
 from viapoint.training.planning.planned_movements import plan_movements
+from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.rollouts.rollout import new_simulation
+from viapoint.training.scene_sets.scene_set import load
 
 PLANE, WHOLE_ARM, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")

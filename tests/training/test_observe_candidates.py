@@ -14,10 +14,10 @@ from viapoint.training import (
     ViaVecEnv,
     load_agent,
 )
-from viapoint.training.rollouts.vec_env import observed_candidates
-from viapoint.training.runs.trainer import train
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.observe_candidates import BOUND
+from viapoint.training.rollouts.vec_env import observed_candidates
+from viapoint.training.runs.trainer import train
 
 ENV, IN_SPACE, REPLANNING = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PandaObstacles", "PlanarMovingObstacles")

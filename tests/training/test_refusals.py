@@ -34,6 +34,7 @@ from viapoint.training.io.files import BadFileError
 from viapoint.training.live.scene_file import from_json
 from viapoint.training.paper.claim import Claim
 from viapoint.training.planning.baselines import agent_method, make_method
+from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.gallery import gallery
 from viapoint.training.plotting.video import record_video
@@ -42,7 +43,6 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
-from viapoint.training.planning.search import GeometrySearch
 
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")

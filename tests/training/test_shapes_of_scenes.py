@@ -9,10 +9,10 @@ from viapoint.envs import Box, Cylinder, obstacles_from_rows
 from viapoint.envs.rendering.overlay import Movement
 from viapoint.training import GeometrySearch, SceneExtractor, ViaQ, ViaVecEnv
 from viapoint.training.planning.cma_planner import Planner, PlannerBudget
-from viapoint.training.plotting.top_view import widened_outline
-from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.planning.plan_checks import check_plans
 from viapoint.training.planning.planned_movements import take_rows
+from viapoint.training.plotting.top_view import widened_outline
+from viapoint.training.rollouts.rollout import SceneSimulation
 
 PANDA, PLANE, WHOLE, MOVING = (
     "viapoint/PandaObstacles-v0",

@@ -16,9 +16,9 @@ import viapoint.envs.geometry.distance
 import viapoint.envs.geometry.narrow_phase
 import viapoint.envs.scenes.dynamic_scene
 import viapoint.envs.sim.outcome
-import viapoint.training.planning.search
 import viapoint.training.planning.plan_checks
 import viapoint.training.planning.planned_clearance
+import viapoint.training.planning.search
 from viapoint.training.agents import viaq_policy
 from viapoint.training.agents.obstacle_parts import (
     PART,
@@ -32,10 +32,10 @@ from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcome
 from viapoint.training.agents.pair_networks import PairMinimum
 from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_critic import Values, _Saturated
-from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 from viapoint.training.planning.candidates import best_duration, candidate_actions
-from viapoint.training.planning.search import score_plans
 from viapoint.training.planning.plan_checks import INFEASIBLE
+from viapoint.training.planning.search import score_plans
+from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 
 PLANE, WHOLE, SPACE = (
     "viapoint/PlanarObstacles-v0",

@@ -16,6 +16,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from viapoint import primitives
 from viapoint.envs.arms.chain import Chain, Spheres
@@ -39,6 +40,7 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
         for a, b in itertools.product(np.linspace(0.1, 0.7, 16), np.linspace(0.3, 0.9, 16))
         if b - a > 0.14
     ],
+    3: list(itertools.combinations([float(t) for t in np.linspace(0.1, 0.9, 13)], 3)),
 }
 """Passage times in unit time by the number of via-points; more via-points are passed at even times."""
 
@@ -246,6 +248,11 @@ def table_costs(table: MovementTable, offsets: Float) -> tuple[Int, Float]:
     for i in range(number):
         times[i], cost[i] = best_times(table, offsets[i], gram)
     return times, cost
+
+
+def nearest_times(table: MovementTable, durations: Float) -> Int:
+    """Return the passage times nearest to given ones, as indices of the table, for durations of shape (H, K + 1)."""
+    return np.asarray(KDTree(table.durations).query(durations)[1], np.int64)
 
 
 @compiled

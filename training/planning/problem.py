@@ -20,6 +20,7 @@ from viapoint.training.planning.movements import (
     MovementTable,
     Setting,
     movement_table,
+    nearest_times,
     shortest_durations,
     table_costs,
 )
@@ -108,14 +109,14 @@ class Moves(NamedTuple):
 def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
     """Return the plans of actions of shape (B, H, m)."""
     layout, table = task.action, movement_table(task.n_via)
-    actions = np.asarray(actions, dtype=np.float64)
+    vectors = np.asarray(actions, dtype=np.float64)
     start, goal = problem.start[:, None], problem.goal[:, None]
-    batch = actions.shape[:2]
+    batch = vectors.shape[:2]
     columns, dimension = task.n_via + 3, layout.dimension
     offsets = np.zeros((*batch, columns, dimension))
     if problem.remaining is None or problem.vias is None:
-        waypoints = layout.waypoints(actions, np.broadcast_to(start, (*batch, dimension)), goal)
-        duration = layout.centre * np.exp(actions[..., task.n_via * dimension] * layout.log_half_range)
+        waypoints = layout.waypoints(vectors, np.broadcast_to(start, (*batch, dimension)), goal)
+        duration = layout.centre * np.exp(vectors[..., task.n_via * dimension] * layout.log_half_range)
     else:
         waypoints, duration = revised_waypoints(
             layout,
@@ -124,13 +125,18 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
             problem.vias[:, None],
             np.broadcast_to(goal, (*batch, dimension)),
             problem.remaining[:, None],
-            actions,
+            vectors,
         )
         offsets[..., -2, :] = problem.velocity[:, None] * duration[..., None]
         offsets[..., -1, :] = problem.acceleration[:, None] * duration[..., None] ** 2
     offsets[..., : task.n_via + 1, :] = waypoints[..., 1:, :] - waypoints[..., :1, :]
     flat = offsets.reshape(-1, columns, dimension)
-    times, cost = table_costs(table, flat)
+    if layout.timing == "learned" and problem.remaining is None:
+        shares = layout.shares(waypoints, vectors)
+        times = nearest_times(table, shares.reshape(-1, task.n_via + 1))
+        cost = np.einsum("hij,hid,hjd->h", table.cost[times], flat, flat)
+    else:
+        times, cost = table_costs(table, flat)
     if layout.space == "joints" and problem.remaining is None:
         limits = np.array(layout.rate_limit)
         duration = duration * shortest_durations(table, times, flat, limits).reshape(batch)

@@ -26,7 +26,12 @@ from viapoint.envs.scenes.sampler import is_planar
 from viapoint.envs.scenes.scene import Scenes, check_scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import CLEARANCE_MARGIN, GeometrySearch, plan_clearances, registered_task
+from viapoint.training.planning.search import (
+    CLEARANCE_MARGIN,
+    GeometrySearch,
+    plan_clearances,
+    registered_task,
+)
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import (
     BANDS,
