@@ -14,11 +14,11 @@ import torch
 from viapoint.training.live.page import LivePage
 
 INWARDS = {
-    "viapoint/PlanarObstacles-v0": (-0.05, 0.38),
-    "viapoint/PlanarWholeArm-v0": (-0.05, 0.38),
-    "viapoint/PandaObstacles-v0": (0.5, 0.0),
+    "viapoint/PlanarObstacles-v0": (-0.05, 0.38, 0.0),
+    "viapoint/PlanarWholeArm-v0": (-0.05, 0.38, 0.0),
+    "viapoint/PandaObstacles-v0": (0.3, 0.0, 0.5),
 }
-"""Environments, and a place in the middle of their workspace, [m]."""
+"""Environments, and a place in the middle of the arm's reach, [m]."""
 DRAGS, STEPS = 4, 10
 """Number of drags, and of positions in each."""
 DISTANCE = 0.03
@@ -38,16 +38,16 @@ def main() -> None:
     window = browser.Browser()
     print("environment, changes, median [ms], 95 % [ms]")
     for env_id, middle in INWARDS.items():
-        with LivePage(env_id, port=0, seed=3) as page:
+        with LivePage(env=env_id, port=0, seed=11) as page:
             tab = window.tab(page.url)
             (session,) = browser.wait_for(lambda page=page: page.sessions)
             browser.wait_for(lambda s=session: s.idle and s.proposal)
             browser.wait_for(lambda t=tab: steady(t))
-            goal = session.scene.goal
-            other = goal.copy()
-            other[:2] += DISTANCE * np.sign(middle - goal[:2])
+            tool = session.setting.tool
+            goal = tool(session.scene.goal)
+            other = goal + DISTANCE * np.sign(middle - goal) * (1.0, 1.0, 0.0)
             for k in range(DRAGS):
-                drag(tab, session, session.scene.goal, (other, goal)[k % 2], steps=STEPS)
+                drag(tab, session, tool(session.scene.goal), (other, goal)[k % 2], steps=STEPS)
                 time.sleep(0.3)
                 browser.wait_for(lambda s=session: s.idle)
             taken = 1e3 * np.array(session.latencies)

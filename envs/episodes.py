@@ -75,6 +75,7 @@ class Episodes:
         """Plans of the running episodes."""
         self._finished: dict[int, tuple[Scenes, History, Pieces]] = {}
         """Episodes before the running ones, by row."""
+        self._moving = False
         self._events = task.events()
         self._start = np.zeros((number, task.space.dimension))
         self._zero_duration = np.ones(number)
@@ -110,6 +111,7 @@ class Episodes:
             self.scenes = scenes
         else:
             self.scenes = self.scenes.put(rows, scenes)
+        self._moving = bool(self.scenes.obstacles.velocity.any() or self.scenes.turn_velocity.any())
         self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
         space = self.task.space
         start, goal = space.coordinates(scenes.start), space.coordinates(scenes.goal)
@@ -173,7 +175,12 @@ class Episodes:
         return self._follow(plan, ~kept & active, active)
 
     def execute(self, plan: Plan) -> Decision:
-        """Replace every plan by another one, which begins at the present reference.
+        """Replace every plan by another one of :meth:`checked`, and follow it."""
+        everyone = np.ones(len(self.begun), bool)
+        return self._follow(plan, everyone, everyone)
+
+    def checked(self, plan: Plan) -> Plan:
+        """Return plans that begin in the present state of the references, after a check that they fit.
 
         Raises:
             ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
@@ -183,9 +190,8 @@ class Episodes:
             raise TypeError(
                 "here an action steers the arm for one control step; plans need another decide_at"
             )
-        everyone = np.ones(len(self.begun), bool)
         if self.task.whole_movement:
-            return self._follow(checked_plan(plan, self._start), everyone, everyone)
+            return checked_plan(plan, self._start)
         state = self.nominal.state
         plan = checked_plan(plan, state.position)
         if plan.waypoints.shape != self.plan.waypoints.shape:
@@ -193,8 +199,7 @@ class Episodes:
                 f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {plan.waypoints.shape}"
             )
         waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
-        moving = Plan(waypoints, plan.durations, state.velocity, state.acceleration)
-        return self._follow(moving, everyone, everyone)
+        return Plan(waypoints, plan.durations, state.velocity, state.acceleration)
 
     def move_goals(self, joints: Float) -> None:
         """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
@@ -255,7 +260,9 @@ class Episodes:
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
-        if given.waypoints.shape != self.plan.waypoints.shape:  # whole movements have any number of via-points
+        if (
+            given.waypoints.shape != self.plan.waypoints.shape
+        ):  # whole movements have any number of via-points
             self.plan = Plan(*(part.copy() for part in given))
         put(self.plan, rows, plan)
         self.last_plan = Plan(*(part.copy() for part in self.plan))
@@ -316,7 +323,7 @@ class Episodes:
             goal = self.task.space.coordinates(scenes.goals((now + steps) * timestep))
             segment = Segment(rows, steps, scenes.obstacles_at(time), goal)
             begin, whole = state.steps.copy(), self.task.whole_movement
-            self.executor.run(segment, self._references, resume=not whole, moving=self.task.moving_obstacles)
+            self.executor.run(segment, self._references, resume=not whole, moving=self._moving)
             since = (begin - self._began)[rows]
             done = since + (state.steps - begin)[rows]
             plan = self.plan.take(rows)
@@ -353,7 +360,7 @@ class Episodes:
             goal = task.space.coordinates(scenes.goal)
             steps = np.full(len(rows), number)
             segment = Segment(rows, steps, scenes.obstacles_at(self.time[rows]), goal)
-            self.executor.run(segment, references, resume=True, moving=task.moving_obstacles)
+            self.executor.run(segment, references, resume=True, moving=self._moving)
             state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True

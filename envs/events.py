@@ -5,6 +5,7 @@ Plans and courses are known to the environment, so all events but a contact are 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
 from typing import Any, Literal, NamedTuple, get_args
@@ -169,7 +170,7 @@ class EventPredictor:
         pieces = [now, *(int(turn) for turn in turns if now < turn < latest), latest]
         trajectory = plan.take([row]).trajectory()
         below = True  # a clearance that is below the margin already does not fall
-        for begin, end in zip(pieces[:-1], pieces[1:], strict=True):
+        for begin, end in itertools.pairwise(pieces):
             looks = (end - begin) // every + 1
             steps = begin + every * np.arange(looks + ahead)
             position, velocity, acceleration = trajectory.sample(self.timestep * (steps - began)[None])

@@ -28,7 +28,7 @@ POSE_SIZE = 16
 class ObservationLayout:
     """Names, sizes, bounds and units of the observation's parts.
 
-    `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where there may be obstacles, `obstacles`:
+    `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where obstacles may be, `obstacles`:
     n rows (kind one-hot, centre [m], first two axes of the frame, half lengths of the bounding box [m], velocity [m/s],
     present), flattened. While a movement is under way also the reference that the arm follows, `command`, `velocity`
     and `acceleration`, and `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero

@@ -102,6 +102,10 @@ class Simulator:
         self._present = np.zeros((num_envs, n_obstacles), bool)
         self._probe: tuple[mujoco.MjModel, mujoco.MjData] | None = None
 
+    def single(self) -> Simulator:
+        """Return a simulator of the same arm and as many obstacles, with one simulation."""
+        return Simulator(self.arm, n_obstacles=len(self._geoms), num_envs=1, meshes=tuple(self._meshes))
+
     def place(self, sims: Int, joints: Float, obstacles: Obstacles) -> None:
         """Place the arms of n simulations at rest at joint positions (n, J), and the obstacles of n scenes."""
         self.batch.state[sims] = self._rest

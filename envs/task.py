@@ -14,6 +14,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.validation import (
     fewest_and_most,
+    names_of,
     number_of_at_least,
     whole_number,
 )
@@ -113,9 +114,10 @@ class Task:
                 raise TypeError(f"{name} must be True or False, got {value!r}")
         most = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
-        kinds = check_kinds((PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes)
-        names = (families,) if isinstance(families, str) else families
-        names = default_families(plane, kinds, most[1]) if names is None else names
+        shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes
+        kinds = check_kinds(names_of("shapes", shapes))
+        families = default_families(plane, kinds, most[1]) if families is None else families
+        names = names_of("families", families)
         task = cls(
             arm=arm,
             space_name=space,

@@ -6,7 +6,7 @@ import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -37,6 +37,7 @@ from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import END, Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
 LEAST_SHARE = 4
 """Fewest environments for which a thread is worth its while."""
 
@@ -83,7 +84,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         (16,)
     """
 
-    metadata: ClassVar[dict[str, Any]] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata = METADATA
 
     def __init__(
         self,
@@ -119,7 +120,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {**SINGLE_METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         number = whole_number("threads", threads, 0) or os.cpu_count() or 1
@@ -208,6 +209,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             ValueError: A given scene is impossible; the environments are unchanged.
         """
         options = reset_options(options)
+        self._check_changes(options)
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         generators, first_seed = self._seeded(seed, rows)
         # Nothing changes before all scenes are there: impossible ones raise an error.
@@ -220,6 +222,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._start(rows, scenes)
         for flags in (self.terminated, self.truncated, self._over):
             flags[rows] = False
+        if self.render_mode == "human":
+            self._renderers[0].render()
         return self.observe(), {}
 
     def use_generator(self, generator: np.random.Generator | None, seed: int | None) -> None:
@@ -288,10 +292,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             ValueError: A plan begins elsewhere.
         """
         self._check_running()
-        whole = Plan(np.asarray(plan.waypoints), np.asarray(plan.durations))
-        if len(whole.waypoints) != self.num_envs:
-            raise ValueError(f"plan must be {self.num_envs} movements, got {len(whole.waypoints)}")
-        return self._joined(self._each(lambda episodes, share: episodes.execute(whole.take(share))))
+        waypoints = finite_array("waypoints of the plan", plan.waypoints, (self.num_envs, None, None))
+        durations = finite_array("durations of the plan", plan.durations, (self.num_envs, None))
+        whole = Plan(waypoints, durations)
+        # Nothing moves before all plans are checked.
+        plans = {
+            id(episodes): episodes.checked(whole.take(share))
+            for episodes, share in zip(self._episodes, self._shares, strict=True)
+        }
+        return self._joined(self._each(lambda episodes, share: episodes.execute(plans[id(episodes)])))
 
     def move_goals(self, goals: Any) -> Observation:
         """Move the targets of the running episodes, which jump no more, and return the new observations.
@@ -455,6 +464,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 episodes.start(rows[inside] - share[0], scenes.take(inside))
         self._running = True
 
+    def _check_changes(self, options: Mapping[str, Any]) -> None:
+        """Check that the task has decisions during a movement, if a scene is to change."""
+        for name in ("jumps", "turns"):
+            if name in options and not self.task.replanning:
+                raise ValueError(
+                    f"options[{name!r}] need an environment with decide_at=('target', ...), which are events of a "
+                    f"movement; here it is {self.task.decide_at!r}"
+                )
+
     def _check_running(self) -> Scenes:
         """Return the running scenes, or raise an error before the first reset."""
         scenes = self.scenes
@@ -474,3 +492,12 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 generators[i], used = seeding.np_random(seeds[i])
                 first_seed = used if i == 0 else first_seed
         return generators, first_seed
+
+
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return an autoreset mode from itself or its name."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        names = ", ".join(each.value for each in AutoresetMode)
+        raise ValueError(f"autoreset_mode must be one of {names}, got {mode!r}") from None

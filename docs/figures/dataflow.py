@@ -6,20 +6,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
-from numpy.typing import NDArray
 
-from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Frame, Observation
+from viapoint.envs.episodes import Recorded
+from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.task import Task
 from viapoint.training.paper.movements import required_torque
-from viapoint.training.plotting.top_view import draw_movement
+from viapoint.training.plotting.top_view import View, draw_movement, footprint, planned_only
 
 SIZE = (12.4, 6.5)
 """Width and height, [inch]."""
@@ -37,42 +38,31 @@ MARGIN = 0.035
 class Data(NamedTuple):
     """Data of one movement."""
 
-    env: Any
-    scene: Scenes
-    """Scene of one row."""
+    task: Task
+    recorded: Recorded
+    """Scene, plan and execution."""
     action: Float
     """Shape (m,)."""
-    plan: Plan
-    """Without the batch dimension."""
-    observation: dict[str, NDArray[np.float32]]
+    observation: Observation
+    """Observation before the movement."""
     info: dict[str, Any]
+    """Info after the movement."""
+    picture: Frame
+    """Rendered picture."""
+
+    @property
+    def plan(self) -> Plan:
+        """Plan without the batch dimension."""
+        return self.recorded.history[0][1].take(0)
 
     @property
     def time(self) -> Float:
         """Instants of the planned movement, [s]."""
-        return np.linspace(0.0, float(self.plan.durations.sum()), 241)
+        return np.linspace(0.0, float(self.plan.duration), 241)
 
 
-def draw_flow(
-    path: Path,
-    env: gym.Env[Any, Any],
-    scene: Scenes,
-    action: Float,
-    observation: dict[str, NDArray[np.float32]],
-    info: dict[str, Any],
-) -> None:
-    """Draw the flow of the last movement of an environment.
-
-    Args:
-        path: PNG file.
-        env: Environment with `render_mode="rgb_array"` after the movement.
-        scene: Scene of one row.
-        action: Action of the movement, shape (m,).
-        observation: Observation before the movement.
-        info: Info after the movement.
-    """
-    inner: Any = env.unwrapped
-    data = Data(env, scene, action, inner.last_plan, observation, info)
+def draw_flow(path: Path, data: Data) -> None:
+    """Draw the flow of a movement to a PNG file."""
     figure = Figure(figsize=SIZE, dpi=120, facecolor="white")
     FigureCanvasAgg(figure)
     for number, (title, place, draw) in enumerate(PANELS):
@@ -89,7 +79,7 @@ def draw_flow(
 
 
 def _action(axes: Axes, data: Data) -> None:
-    names = [name.replace("_", " ") for name in data.env.unwrapped.action_layout.names]
+    names = [name.replace("_", " ") for name in data.task.action.names]
     places = np.arange(len(names))[::-1]
     axes.barh(places, data.action, height=0.34, color=PALETTE.via)
     axes.axvline(0.0, color=GREY, linewidth=0.8)
@@ -102,8 +92,10 @@ def _action(axes: Axes, data: Data) -> None:
 
 
 def _vias(axes: Axes, data: Data) -> None:
-    arm, view = data.env.unwrapped.task.arm, window(data.scene, data.plan.waypoints, ASPECT)
-    draw_movement(axes, arm, data.scene, data.plan, arm_shown=False, view=view, scale=0.9)
+    scene, history, _ = data.recorded
+    view = window(scene, data.plan.waypoints, ASPECT)
+    plan = planned_only(scene, history[0][1])
+    draw_movement(axes, data.task, plan, arm_shown=False, view=view, scale=0.9)
     start, *_, goal = data.plan.waypoints
     axes.plot(*np.stack((start, goal)).T, ":", color=GREY, linewidth=1.0, zorder=1)
     ends = np.concatenate(([0.0], np.cumsum(data.plan.durations)))
@@ -145,14 +137,13 @@ def _controls(axes: Axes, data: Data) -> None:
 
 
 def _rollout(axes: Axes, data: Data) -> None:
-    frame = np.asarray(data.env.render())
-    axes.imshow(frame[: round(frame.shape[1] * ASPECT)])
+    axes.imshow(data.picture[: round(data.picture.shape[1] * ASPECT)])
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
 
 def _clearance(axes: Axes, data: Data) -> None:
-    rollout = data.env.unwrapped.last_rollout
+    rollout = data.recorded.rollout
     clearance = 1e3 * rollout.clearance
     top, least = 1.25 * clearance.max(), int(clearance.argmin())
     axes.axhspan(-top, 0.0, color=PALETTE.contact, alpha=0.18, linewidth=0)
@@ -180,14 +171,14 @@ def _observation(axes: Axes, data: Data) -> None:
 
 
 PANELS: tuple[tuple[str, str, Callable[[Axes, Data], None]], ...] = (
-    ("action", "envs/actions/", _action),
-    ("via-points & durations", "envs/actions/", _vias),
+    ("action", "envs/plans.py", _action),
+    ("via-points & durations", "envs/plans.py", _vias),
     ("minimum-jerk trajectory", "primitives/", _trajectory),
     ("references", "primitives/trajectory.py", _references),
     ("controls", "envs/arms/", _controls),
-    ("physics rollout", "envs/sim/", _rollout),
-    ("clearance, reward, info", "envs/geometry/ envs/mdp/", _clearance),
-    ("observation", "envs/mdp/", _observation),
+    ("physics rollout", "envs/simulator.py", _rollout),
+    ("clearance, reward, info", "envs/geometry/ envs/rewards.py", _clearance),
+    ("observation", "envs/observation.py", _observation),
 )
 
 
@@ -205,10 +196,10 @@ def _label(axes: Axes, data: Data, quantity: str) -> None:
     axes.set_ylabel(quantity, fontsize=8, color=GREY, labelpad=1)
 
 
-def window(scene: Scenes, points: Float, aspect: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def window(scene: Scenes, points: Float, aspect: float) -> View:
     """Return limits of x and y around points and the obstacles of a scene, with a given height per width, [m]."""
-    rows = scene.obstacles[0, scene.present[0]]
-    points = np.concatenate((points, rows[:, :2] + rows[:, 2:4], rows[:, :2] - rows[:, 2:4]))
+    outlines = [each for shape in unpack(scene.obstacles, 0) for each in footprint(shape)]
+    points = np.concatenate((points, *outlines))
     middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2.0, np.ptp(points, axis=0)
     half = max(extent[0], extent[1] / aspect) / 2.0 + MARGIN
     x, y = (float(m) for m in middle)

@@ -18,14 +18,15 @@ from matplotlib.patches import FancyArrowPatch
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.episodes import Recorded
+from viapoint.envs.task import Task
 from viapoint.training import load_agent
-from viapoint.training.planning.plan_checks import check_plans
-from viapoint.training.planning.planned_movements import plan_movements
-from viapoint.training.plotting.top_view import draw_movement
-from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import plan_clearances
+from viapoint.training.plotting.top_view import View, draw_movement, planned_only
+from viapoint.training.scene_sets.scene_set import scenes_for
 
-ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 1
+ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19
 """Environment, and row of its `validation` set."""
 CHECKS = 4
 """Number of plans that are checked by computed geometry."""
@@ -39,9 +40,9 @@ GREY = (0.45, 0.47, 0.52)
 class Decision(NamedTuple):
     """Data of one decision."""
 
-    env: Any
-    scene: Scenes
-    """Scene, one row."""
+    task: Task
+    recorded: Recorded
+    """Scene, plan and execution."""
     paths: Float
     """Planned path of each candidate, shape (H, T, 2), [m]."""
     margin: Float
@@ -50,34 +51,35 @@ class Decision(NamedTuple):
     """Candidates that are checked, the most promising first."""
     clearance: Float
     """Their computed clearance, [m]."""
-    chosen: int
-    """Index of the candidate that is executed."""
     info: dict[str, Any]
 
     @property
-    def view(self) -> tuple[tuple[float, float], tuple[float, float]]:
+    def view(self) -> View:
         """Part of the plane that is shown, [m]."""
-        return window(self.scene, self.paths[self.checked].reshape(-1, 2), ASPECT)
+        return window(self.recorded.scene, self.paths[self.checked].reshape(-1, 2), ASPECT)
 
 
-def decide() -> Decision:
-    """Return the data of the decision of the shipped agent in one scene."""
-    env: Any = gym.make(ENV_ID)
-    scene = load("validation", ENV_ID).scenes.take([SCENE])
-    observation, _ = env.reset(options=scene.as_options())
-    batch = {name: part[None] for name, part in observation.items()}
-    policy: Any = load_agent(ENV_ID).policy
+def decide(agent: str) -> Decision:
+    """Return the data of the decision of an agent in one scene."""
+    envs: Any = gym.make_vec(ENV_ID, num_envs=1).unwrapped
+    task: Task = envs.task
+    scene = scenes_for("validation", task).scenes.take([SCENE])
+    observation = envs.begin(scene)
+    problem = Problem.of_observation(observation, task)
+    policy: Any = load_agent(agent).policy
     policy.checks = CHECKS
     with torch.no_grad():
-        actions, merits = policy.propose(batch)
-        margin = policy.critic(policy.inputs(batch, actions)).margin[0].numpy()
+        actions, merits = policy.propose(problem)
+        margin = policy.critic(policy.inputs(problem, actions)).margin[0].numpy()
     checked = [int(row) for row in policy._promising(merits, CHECKS)[0]]
-    action = policy.decide(batch)[0]
-    chosen = int(np.abs(actions[0] - action).max(axis=-1).argmin())
-    clearance = check_plans(batch, actions[:, checked], env.unwrapped.task).clearance[0]
-    paths = plan_movements(batch, actions, env.unwrapped.task, np.linspace(0.0, 1.0, 61)).path[0]
-    *_, info = env.step(action.astype(np.float32))
-    return Decision(env, scene, np.asarray(paths), margin, checked, np.asarray(clearance), chosen, info)
+    clearance = plan_clearances(task, problem, actions[:, checked], most=1.0, least=-1.0)[0]
+    ends = [np.broadcast_to(end, (len(actions[0]), 2)) for end in (problem.start, problem.goal)]
+    plans = task.action.decode(actions[0], *ends)
+    paths = plans.trajectory()(plans.duration[:, None] * np.linspace(0.0, 1.0, 61))
+    info = envs.execute_actions(policy.decide(observation)).info
+    recorded = Recorded(scene, envs.last_plans[0], envs.last_rollout[0])
+    last = {name: value[0] for name, value in info.items()}
+    return Decision(task, recorded, np.asarray(paths), margin, checked, clearance, last)
 
 
 def draw(path: Path, data: Decision) -> None:
@@ -103,12 +105,15 @@ def draw(path: Path, data: Decision) -> None:
 
 def base(axes: Axes, data: Decision) -> None:
     """Draw the scene."""
-    draw_movement(axes, data.env.unwrapped.task.arm, data.scene, arm_shown=False, view=data.view, scale=0.9)
+    scene = planned_only(data.recorded.scene)
+    draw_movement(axes, data.task, scene, arm_shown=False, view=data.view, scale=0.9)
 
 
 def observation(axes: Axes, data: Decision) -> str:
     """Draw the straight line, and return the caption."""
-    axes.plot(*np.concatenate((data.scene.start, data.scene.goal)).T, ":", color=GREY, lw=1.4)
+    scene = data.recorded.scene
+    ends = data.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
+    axes.plot(*ends.T, ":", color=GREY, lw=1.4)
     return "hand, goal, obstacles;\nthe straight line is blocked"
 
 
@@ -137,10 +142,7 @@ def checks(axes: Axes, data: Decision) -> str:
 
 def action(axes: Axes, data: Decision) -> str:
     """Draw the executed movement, and return the caption."""
-    inner = data.env.unwrapped
-    draw_movement(
-        axes, inner.task.arm, data.scene, inner.last_plan, inner.last_rollout, view=data.view, scale=0.9
-    )
+    draw_movement(axes, data.task, data.recorded, view=data.view, scale=0.9)
     result = "success" if data.info["is_success"] else "failure"
     return f"the via-point and the duration;\nexecuted: {result}, {1e3 * data.info['min_clearance']:.0f} mm clear"
 
@@ -158,7 +160,9 @@ def main() -> None:
     """Write `decision.png`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
-    draw(parser.parse_args().out / "decision.png", decide())
+    parser.add_argument("--agent", default=ENV_ID, help="run folder or model folder of another agent")
+    arguments = parser.parse_args()
+    draw(arguments.out / "decision.png", decide(arguments.agent))
 
 
 if __name__ == "__main__":

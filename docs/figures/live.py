@@ -16,11 +16,13 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 SIZE = 1320, 850
 """Size of the window, [pixels]."""
+SEED, OBSTACLE = 11, 0
+"""Seed of the scene, and the obstacle that has a number."""
 LEFT, RIGHT = 352, 988
 """Columns of the numbers beside the panels, [pixels]."""
 PANELS = (
     (LEFT, 150),
-    (LEFT, 270),
+    (LEFT, 240),
     (LEFT, 550),
     (RIGHT, 125),
     (RIGHT, 181),
@@ -41,7 +43,7 @@ def main() -> None:
 
     browser.SIZE = SIZE
     window = browser.Browser()
-    with LivePage("viapoint/PandaObstacles-v0", port=0, seed=47) as page:
+    with LivePage(env="viapoint/PandaObstacles-v0", port=0, seed=SEED) as page:
         tab = window.tab(page.url)
         tab.call(
             "Emulation.setDeviceMetricsOverride",
@@ -57,8 +59,8 @@ def main() -> None:
         )
         time.sleep(1.0)
         browser.wait_for(lambda: steady(tab))
-        via = on_screen(tab, session, session.proposal.plan.waypoints[1])
-        obstacle = on_screen(tab, session, session.scene.obstacles[0, :3])
+        via = on_screen(tab, session, session.setting.tool(session.proposal.plan.waypoints[1]))
+        obstacle = on_screen(tab, session, session.scene.obstacles[OBSTACLE].position)
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
     window.close()
     plain.save(IMAGES / "live.webp", quality=82, method=6)

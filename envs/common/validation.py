@@ -47,6 +47,22 @@ def check_increasing_pair(name: str, pair: Any, least: float = 0.0, most: float 
         )
 
 
+def names_of(argument: str, names: Any) -> tuple[Any, ...]:
+    """Return one name, or a sequence of one or more names, as a tuple.
+
+    Raises:
+        TypeError: The argument is something else.
+        ValueError: There is no name.
+    """
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, Sequence):
+        raise TypeError(f"{argument} must be a name or a sequence of names, got {names!r:.60}")
+    if not names:
+        raise ValueError(f"{argument} must be one name or more, got {names!r}")
+    return tuple(names)
+
+
 def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of arguments, independent of later changes of the caller's lists and mappings."""
     return {

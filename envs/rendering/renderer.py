@@ -13,8 +13,9 @@ from viapoint.envs.episodes import Episodes, Recorded
 from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.scene_view import Picture, SceneView
+from viapoint.envs.task import Task
 
-__all__ = ["RENDER_MODES", "EpisodeRenderer", "GLUnavailableError", "frame_steps"]
+__all__ = ["RENDER_MODES", "EpisodeRenderer", "GLUnavailableError", "frame_steps", "picture_of"]
 
 RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]
 """Values of `render_mode` besides None."""
@@ -75,34 +76,13 @@ class EpisodeRenderer:
     def _draw(self, recorded: Recorded, step: int) -> Any:
         """Return the picture of a step, or show it and return False after the window has been closed."""
         view, screen = self._open()
-        view.write(self._picture(recorded, step))
+        view.write(picture_of(self._episodes.task, recorded, step))
         return screen.draw()
-
-    def _picture(self, recorded: Recorded, step: int) -> Picture:
-        """Return what a picture of a step shows; step 0 is the start."""
-        scene, history, rollout = recorded
-        arm, space = self._episodes.task.arm, self._episodes.task.space
-        now = np.array([step * self._episodes.simulator.timestep])
-        joints = np.concatenate((scene.start, rollout.joints))
-        done = np.concatenate((arm.hand(scene.start), rollout.hand))[: step + 1]
-        plans = [plan for began, plan in history if began <= now[0] + 1e-9]
-        paths = [arm.hand(space.joints(_path(plan))) for plan in plans]
-        vias = arm.hand(space.joints(np.asarray(plans[-1].waypoints)[0, 1:-1])) if plans else np.zeros((0, 3))
-        return Picture(
-            joints=joints[step],
-            centres=scene.obstacles_at(now).centre[0],
-            ends=(arm.hand(scene.start)[0], arm.hand(scene.goals(now))[0]),
-            planned=paths[-1] if paths else np.zeros((0, 3)),
-            vias=vias,
-            done=done,
-            touched=int(rollout.contact[:step].argmax()) if rollout.contact[:step].any() else len(done),
-            replaced=paths[:-1],
-        )
 
     def _open(self) -> tuple[SceneView, Canvas | Window]:
         """Return the scene view, and the canvas or window for it, which the first picture opens."""
         if self._view is None or self._screen is None:
-            view = SceneView(self._episodes.simulator, self._row, *self._size)
+            view = SceneView(self._episodes.simulator.single(), *self._size)
             if self._mode == "human":
                 self._screen = Window(view.model, *self._size, title="Viapoint")
             else:
@@ -123,6 +103,30 @@ class EpisodeRenderer:
                 time.sleep(-late)
             if not self._draw(recorded, int(step)):
                 return
+
+
+def picture_of(task: Task, recorded: Recorded, step: int) -> Picture:
+    """Return what a picture of a physics step of an episode shows; step 0 is the start."""
+    scene, history, rollout = recorded
+    arm, space = task.arm, task.space
+    now = np.array([step * arm.timestep])
+    joints = np.concatenate((scene.start, rollout.joints))
+    done = np.concatenate((arm.hand(scene.start), rollout.hand))[: step + 1]
+    plans = [plan for began, plan in history if began <= now[0] + 1e-9]
+    paths = [arm.hand(space.joints(_path(plan))) for plan in plans]
+    vias = arm.hand(space.joints(np.asarray(plans[-1].waypoints)[0, 1:-1])) if plans else np.zeros((0, 3))
+    # The contact of a step is that of the state before it.
+    contact = rollout.contact[: step + 1]
+    return Picture(
+        joints=joints[step],
+        obstacles=scene.obstacles_at(now),
+        ends=(arm.hand(scene.start)[0], arm.hand(scene.goals(now))[0]),
+        planned=paths[-1] if paths else np.zeros((0, 3)),
+        vias=vias,
+        done=done,
+        touched=int(contact.argmax()) if contact.any() else len(done),
+        replaced=paths[:-1],
+    )
 
 
 def _path(plan: Plan) -> Float:

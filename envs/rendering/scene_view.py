@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ import numpy as np
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.simulator import Simulator
 
 Geom = Any
@@ -36,8 +36,8 @@ class Picture(NamedTuple):
 
     joints: Float
     """Joint positions, shape (J,), [rad]."""
-    centres: Float
-    """Centres of the obstacles, shape (rows, 3), [m]."""
+    obstacles: Obstacles
+    """Obstacles at their present places, of one scene."""
     ends: tuple[Float, Float]
     """Hand positions at start and goal, shape (3,) each, [m]."""
     planned: Float
@@ -56,8 +56,7 @@ class SceneView:
     """Writer of MuJoCo scenes with the arm, its surroundings and a movement.
 
     Args:
-        simulator: Simulation that is shown. Its model is copied, so that changes of appearance do not affect it.
-        sim: Index of the simulation.
+        simulator: Simulator with one simulation, which the view alone uses.
         width: Width of the pictures, [pixels].
         height: Height of the pictures, [pixels].
     """
@@ -65,9 +64,9 @@ class SceneView:
     scene: mujoco.MjvScene
     """Scene to write, which belongs to the screen that shows it."""
 
-    def __init__(self, simulator: Simulator, sim: int, width: int, height: int) -> None:
-        self._simulator, self._sim = simulator, sim
-        self.model = copy.copy(simulator.model)
+    def __init__(self, simulator: Simulator, width: int, height: int) -> None:
+        self._simulator = simulator
+        self.model = simulator.model
         self._data = mujoco.MjData(self.model)
         self._option = mujoco.MjvOption()
         self._flat = simulator.arm.space == "hand"
@@ -94,7 +93,8 @@ class SceneView:
     def _pose(self, picture: Picture) -> None:
         """Start the scene with the arm in a configuration among the obstacles; geoms in contact are red."""
         model, data = self.model, self._data
-        self._simulator.copy_obstacles(self._sim, model, data, picture.centres)
+        self._simulator.place(np.zeros(1, np.int64), picture.joints[None], picture.obstacles)
+        self._simulator.copy_obstacles(0, model, data, picture.obstacles.centre[0])
         data.qpos[: len(picture.joints)] = picture.joints
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)

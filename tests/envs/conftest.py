@@ -1,4 +1,4 @@
-"""Paths of helpers and benchmarks that tests import, and how pictures are made."""
+"""Fixtures of the tests of environments: helpers that they import, and how pictures are made."""
 
 import sys
 from pathlib import Path
@@ -8,17 +8,17 @@ import pytest
 
 from viapoint.envs.rendering import renderer
 from viapoint.envs.rendering.renderer import GLUnavailableError
-from viapoint.envs.scenes import families
+from viapoint.envs.scenes import families_registry
 
-sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[2] / "benchmarks")]
+sys.path.append(str(Path(__file__).parent))
 
 OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 
 
 @pytest.fixture
 def registry(monkeypatch):
-    """Families of scenes that a test registers are gone afterwards."""
-    monkeypatch.setattr(families, "_FAMILIES", {d: dict(names) for d, names in families._FAMILIES.items()})
+    """Scene families that a test registers are gone afterwards."""
+    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
 
 
 @pytest.fixture
@@ -29,6 +29,7 @@ def quick_pictures(monkeypatch):
 
 @pytest.fixture(scope="session")
 def opengl():
+    """OpenGL, or the test is skipped."""
     env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
     env.reset(seed=0)
     try:
@@ -41,6 +42,7 @@ def opengl():
 
 @pytest.fixture
 def make(opengl):
+    """Function that makes environments with small pictures, which are closed after the test."""
     opened = []
 
     def made(name=OBSTACLES, mode="rgb_array", *, side=96, **kwargs):

@@ -1,4 +1,4 @@
-"""What every registered environment keeps to."""
+"""Laws that every registered environment keeps."""
 
 import pickle
 import warnings
@@ -6,153 +6,107 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import IDS, play, same
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
-from viapoint.envs import TASKS
-from viapoint.envs.mdp.rewards import RewardTerms
-from viapoint.envs.registration import REPLANNING_TASKS, STEP_TASKS
+from viapoint.envs.outcome import Outcome
+from viapoint.envs.registration import TASKS, twin_of
+from viapoint.envs.rewards import RewardTerms
 
-IDS = sorted({*TASKS, *STEP_TASKS, *REPLANNING_TASKS})
-INFO = {
-    "is_success", "collision", "first_contact_time", "min_clearance", "goal_error", "duration", "path_length",
-    "jerk_cost", "jerk_ratio", "peak_speed", "tracking_error", "reachable", "unstable",
-}  # fmt: skip
+INFO = {*Outcome._fields, *(f"reward_{name}" for name in RewardTerms._fields), "elapsed", "time", "event"}
+DIFFERENT = sorted({str(TASKS[env_id]): env_id for env_id in reversed(IDS)}.values())
+"""One id of each task."""
 
 
-@pytest.fixture(params=IDS)
+@pytest.fixture(params=DIFFERENT)
 def env_id(request):
     return request.param
 
 
-def play(env, action):
-    """The same action until the episode ends: its last step."""
-    while True:
-        last, reward, terminated, truncated, info = env.step(action)
-        if terminated or truncated:
-            return last, reward, info
+def actions_for(env, number, seed=3):
+    """Return random actions of one environment."""
+    shape = getattr(env, "single_action_space", env.action_space).shape
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (number, *shape)).astype(np.float32)
 
 
-def episodes(env_id, seeds, actions, **kwargs):
-    """One episode from each seed, environment by environment: first and last observation, last reward and info."""
-    env = gym.make(env_id, **kwargs)
-    result = []
-    for seed, action in zip(seeds, actions, strict=True):
-        first, _ = env.reset(seed=int(seed))
-        result.append((first, *play(env, action)))
-    env.close()
-    return result
-
-
-def actions_for(env_id, number, scale=1.0):
-    size = gym.make(env_id).action_space.shape[0]
-    return (scale * np.random.default_rng(3).uniform(-1.0, 1.0, (number, size))).astype(np.float32)
-
-
+@pytest.mark.parametrize("env_id", IDS)
 def test_both_checkers_pass_without_a_warning(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Rows of obstacles of any shape are a matrix, which Stable-Baselines3's extractor and ours take.
-        warnings.filterwarnings("ignore", "Your observation obstacles has an unconventional shape")
         gymnasium_check(gym.make(env_id).unwrapped, skip_render_check=True)
         sb3_check(gym.make(env_id), warn=True, skip_render_check=True)
 
 
-def test_info_is_complete_finite_and_scalar_and_holds_the_terms_of_the_reward(env_id):
-    for *_, reward, info in episodes(env_id, range(20), actions_for(env_id, 20)):
-        assert set(info) >= INFO
-        assert set(info) >= {f"reward_{name}" for name in RewardTerms._fields}
-        for name, value in info.items():
-            assert isinstance(value, bool | float | (int if env_id in REPLANNING_TASKS else float)), name
-            assert np.isfinite(value), name
-        assert reward == pytest.approx(sum(v for k, v in info.items() if k.startswith("reward_")), abs=1e-12)
+def test_info_is_complete_finite_and_scalar_and_its_terms_add_up_to_the_reward(env_id):
+    env = gym.make(env_id)
+    for seed in range(8):
+        env.reset(seed=seed)
+        for info in play(env, 1.0, seed):
+            reward = info.pop("reward")
+            assert set(info) == INFO
+            for name, value in info.items():
+                assert isinstance(value, bool | float | int), name
+                assert np.isfinite(value), name
+            terms = sum(value for name, value in info.items() if name.startswith("reward_"))
+            assert reward == pytest.approx(terms, abs=1e-12)
 
 
-def test_the_next_episodes_are_those_of_a_reset(env_id):
-    """Autoreset draws what reset would have drawn."""
-    env, single = gym.make_vec(env_id, num_envs=3), gym.make(env_id)
-    env.reset(seed=8)
-    ended = False
-    while not ended:
-        following, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-        ended = (terminated | truncated)[2]
-    single.reset(seed=10)
-    play(single, np.zeros(single.action_space.shape, dtype=np.float32))
-    again, _ = single.reset()
-    for name, part in again.items():
-        np.testing.assert_array_equal(part, following[name][2])
+@pytest.mark.parametrize(("number", "threads"), [(3, 1), (9, 1), (9, 2)])
+def test_an_episode_is_the_same_in_any_batch_with_any_threads(env_id, number, threads):
+    single = gym.make(env_id)
+    batch = gym.make_vec(env_id, num_envs=number, threads=threads, autoreset_mode="Disabled")
+    row = number - 1
+    actions = actions_for(batch, 3)
+    first, _ = batch.reset(seed=5)
+    alone, _ = single.reset(seed=5 + row)
+    same(alone, {name: part[row] for name, part in first.items()})
+    generator = np.random.default_rng(0)
+    for action in actions:
+        others = generator.uniform(-1.0, 1.0, batch.action_space.shape)
+        others[row] = action
+        seen, reward, terminated, truncated, info = batch.unwrapped.execute_actions(others)[:5]
+        alone, mine, over, cut, values = single.step(action)
+        same(alone, {name: part[row] for name, part in seen.items()})
+        same(values, {name: info[name][row] for name in values})
+        assert (mine, over, cut) == (reward[row], terminated[row], truncated[row])
+        if over or cut or (terminated | truncated).any():
+            break
+    batch.close()
 
 
 def test_observations_share_no_memory_and_stay_in_their_space(env_id):
-    env = gym.make_vec(env_id, num_envs=16)
+    env = gym.make_vec(env_id, num_envs=6)
     before, _ = env.reset(seed=0)
     kept = {name: part.copy() for name, part in before.items()}
-    for action in actions_for(env_id, 8):
-        after, _, terminated, truncated, info = env.step(np.tile(action, (16, 1)))
+    for action in actions_for(env, 6):
+        after, _, terminated, truncated, info = env.step(np.tile(action, (6, 1)))
         ended = terminated | truncated
-        assert (info.get("_final_info", np.zeros(16, dtype=bool)) == ended).all()
+        assert (info.get("_final_info", np.zeros(6, bool)) == ended).all()
         for name, value in info.get("final_info", {}).items():
             np.testing.assert_array_equal(value[ended], info[name][ended])
         assert env.observation_space.contains(after)
         last = [each for each in info.get("final_obs", ()) if each is not None]
         assert all(env.single_observation_space.contains(each) for each in last)
         assert not any(np.shares_memory(before[name], after[name]) for name in before)
-    for name, part in kept.items():
-        np.testing.assert_array_equal(part, before[name])
+    same(kept, before)
 
 
-def test_no_element_of_the_observation_is_constant(env_id):
-    env = gym.make_vec(env_id, num_envs=64)
-    seen = [env.reset(seed=0)[0]]
-    for action in actions_for(env_id, 2):
-        seen.append(env.step(np.tile(action, (64, 1)))[0])
-    for name, part in seen[0].items():
-        assert part.dtype == np.float32
-        assert (np.ptp(np.concatenate([each[name] for each in seen]), axis=0) > 0.0).all(), name
-
-
-def test_everything_in_the_model_has_a_name(env_id):
-    model = gym.make(env_id).unwrapped.model
-    counts = {"body": model.nbody, "geom": model.ngeom, "joint": model.njnt, "actuator": model.nu}
-    for kind, count in counts.items():
-        for index in range(count):
-            assert getattr(model, kind)(index).name, f"{kind} {index}"
-
-
-def test_a_pickled_environment_is_as_it_was_made_whatever_becomes_of_the_arguments(env_id):
+def test_a_pickled_environment_goes_on_as_the_original(env_id):
+    """Whatever becomes of the arguments."""
     weights = {"smoothness": 0.2}
-    made = gym.make(env_id, reward_weights=weights).unwrapped
-    several = gym.make_vec(env_id, num_envs=2, reward_weights=weights)
+    env = gym.make_vec(env_id, num_envs=2, reward_weights=weights)
     weights["smoothness"] = 5.0
-    for env in (made, several):
-        again = pickle.loads(pickle.dumps(env))
-        assert again.task.weights == env.task.weights
-        wanted = env.reset(seed=4)[0]
-        for name, part in again.reset(seed=4)[0].items():
-            np.testing.assert_array_equal(part, wanted[name])
-
-
-def test_what_a_step_returns_may_be_written_to(env_id):
-    """As a wrapper may that ends episodes by a limit of its own."""
-    env, same = (gym.make_vec(env_id, num_envs=3, threads=1) for _ in range(2))
-    env.reset(seed=1)
-    same.reset(seed=1)
-    for _ in range(4):
-        results = [each.step(np.zeros(env.action_space.shape)) for each in (env, same)]
-        for mine, theirs in zip(*(result[1:4] for result in results), strict=True):
-            np.testing.assert_array_equal(mine, theirs)
-            mine[:] = 1
-
-
-def test_vector_environment_names_its_autoreset_mode_and_counts_physics_steps(env_id):
-    env = gym.make_vec(env_id, num_envs=4)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    env.reset(seed=0)
-    assert env.physics_steps == 0
-    _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-    assert env_id not in TASKS or (terminated.all() and not truncated.any())
-    assert env.physics_steps >= info["duration"].sum() / env.model.opt.timestep
+    env.reset(seed=4)
+    actions = actions_for(env, 4)
+    env.step(np.tile(actions[0], (2, 1)))
+    again = pickle.loads(pickle.dumps(env))
+    assert again.unwrapped.task.weights.smoothness == 0.2
+    assert again.unwrapped.task == env.unwrapped.task
+    for action in actions[1:]:
+        first, second = (each.step(np.tile(action, (2, 1))) for each in (env, again))
+        same(first[0], second[0])
+        np.testing.assert_array_equal(first[1], second[1])
 
 
 def test_a_reset_mask_resets_only_those(env_id):
@@ -163,3 +117,64 @@ def test_a_reset_mask_resets_only_those(env_id):
     for name, part in before.items():
         np.testing.assert_array_equal(part[~mask], after[name][~mask])
     assert not np.array_equal(before["goal"][mask], after["goal"][mask])
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_failed_reset_changes_nothing(env_id, begun):
+    usual, refused = gym.make(env_id), gym.make(env_id)
+    seed = None if begun else 7
+    for env in (usual, refused):
+        if begun:
+            env.reset(seed=0)
+    for options in ({"start": "here"}, {"speed": 1.0}, {"goal": np.full(99, np.nan)}):
+        with pytest.raises(ValueError):
+            refused.reset(seed=9, options=options)
+    zero = np.zeros(usual.action_space.shape, np.float32)
+    if begun:
+        same(usual.step(zero)[0], refused.step(zero)[0])
+    same(usual.reset(seed=seed)[0], refused.reset(seed=seed)[0])
+    same(usual.step(zero)[4], refused.step(zero)[4])
+
+
+def test_scenes_are_those_of_the_twin(env_id):
+    assert twin_of(twin_of(env_id)) == twin_of(env_id)
+    mine, theirs = (gym.make_vec(each, num_envs=3).reset(seed=3)[0] for each in (env_id, twin_of(env_id)))
+    same({name: mine[name] for name in theirs if name in mine}, {n: theirs[n] for n in theirs if n in mine})
+
+
+def test_any_id_with_the_same_entry_point_is_an_environment_like_these():
+    name = "tests/Own-v0"
+    gym.register(
+        name,
+        entry_point="viapoint.envs.env:ReachEnv",
+        vector_entry_point="viapoint.envs.vector_env:ReachVectorEnv",
+        kwargs={"n_obstacles": 2, "n_via": 2},
+    )
+    try:
+        gymnasium_check(gym.make(name).unwrapped, skip_render_check=True)
+        assert gym.make_vec(name, num_envs=2).unwrapped.task.n_via == 2
+    finally:
+        del gym.registry[name]
+
+
+@pytest.mark.parametrize("broken", [1e9, np.nan])
+def test_broken_physics_ends_its_episode_alone(env_id, broken, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file in the present folder
+    env = gym.make_vec(env_id, num_envs=3, threads=1)
+    actions = np.zeros(env.action_space.shape)
+    results = []
+    for spoilt in (False, True):
+        env.reset(seed=4)
+        if spoilt:
+            env.unwrapped._episodes[0].simulator.batch.bind("qvel")[1] = broken
+        results.append(env.step(actions))
+        assert env.observation_space.contains(results[-1][0])
+        assert np.isfinite(results[-1][1]).all()
+    (_, whole, *_, before), (_, reward, terminated, _, info) = results
+    assert list(info["unstable"]) == [False, True, False]
+    assert not before["unstable"].any()
+    assert terminated[1]
+    assert not info["is_success"][1]
+    np.testing.assert_array_equal(reward[[0, 2]], whole[[0, 2]])
+    *_, after = env.step(actions)
+    assert not after["unstable"].any()  # the next episode is sound

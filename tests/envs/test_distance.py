@@ -1,12 +1,10 @@
 """Signed distances of points and their gradients are those of independent libraries and of differences."""
 
-import sys
-from pathlib import Path
-
 import coal
 import mujoco
 import numpy as np
 import pytest
+from random_shapes import random_shape
 from scipy.spatial.transform import Rotation
 
 from viapoint.envs.geometry.compiled import compiled
@@ -26,9 +24,6 @@ from viapoint.envs.geometry.shapes import (
     Sphere,
     as_obstacle,
 )
-
-sys.path.append(str(Path(__file__).parent))
-from random_shapes import random_shape
 
 ALL = pytest.mark.parametrize("kind", KINDS)
 CONVEX = pytest.mark.parametrize("kind", KINDS[:-1])

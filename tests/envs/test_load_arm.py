@@ -1,38 +1,21 @@
 """Arms that are loaded from MJCF files are those of the file."""
 
 import re
-import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from self_contact import check_contact_implies_overlap, least_pair_distance
 
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
 
-sys.path.append(str(Path(__file__).parent))
-from self_contact import check_contact_implies_overlap, least_pair_distance
-
-UR5E = Path(__file__).parents[3] / "docs" / "ur5e.xml"
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 TEXT = UR5E.read_text(encoding="utf-8")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
 CUBE = " ".join(f"{x} {y} {z}" for x, y, z in np.ndindex(2, 2, 2))
-FETCH = {
-    "hand_site": "robot0:grip",
-    "joints": [
-        f"robot0:{name}_joint"
-        for name in (
-            "shoulder_pan", "shoulder_lift", "upperarm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll",
-        )
-    ],
-    "joint_range": [(-1.6, 1.6), (-1.2, 1.5), (-3.1, 3.1), (-2.2, 2.2), (-3.1, 3.1), (-2.1, 2.1), (-3.1, 3.1)],
-    "torque_limit": (33.8, 131.7, 76.9, 66.1, 29.3, 25.7, 7.3),
-    "velocity_limit": 1.5,
-    "home": (0.0, -0.5, 0.0, 1.3, 0.0, 0.77, 0.0),
-}  # fmt: skip
 
 
 def ur5e(file=TEXT, **changes):
@@ -285,16 +268,3 @@ def test_files_that_lack_something_are_refused(pattern, other):
     assert number
     with pytest.raises(ValueError):
         ur5e(text)
-
-
-@pytest.mark.skipif(find_spec("gymnasium_robotics") is None, reason="gymnasium-robotics is not installed")
-def test_the_fetch_of_gymnasium_robotics():
-    assets = Path(find_spec("gymnasium_robotics").submodule_search_locations[0]) / "envs" / "assets"
-    path = assets / "fetch" / "reach.xml"
-    for missing in ("joint_range", "torque_limit"):
-        with pytest.raises(ValueError):
-            load_arm(path, **{**FETCH, missing: None})
-    arm = load_arm(path, **FETCH)
-    assert least_pair_distance(arm, arm.home).min() > 0.0
-    assert "robot0:base_link" in arm.group_names
-    check_contact_implies_overlap(arm)

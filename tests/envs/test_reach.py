@@ -1,183 +1,237 @@
-"""What movements lead to."""
+"""Outcomes of whole movements."""
+
+import os
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import ENDS, GOAL, OBSTACLES, PANDA, START, WALL, given, post, same
+from random_shapes import random_shape
 
-from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.mdp.rewards import RewardWeights
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import GOAL_TOLERANCE
+from viapoint.envs import Box, Task
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.outcome import TOLERANCES
+from viapoint.envs.plans import Plan
+from viapoint.envs.scenes.scene import resting
 
-START, GOAL = np.array([-0.3, 0.4]), np.array([0.1, 0.4])
-
-
-def make(obstacles=(), **kwargs):
-    """An environment in a given scene."""
-    rows = np.array(obstacles, dtype=float).reshape(-1, 5)
-    env = gym.make("viapoint/PlanarObstacles-v0", **kwargs).unwrapped
-    env.reset(seed=0, options={"start": START, "goal": GOAL, "obstacles": rows})
-    return env
+SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
+MOVEMENTS = int(os.environ.get("VIAPOINT_TEST_MOVEMENTS", "200"))
+"""Random movements for each arm and shape."""
 
 
 def through(env, via, duration=0.85):
-    """The action whose movement passes `via`."""
+    """Return the action whose movement passes `via`."""
     waypoints = np.stack((START, via, GOAL))
-    return env.action_layout.encode(Plan(waypoints, np.full(2, duration / 2))).astype(np.float32)
-
-
-WALL = [[-0.1, 0.4, 0.0, 0.1, 0.008]]
-"""A row of lights across the middle."""
+    return env.task.action.encode(Plan(waypoints, np.full(2, duration / 2))).astype(np.float32)
 
 
 def test_a_straight_movement_with_nothing_in_the_way_succeeds():
-    env = make()
-    _, reward, *_, info = env.step(np.zeros(3, dtype=np.float32))
+    env, _ = given()
+    _, reward, *_, info = env.step(np.zeros(3, np.float32))
     assert info["is_success"]
     assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-9)
     assert info["path_length"] == pytest.approx(0.4, abs=1e-3)
     assert info["peak_speed"] == pytest.approx(1.875 * 0.4 / info["duration"], rel=2e-3)
     assert info["jerk_cost"] == pytest.approx(360.0 * 0.4**2 / info["duration"] ** 5, rel=1e-9)
-    assert info["first_contact_time"] == -1.0
-    assert info["min_clearance"] == 1.0
-    assert reward > 1.0
-
-
-def test_the_way_round_succeeds_where_the_straight_line_crashes():
-    env = make(WALL)
-    *_, crash = env.step(np.zeros(3, dtype=np.float32))
-    assert crash["collision"]
-    assert 0.2 < crash["first_contact_time"] < crash["duration"]
-    env = make(WALL)
-    action = through(env, np.array([-0.1, 0.54]))
-    *_, around = env.step(action)
-    assert around["is_success"]
-    assert 0.0 < around["min_clearance"] < 0.04
-    np.testing.assert_allclose(env.last_plan.waypoints[1], [-0.1, 0.54], atol=1e-6)
+    assert (info["first_contact_time"], info["min_clearance"]) == (-1.0, 1.0)
+    assert reward > 0.5
 
 
 def test_rewards_are_ordered_as_a_person_would_order_them():
-    """A smooth way round, a wide one, a refused one, a crash; and a graze above a crash in the middle."""
-    env = make(WALL)
-    smooth, wide, graze = (through(env, np.array([-0.1, y])) for y in (0.53, 0.59, 0.515))
-    refused, crash = np.array([-1.0, 1.0, 0.0], np.float32), np.zeros(3, np.float32)
-    rewards = []
-    for action in (smooth, wide, refused, graze, crash):
-        env = make(WALL)
+    """Smooth way round, wide way round, crash; only a plan out of reach does not start."""
+    outcomes = []
+    for via in ((-0.1, 0.54), (-0.1, 0.58), None):
+        env, _ = given(obstacles=[WALL])
+        action = np.zeros(3, np.float32) if via is None else through(env, np.array(via))
         _, reward, *_, info = env.step(action)
-        rewards.append((reward, info["is_success"], info["reachable"], info["collision"]))
-    assert [r[1:] for r in rewards] == [
-        (True, True, False), (True, True, False), (False, False, False), (False, True, True), (False, True, True),
-    ]  # fmt: skip
-    values = [r[0] for r in rewards]
-    assert values == sorted(values, reverse=True)
+        outcomes.append((reward, info["is_success"], info["collision"]))
+        if via is not None:
+            np.testing.assert_allclose(env.last_plan.waypoints[1], via, atol=1e-6)
+    rewards = [each[0] for each in outcomes]
+    assert rewards == sorted(rewards, reverse=True)
+    assert [each[1:] for each in outcomes] == [(True, False), (True, False), (False, True)]
+    assert 0.2 < info["first_contact_time"] < info["duration"]
 
 
 def test_a_plan_out_of_reach_is_a_failed_movement_that_does_not_start():
-    env = make(WALL)
-    steps = env.physics_steps
-    observation, _, terminated, _, info = env.step(np.array([-1.0, 1.0, 0.0], dtype=np.float32))
+    env, _ = given(obstacles=[WALL])
+    observation, _, terminated, _, info = env.step(np.array([-1.0, 1.0, 0.0], np.float32))
     assert terminated
-    assert not info["reachable"]
-    assert not info["is_success"]
-    assert not info["collision"]
-    assert env.physics_steps == steps
-    np.testing.assert_allclose(observation["hand"], START, atol=1e-6)
+    assert not any(info[name] for name in ("reachable", "is_success", "collision"))
+    assert env.physics_steps == 0
+    np.testing.assert_allclose(observation["hand"][:2], START, atol=1e-6)
 
 
-def test_a_thin_bar_is_not_tunnelled_at_the_highest_speed():
-    """The fastest movements of the action space against the thinnest bar, at 200 places along the line."""
-    number = 200
-    env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=number, n_obstacles=1).unwrapped
-    start, goal = np.array([-0.32, 0.42]), np.array([0.13, 0.42])
-    bars = np.zeros((number, 1, 5))
-    bars[:, 0, 0] = np.linspace(-0.25, 0.06, number)
-    bars[:, 0, 1:] = (0.42, 0.0, 0.06, 0.001)
-    env.reset(seed=0, options={"start": start, "goal": goal, "obstacles": bars})
+def test_thin_walls_are_not_tunnelled_at_the_highest_speed():
+    """The fastest movements of the action space against the thinnest wall, at 100 places along the line."""
+    number = 100
+    env = gym.make_vec(OBSTACLES, num_envs=number, n_obstacles=1).unwrapped
+    places = np.linspace(-0.22, 0.03, number)
+    walls = [[Box((0.0005, 0.1, 0.04), position=(x, 0.4, 0.0))] for x in places]
+    env.reset(seed=0, options={**ENDS, "obstacles": walls})
     action = np.zeros((number, 3))
     action[:, 2] = -1.0
     *_, info = env.step(action)
     assert info["collision"].all()
 
 
-def test_contact_and_clearance_agree_at_every_step():
-    env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=100).unwrapped
-    env.reset(seed=3)
-    *_, info = env.step(np.random.default_rng(0).uniform(-1, 1, (100, 3)))
-    touched = 0
-    for i, rollout in enumerate(env.last_rollout):
-        # contact is found at the state before a step, clearance is that of the state after it
-        np.testing.assert_array_equal(rollout.contact[1:], rollout.clearance[:-1] < 0.0)
-        assert rollout.contact.any() == info["collision"][i]
-        touched += rollout.contact.any()
-    assert 20 < touched < 80
+@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize("arm", ["planar", "panda"])
+def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm, kind):
+    """In MuJoCo at every physics step of random movements past a random shape."""
+    rng = np.random.default_rng(7)
+    number = min(MOVEMENTS, 50)
+    # Not all kinds have default families in the plane.
+    kinds = (kind, "box", "cylinder")
+    env = gym.make_vec(
+        PANDA if arm == "panda" else OBSTACLES,
+        num_envs=number,
+        n_obstacles=1,
+        shapes=tuple(dict.fromkeys(kinds)),
+        families="clutter",
+        whole_arm=arm == "planar",
+        space="joints",
+        autoreset_mode="Disabled",
+    ).unwrapped
+    env.reset(seed=0)
+    touched = clear = 0
+    for _ in range(max(MOVEMENTS // number, 1)):
+        scenes = scenes_with(env, kind, rng)
+        env.begin(scenes)
+        decision = env.execute_actions(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        info = decision.info
+        clearance = np.minimum(info["min_clearance"], info["self_clearance"])
+        assert (clearance[info["collision"]] < 0.0).all()
+        assert not info["collision"][clearance >= 0.0].any()
+        touched += info["collision"].sum()
+        clear += (clearance >= 0.0).sum()
+    assert min(touched, clear) > 0.02 * MOVEMENTS
+
+
+def scenes_with(env, kind, rng):
+    """Return free configurations and a random shape of a kind within reach in each scene."""
+    task = Task.of(arm=env.arm, space="joints", n_obstacles=0)
+    scenes = task.sampler()([np.random.default_rng(seed) for seed in rng.integers(2**31, size=env.num_envs)])
+    shapes = []
+    for start in scenes.start:
+        hand = env.arm.hand(start)
+        shape = random_shape(kind, rng)
+        away = rng.normal(size=3) * (1.0, 1.0, 0.3)
+        away *= rng.uniform(0.15, 0.5) / np.linalg.norm(away)
+        if kind == "half_space":
+            normal = -away / np.linalg.norm(away)
+            values = shape.facing(normal, position=hand + away).to_dict()
+        else:
+            values = {**shape.to_dict(), "position": (hand + away).tolist()}
+        shapes.append([values])
+    return resting(scenes.start, scenes.goal, pack(shapes, 1))
 
 
 def test_the_rollout_is_the_movement_that_info_tells_of():
-    env = make(WALL)
+    env, _ = given(obstacles=[WALL])
     *_, info = env.step(through(env, np.array([-0.1, 0.54])))
     rollout = env.last_rollout
-    np.testing.assert_allclose(np.linalg.norm(rollout.hand[-1] - GOAL), info["goal_error"])
-    assert info["goal_error"] < GOAL_TOLERANCE
+    assert np.linalg.norm(rollout.hand[-1, :2] - GOAL) == pytest.approx(info["goal_error"])
+    assert info["goal_error"] < TOLERANCES["hand"].goal
     assert rollout.clearance.min() == pytest.approx(info["min_clearance"])
-    error = np.linalg.norm(rollout.hand - rollout.planned, axis=-1)
+    error = np.linalg.norm(rollout.hand[:, :2] - rollout.planned, axis=-1)
     assert np.sqrt((error**2).mean()) == pytest.approx(info["tracking_error"])
     assert info["tracking_error"] < 2e-3
+    assert len(rollout.time) == env.physics_steps
 
 
-def test_short_movements_cost_fewer_physics_steps():
-    steps = []
-    for duration in (-1.0, 1.0):
-        env = make()
-        env.step(np.array([0.0, 0.0, duration], dtype=np.float32))
-        steps.append(env.physics_steps)
-    assert steps[0] == pytest.approx(350, abs=2)
-    assert steps[1] == pytest.approx(650, abs=2)
+def test_joints_track_references_within_a_milliradian_and_succeed_at_the_medium_duration():
+    env = gym.make_vec("viapoint/PandaReach-v0", num_envs=24).unwrapped
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros(env.action_space.shape))
+    free = ~info["collision"]
+    assert free.mean() > 0.7
+    assert info["is_success"][free].all()
+    assert (info["tracking_error"][free] < 1e-3).all()
+    for rollout, moved in zip(env.last_rollout, free, strict=True):
+        assert not moved or np.abs(rollout.joints - rollout.planned).max() < 1e-3
 
 
 def test_components_beyond_one_are_clipped():
     outcomes = []
     for size in (1.0, 7.0):
-        env = make()
-        *_, info = env.step(np.array([0.0, 0.0, size], dtype=np.float32))
-        outcomes.append(info)
+        env, _ = given()
+        outcomes.append(env.step(np.array([0.0, 0.0, size], np.float32))[4])
     assert outcomes[0] == outcomes[1]
 
 
-def test_weights_scale_their_terms():
-    action = np.array([0.1, 0.3, 0.2], dtype=np.float32)
-    *_, usual = make(WALL).step(action)
-    *_, double = make(WALL, reward_weights={"smoothness": 2 * RewardWeights().smoothness}).step(action)
-    assert double["reward_smoothness"] == pytest.approx(2 * usual["reward_smoothness"])
-    assert double["reward_duration"] == usual["reward_duration"]
-
-
-def test_more_via_points_and_learned_timing():
-    for n_via, timing in ((2, "optimal"), (3, "learned")):
-        env = make(n_via=n_via, timing=timing)
-        *_, info = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-        assert info["is_success"]
-        assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_a_wrapped_batch_takes_scenes_in_a_batch():
-    env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=3)
-    goals = np.array([[0.1, 0.4], [0.05, 0.5], [0.0, 0.3]])
-    observation, _ = env.reset(options={"start": START, "goal": goals, "obstacles": np.zeros((0, 5))})
-    np.testing.assert_allclose(observation["goal"], goals, atol=1e-7)
-    assert isinstance(env.unwrapped.scenes, Scenes)
-    *_, info = env.step(np.zeros((3, 3)))
-    assert info["is_success"].all()
-
-
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarObstacles-v0", "viapoint/PlanarWholeArm-v0"])
-def test_any_success_is_worth_more_than_any_failure(env_id):
-    env = gym.make_vec(env_id, num_envs=256)
+@pytest.mark.parametrize(("n_via", "timing"), [(0, "optimal"), (2, "optimal"), (3, "learned")])
+@pytest.mark.parametrize("space", ["hand", "joints"])
+def test_zero_actions_are_straight_minimum_jerk_movements(n_via, timing, space):
+    env = gym.make("viapoint/PlanarReach-v0", n_via=n_via, timing=timing, space=space).unwrapped
     env.reset(seed=1)
-    rng, rewards, success = np.random.default_rng(1), [], []
-    for _ in range(3):
-        _, reward, *_, info = env.step(rng.uniform(-1.0, 1.0, (256, 3)))
-        rewards.append(reward)
-        success.append(info["is_success"])
-    reward, success = np.concatenate(rewards), np.concatenate(success)
-    assert reward[success].min() > reward[~success].max()
+    *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-6)
+    rollout = env.last_rollout
+    line = rollout.planned[-1] - rollout.planned[0]
+    across = rollout.planned - rollout.planned[0]
+    across -= np.outer(across @ line, line) / (line @ line)
+    assert np.abs(across).max() < 1e-9
+
+
+@pytest.mark.parametrize("env_id", [OBSTACLES, "viapoint/PlanarWholeArm-v0", PANDA])
+def test_any_success_is_worth_more_than_any_failure(env_id):
+    number = 16 if env_id == PANDA else 256
+    env = gym.make_vec(env_id, num_envs=number)
+    env.reset(seed=1)
+    rng = np.random.default_rng(1)
+    _, reward, *_, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape) * (number > 16))
+    success = info["is_success"]
+    if success.any():
+        assert reward[success].min() > reward[~success].max()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, -0.9])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_turned_and_mirrored_obstacles_have_turned_and_mirrored_distances_along_the_way(turn, mirrored):
+    """An arm without an asymmetry of its own: hand and posts turn about the vertical axis of the first joint."""
+    way = np.array([1.0, -1.0]) if mirrored else np.ones(2)
+    cos, sin = np.cos(turn), np.sin(turn)
+
+    def moved(points):
+        points = np.asarray(points) * way
+        return points @ np.array([[cos, sin], [-sin, cos]])
+
+    panda = gym.make(
+        "viapoint/PandaObstacles-v0", shapes=("cylinder", "sphere"), families="clutter"
+    ).unwrapped
+    start = np.array([-0.3, 0.4, 0.0, -1.8, 0.0, 2.0, 0.0])
+    goal = np.array([0.4, 0.6, 0.0, -1.5, 0.0, 2.1, 0.0])
+    sign = np.where(np.arange(7) % 2 == 0, -1.0 if mirrored else 1.0, 1.0)
+    shift = np.array([turn, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    results = []
+    for change in (False, True):
+        places = [(0.75, 0.35), (0.2, -0.7)]
+        places = moved(places) if change else np.array(places)
+        obstacles = [post(*place, 0.03) for place in places]
+        ends = [sign * end + shift if change else end for end in (start, goal)]
+        panda.reset(options={"start": ends[0], "goal": ends[1], "obstacles": obstacles})
+        action = np.array([0.1, -0.2, 0.3, 0.1, -0.3, 0.2, 0.0, 0.2])
+        if change:
+            action[:7] *= sign
+        results.append(panda.step(action.astype(np.float32))[4])
+    usual, other = results
+    for name in ("is_success", "collision", "reachable"):
+        assert usual[name] == other[name]
+    for name in ("duration", "jerk_cost", "path_length"):
+        assert other[name] == pytest.approx(usual[name], rel=1e-3)
+    assert other["min_clearance"] == pytest.approx(usual["min_clearance"], abs=4e-3)
+
+
+def test_executed_actions_are_those_of_their_plans():
+    results = []
+    for by_plan in (False, True):
+        env = gym.make_vec(OBSTACLES, num_envs=4, threads=1).unwrapped
+        env.reset(seed=2)
+        actions = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3))
+        space, scenes = env.task.space, env.scenes
+        ends = space.coordinates(scenes.start), space.coordinates(scenes.goal)
+        plan = env.task.action.decode(actions, *ends)
+        results.append(env.execute_plan(plan) if by_plan else env.execute_actions(actions))
+    same(results[0].info, results[1].info)
+    np.testing.assert_allclose(env.task.action.encode(plan), actions, atol=1e-9)

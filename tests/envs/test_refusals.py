@@ -3,107 +3,50 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
-from revised import GOAL, JUMP, MOVING, NO_ROWS, OTHER, START
+from episodes import JUMP, MOVING, OBSTACLES, PANDA, STEP
 
-from viapoint.envs.actions.via_points import ActionLayout, Plan
-from viapoint.envs.mdp.rewards import RewardWeights, StepRewardWeights
-from viapoint.envs.mdp.task import family_sampler
+from viapoint.envs import ReachVectorEnv, Task
+from viapoint.envs.plans import ActionLayout, Plan
 from viapoint.envs.record_video import RecordMovements
-from viapoint.envs.scenes.config import SceneDistribution, SpaceDistribution
-from viapoint.envs.scenes.families import register_scene_family
+from viapoint.envs.rewards import RewardWeights
 
-PLANAR, STEP, SPACE = (
-    f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarObstaclesStep", "PandaObstacles")
-)
-KINDS = (PLANAR, STEP, MOVING)
+KINDS = (OBSTACLES, STEP, MOVING, PANDA)
 ANY_ENVIRONMENT = [
-    ({"speed": 1.0}, TypeError),
-    ({"workers": 2}, TypeError),
-    ({"uniform_share": 0.5}, TypeError),
-    ({"render_mode": "rgb"}, ValueError),
-    ({"width": 0}, ValueError),
-    ({"height": -3}, ValueError),
-    ({"width": 2.5}, ValueError),
-    ({"height": True}, ValueError),
-    ({"arm": "ur5"}, ValueError),
-    ({"whole_arm": "yes"}, TypeError),
-    ({"n_obstacles": -1}, ValueError),
-    ({"n_obstacles": (9, 24)}, ValueError),
-    ({"threads": -1}, ValueError),
-    ({"reward_weights": {"speed": 1.0}}, ValueError),
-    ({"reward_weights": {"success": -1.0}}, ValueError),
-    ({"reward_weights": {1: 2.0, "speed": 1.0}}, ValueError),
-    *(({"duration_range": pair}, ValueError) for pair in (("0.5", "1"), (True, 2), (0.5, None), 3, "ab")),
-    *(({"duration_range": pair}, ValueError) for pair in ((1.0,), (1 + 0j, 2.0), (1.0, 0.5), (0.0, 0.5))),
-]
+    *(({name: 1.0}, TypeError) for name in ("speed", "workers", "uniform_share", "dimension")),
+    ({"render_mode": "rgb"}, ValueError), ({"width": 0}, ValueError), ({"height": -3}, ValueError),
+    ({"width": 2.5}, ValueError), ({"height": True}, ValueError), ({"threads": -1}, ValueError),
+    ({"arm": "ur5"}, ValueError), ({"arm": 5}, ValueError), ({"space": "hands"}, ValueError),
+    ({"whole_arm": "yes"}, TypeError), ({"moving_obstacles": 1}, TypeError), ({"shapes": 3}, TypeError),
+    ({"shapes": ()}, ValueError), ({"shapes": "pyramid"}, ValueError), ({"shapes": ("box", "box")}, ValueError),
+    ({"families": 3}, TypeError), ({"families": ()}, ValueError), ({"families": "maze"}, ValueError),
+    *(({"n_obstacles": number}, ValueError) for number in (-1, 1.5, True, (3, 2), (40, 50), (0, 257), "many")),
+    *(({"n_via": number}, ValueError) for number in (-1, 1.5, 17, 10**9, True)),
+    ({"timing": "fast"}, ValueError), ({"margin": -0.1}, ValueError), ({"horizon": 0.0}, ValueError),
+    ({"horizon": np.nan}, ValueError), ({"n_jumps": 9}, ValueError), ({"n_jumps": (1, 2, 3)}, ValueError),
+    *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"})),
+    ({"reward_weights": {"speed": 1.0}}, ValueError), ({"reward_weights": {"success": -1.0}}, ValueError),
+    ({"reward_weights": {1: 2.0}}, ValueError), ({"reward_weights": 3.0}, ValueError),
+    *(({"duration_range": pair}, ValueError) for pair in (
+        ("0.5", "1"), (True, 2), (0.5, None), 3, "ab", (1.0,), (1 + 0j, 2.0), (1.0, 0.5), (0.0, 0.5), (1.0, 100.0),
+    )),
+    *(({"autoreset_mode": mode}, ValueError) for mode in ("sometimes", None, 3)),
+]  # fmt: skip
 ONE_ENVIRONMENT = [
-    (PLANAR, {"n_via": 10**9}),
-    (PLANAR, {"timing": "fast"}),
-    (PLANAR, {"reward_weights": StepRewardWeights()}),
-    (MOVING, {"reward_weights": StepRewardWeights()}),
-    (STEP, {"reward_weights": RewardWeights()}),
+    (PANDA, {"space": "hand"}), (PANDA, {"duration_range": (0.5, 2.0)}),
+    (PANDA, {"families": "gate", "n_obstacles": 2}),
+    (PANDA, {"families": "gate", "shapes": "sphere"}), (OBSTACLES, {"families": "shelf"}), (OBSTACLES, {"n_jumps": 1}),
+    (OBSTACLES, {"moving_obstacles": True}), (MOVING, {"timing": "learned"}), (STEP, {"timing": "learned"}),
     *((STEP, {"control_step": step}) for step in (0.0, -0.04, 0.003, 2.0, np.nan, "fast", True)),
-    (JUMP, {"horizon": 0.001}),
-    (JUMP, {"horizon": np.nan}),
-    (JUMP, {"margin": -0.1}),
-    (JUMP, {"decide_at": ("noon",)}),
-    (JUMP, {"decide_at": "target"}),
-    (JUMP, {"timing": "learned"}),
-    (JUMP, {"n_jumps": 9}),
-    (JUMP, {"n_jumps": (1, 2, 3)}),
-]
-ENDS = {"start": START, "goal": GOAL}
-POST = [-0.1, 0.6, 0.0, 0.0, 0.03]
-PARTS_OF_SCENES = [{"goal": [2.0, 0.0]}, {"start": [0.0, 0.05]}, {"start": START, "goal": START}]
-SCENES = [
-    {"goal": [2.0, 0.0]},
-    {"start": [0.0, 0.05]},
-    {"goal": START, "obstacles": [[-0.1, 0.4, 0.0, 0.1, 0.01]]},
-    {"obstacles": [[-0.3, 0.41, 0.0, 0.0, 0.02]]},
-    {"obstacles": [[-0.1, 0.4, 0.0, 0.1]]},
-    {"obstacles": np.zeros((6, 5))},
-    {"obstacles": [[-0.1, 0.4, 0.0, 0.1, -0.01]]},
-    {"obstacles": [[-0.1, 0.4, 0.0, 0.1, 0.0]]},
-    {"obstacles": [[-0.1, 0.4, 0.0, 0.9, 0.01]]},
-    {"start": [np.nan, 0.4]},
-    {"start": [0.1, 0.2, 0.3]},
-    {"start": [-0.3 + 0.1j, 0.4]},
-    {"target": [0.1, 0.2]},
-]
-CHANGES = [
-    {"jumps": [[0.0, *OTHER]]},
-    {"jumps": [[-0.1, *OTHER]]},
-    {"jumps": [[0.5, *OTHER], [0.4, *GOAL]]},
-    {"jumps": [[99.0, *OTHER]]},
-    {"jumps": [[0.2, 3.0, 0.0]]},
-    {"jumps": [[0.2, 3.0]]},
-    {"jumps": [[0.2, np.nan, 0.3]]},
-    {"jumps": [["soon", 0.0, 0.3]]},
-    {"courses": [[0.1, 0.0, 0.0, 0.1, 0.0]]},
-    {"obstacles": [[*START, 0.0, 0.0, 0.03]], "courses": [[0.1, 0.0, 0.0, 0.1, 0.0]]},
-    {"obstacles": [POST], "courses": [[0.1, 0.0, 0.0, 0.2, 0.0]]},
-    {"obstacles": [POST], "courses": [[3.0, 0.0, 0.0, 3.0, 0.0]]},
-    {"obstacles": [[*OTHER, 0.0, 0.0, 0.03]], "jumps": [[0.2, *OTHER]]},
-]
-
-
-def both(env_id):
-    """An environment and a batch after a reset."""
-    for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1)):
-        env.reset(seed=0)
-        yield env
-        env.close()
+]  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore:.*render_mode='rgb' that is not")  # Gymnasium's, before our error
 @pytest.mark.parametrize("env_id", KINDS)
 @pytest.mark.parametrize(("kwargs", "error"), ANY_ENVIRONMENT)
 def test_arguments_of_any_environment(env_id, kwargs, error):
-    with pytest.raises(error):
-        gym.make(env_id, **kwargs)
-    with pytest.raises(error):
-        gym.make_vec(env_id, num_envs=2, **kwargs)
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(error):
+            make(env_id, **kwargs)
 
 
 @pytest.mark.parametrize(("env_id", "kwargs"), ONE_ENVIRONMENT)
@@ -112,9 +55,25 @@ def test_arguments_of_one_environment(env_id, kwargs):
         gym.make(env_id, **kwargs)
 
 
-def test_an_unknown_argument_is_answered_with_those_that_there_are():
-    with pytest.raises(TypeError, match=r"'speed'; allowed are arm, .*n_obstacles"):
-        gym.make(PLANAR, speed=3)
+@pytest.mark.parametrize("number", [0, -1, 1.5, True, "two"])
+def test_numbers_of_environments(number):
+    with pytest.raises(ValueError):
+        ReachVectorEnv(number)
+
+
+def test_an_unknown_argument_is_the_error_that_others_raise():
+    """TorchRL looks for these words."""
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(TypeError, match="got an unexpected keyword argument 'speed'"):
+            make(OBSTACLES, speed=3)
+
+
+def both(env_id):
+    """Yield an environment and a batch after a reset."""
+    for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2, threads=1).unwrapped):
+        env.reset(seed=0)
+        yield env
+        env.close()
 
 
 @pytest.mark.parametrize("env_id", KINDS)
@@ -122,7 +81,7 @@ def test_actions(env_id):
     for env in both(env_id):
         zero = np.zeros(env.action_space.shape)
         bad = [zero.astype(kind) for kind in (str, bool, complex, object)]
-        bad += [zero + np.nan, zero - np.inf, zero[..., :-1], "north", [[0.0], [0.0, 0.0]]]
+        bad += [zero + np.nan, zero - np.inf, zero[..., :-1], "north", [[0.0], [0.0, 0.0]], None]
         for action in bad:
             with pytest.raises(ValueError):
                 env.step(action)
@@ -135,7 +94,7 @@ def test_seeds_options_and_masks(env_id):
         for options in (5, "abc", [1, 2], 0, np.zeros(2), {"speed": 3}, {"jumps": "soon"}):
             with pytest.raises(ValueError):
                 env.reset(options=options)
-        for seed in (-1, 1.5, "a", np.array(1.5), np.array([[1]])):
+        for seed in (-1, 1.5, "a", np.array(1.5), np.array([[1]]), [1, 2, 3]):
             with pytest.raises(ValueError):
                 env.reset(seed=seed)
     for mask in ([True], [True, 1, 0], np.zeros(2, bool), "all"):
@@ -145,46 +104,12 @@ def test_seeds_options_and_masks(env_id):
         gym.make_vec(env_id, num_envs=2).reset(options={"reset_mask": np.array([True, False])})
 
 
-def test_plans_are_for_the_twin_of_an_environment_with_steps():
-    env = gym.make_vec(STEP, num_envs=2).unwrapped
-    env.reset(seed=0)
-    with pytest.raises(TypeError):
-        env.execute_plan(env.last_plan)
-
-
 @pytest.mark.parametrize("env_id", KINDS)
 def test_steps_before_a_reset(env_id):
     for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2).unwrapped):
-        with pytest.raises(gym.error.ResetNeeded):
-            env.step(np.zeros(env.action_space.shape))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "options"),
-    [
-        *((PLANAR, each) for each in PARTS_OF_SCENES),
-        *((PLANAR, {**ENDS, **NO_ROWS, **each}) for each in SCENES),
-        *((MOVING, {**ENDS, **NO_ROWS, **each}) for each in CHANGES),
-    ],
-)
-def test_impossible_scenes_change_nothing(env_id, options):
-    usual, refused = (gym.make(env_id).unwrapped for _ in range(2))
-    for env in (usual, refused):
-        env.reset(seed=0)
-    for seed in (9, None):
-        with pytest.raises(ValueError):
-            refused.reset(seed=seed, options=options)
-    for now, then in zip(refused.batch.scenes, usual.batch.scenes, strict=True):
-        np.testing.assert_array_equal(now, then)
-    expected, found = (env.reset()[0] for env in (usual, refused))
-    for name, part in expected.items():
-        np.testing.assert_array_equal(found[name], part)
-
-
-def test_the_reason_names_what_is_in_the_way():
-    rows = [[0.4, 0.4, 0.0, 0.0, 0.02], [0.1, 0.41, 0.0, 0.0, 0.02]]
-    with pytest.raises(ValueError, match=r"obstacle 1 .* touches the arm at the goal"):
-        gym.make(PLANAR).reset(options={**ENDS, "obstacles": rows})
+        for call in (lambda env=env: env.step(np.zeros(env.action_space.shape)), env.render):
+            with pytest.raises(gym.error.ResetNeeded):
+                call()
 
 
 @pytest.mark.parametrize(
@@ -199,112 +124,95 @@ def test_the_reason_names_what_is_in_the_way():
         lambda way, time: ("there", time),
     ],
 )
-@pytest.mark.parametrize("env_id", [PLANAR, MOVING])
+@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING, PANDA])
 def test_plans(env_id, change):
     env = gym.make_vec(env_id, num_envs=2, threads=1).unwrapped
     env.reset(seed=0)
-    scenes = env.scenes
-    waypoints = np.stack((scenes.start, 0.5 * (scenes.start + scenes.goal), scenes.goal), axis=1)
+    space, scenes = env.task.space, env.scenes
+    start, goal = space.coordinates(scenes.start), space.coordinates(scenes.goal)
+    waypoints = np.stack((start, 0.5 * (start + goal), goal), axis=1)
     durations = np.full((2, 2), 0.4)
     with pytest.raises(ValueError):
         env.execute_plan(Plan(*change(waypoints, durations)))
     info = env.execute_plan(Plan(waypoints.tolist(), durations.tolist())).info
     assert (info["jerk_ratio"] < 1.0 + 1e-9).all()
-    env.close()
+
+
+def test_plans_are_for_the_twin_of_an_environment_with_steps():
+    env = gym.make_vec(STEP, num_envs=2).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(TypeError):
+        env.execute_plan(Plan(np.zeros((2, 3, 2)), np.ones((2, 2))))
 
 
 @pytest.mark.parametrize(
-    ("kind", "arguments"),
+    "goals", [np.full((2, 2), 3.0), np.zeros(2), np.full((2, 2), np.nan), "there", np.zeros((2, 3))]
+)
+def test_goals_that_are_moved(goals):
+    env = gym.make_vec(JUMP, num_envs=2, threads=1).unwrapped
+    env.reset(seed=0)
+    before = env.observe()
+    with pytest.raises(ValueError):
+        env.move_goals(goals)
+    np.testing.assert_array_equal(env.observe()["goal"], before["goal"])
+
+
+HAND = {
+    "space": "hand",
+    "names_of_axes": ("along", "across"),
+    "via_scale": (0.1, 0.2),
+    "duration_range": (0.5, 1.0),
+}
+
+
+@pytest.mark.parametrize(
+    "arguments",
     [
-        *((ActionLayout, {"n_via": number}) for number in (-1, 1.5, 17)),
-        *((ActionLayout, {"via_scale": scale}) for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1)),
-        (ActionLayout, {"dimension": 4}),
-        (ActionLayout, {"timing": "free"}),
-        (SceneDistribution, {"n_obstacles": (3, 2)}),
-        (SceneDistribution, {"n_obstacles": (-1, 2)}),
-        (SceneDistribution, {"distance": (0.4, 0.2)}),
-        (SpaceDistribution, {"n_obstacles": (3, 2)}),
-        (SpaceDistribution, {"n_obstacles": (0, 257)}),
-        (SpaceDistribution, {"distance": (0.4, 0.2)}),
-        (SpaceDistribution, {"families": ("wall",)}),
-        (SpaceDistribution, {"families": ("gate",), "n_obstacles": (1, 2)}),
+        *({"n_via": number} for number in (-1, 1.5, 17)),
+        *({"via_scale": scale} for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1, (0.0, 0.1))),
+        {"timing": "free"},
+        {"space": "joints", "rate_limit": (1.0, 1.0)},
     ],
 )
-def test_records(kind, arguments):
+def test_layouts_of_actions(arguments):
     with pytest.raises(ValueError):
-        kind(**arguments)
+        ActionLayout(**{**HAND, **arguments})
 
 
 ACTIONS = [((size,), (2,), (2,)) for size in (2, 5)]
 ACTIONS += [((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)), ((3,), (2,), (3,))]
-ACTIONS += [((4, 3), (4, 2), (2,)), ((4, 3), (5, 2), (5, 2)), ((4, 3), (2,), (2,))]
-PLANS = [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,)), ((7, 3, 2), (2,))]
+PLANS = [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,))]
 
 
-@pytest.mark.parametrize("kind", [np.ones, torch.ones])
 @pytest.mark.parametrize("shapes", [*ACTIONS, *PLANS])
-def test_shapes_of_actions_and_plans(kind, shapes):
-    layout, arrays = ActionLayout(), [kind(shape) for shape in shapes]
+def test_shapes_of_actions_and_plans(shapes):
+    layout, arrays = ActionLayout(**HAND), [np.ones(shape) for shape in shapes]
     with pytest.raises(ValueError):
         layout.decode(*arrays) if len(shapes) == 3 else layout.encode(Plan(*arrays))
 
 
 @pytest.mark.parametrize(
-    ("env_id", "kwargs", "family"),
+    ("change", "error"),
     [
-        (PLANAR, {}, "maze"),
-        (PLANAR, {"n_obstacles": 2}, "gate"),
-        (SPACE, {}, "ring"),
-        (SPACE, {"n_obstacles": 5, "shapes": "capsule"}, "tunnel"),
-        (SPACE, {"shapes": "capsule"}, "bin"),
+        ({"speed": 1}, TypeError),
+        ({"arm": "none"}, ValueError),
+        ({"n_via": 99}, ValueError),
+        ({"shapes": 1}, TypeError),
     ],
 )
-def test_families_of_a_task(env_id, kwargs, family):
-    with pytest.raises(ValueError):
-        family_sampler(gym.make(env_id, **kwargs).unwrapped.task, family)
-
-
-def post(uniforms, site):
-    radius = 0.02 + 0.0 * uniforms.take(1)
-    return np.concatenate((0.5 * (site.start + site.goal), 0.0 * site.start, radius), axis=-1)[:, None]
-
-
-@pytest.mark.parametrize(
-    ("name", "build", "numbers", "error"),
-    [
-        ("gate", post, {}, ValueError),
-        ("", post, {}, ValueError),
-        (3, post, {}, TypeError),
-        ("ball", lambda site: None, {}, TypeError),
-        ("ball", 3, {}, TypeError),
-        ("ball", post, {"dimension": 4}, ValueError),
-        ("ball", post, {"n_obstacles": 0}, ValueError),
-        ("ball", post, {"n_obstacles": 9, "dimension": 3}, ValueError),
-        ("ball", post, {"n_obstacles": 1.5}, ValueError),
-    ],
-)
-@pytest.mark.usefixtures("registry")
-def test_families_to_register(name, build, numbers, error):
+def test_records_of_tasks(change, error):
+    record = Task.of().as_dict()
+    assert Task.from_dict(record) == Task.of()
     with pytest.raises(error):
-        register_scene_family(name, build, **numbers)
+        Task.from_dict({**record, **change})
 
 
 @pytest.mark.parametrize(
-    "build",
-    [
-        lambda uniforms, site: np.zeros((3, 1, 5)),
-        lambda uniforms, site: np.repeat(post(uniforms, site), 2, axis=1),
-        lambda uniforms, site: np.nan * post(uniforms, site),
-        lambda uniforms, site: None,
-        lambda uniforms, site: uniforms.take(15),
-    ],
+    "weights", [{"success": np.nan}, {"success": "much"}, {"duration": -0.1}, {"progress": True}]
 )
-@pytest.mark.usefixtures("registry")
-def test_obstacles_of_families(build):
-    register_scene_family("wrong", build, n_obstacles=1)
-    sampler = family_sampler(gym.make(PLANAR).unwrapped.task, "wrong")
+def test_reward_weights(weights):
     with pytest.raises(ValueError):
-        sampler([np.random.default_rng(seed) for seed in range(8)])
+        RewardWeights(**weights)
 
 
 @pytest.mark.parametrize("mode", [None, "human", "rgb_array"])

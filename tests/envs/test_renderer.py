@@ -4,11 +4,12 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from drawn import AROUND, OBSTACLES, SCENE, STRAIGHT, moved
+from episodes import AROUND, DRAWN, OBSTACLES, STRAIGHT, moved
 
+from viapoint.envs import Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
-from viapoint.envs.rendering.overlay import Movement, first_contact
 from viapoint.envs.rendering.renderer import frame_steps
+from viapoint.envs.rendering.scene_view import resampled
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
 
@@ -29,13 +30,13 @@ def test_the_frames_of_a_film_are_evenly_spaced_from_start_to_end(duration, fps)
     assert np.ptp(np.diff(steps)) <= 1
 
 
-@pytest.mark.parametrize(("width", "height"), [(120, 80), (80, 120), (1, 1), (1400, 64)])
-@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM, "viapoint.envs:viapoint/PlanarReach-v0"])
+@pytest.mark.parametrize(("width", "height"), [(80, 120), (1, 1), (1400, 64)])
+@pytest.mark.parametrize("name", [OBSTACLES, "viapoint.envs:viapoint/PandaReach-v0"])
 def test_a_picture_has_the_size_asked_for(make, name, width, height):
     env = make(name, width=width, height=height)
     env.reset(seed=1)
     still = env.render()
-    env.step(STRAIGHT)
+    env.step(np.zeros(env.action_space.shape, np.float32))
     for frame in (still, env.render()):
         assert frame.shape == (height, width, 3)
         assert frame.dtype == np.uint8
@@ -67,7 +68,7 @@ def test_a_film_lasts_as_long_as_the_movement(make):
 @pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
 def test_contact_is_red_and_nothing_else_is(make, name):
     env = make(name, side=240)
-    env.reset(options={key: np.array(value) for key, value in SCENE.items()})
+    env.reset(options=DRAWN)
     assert red(env.render()) == 0
     assert moved(env, STRAIGHT)["collision"]
     assert red(env.render()) > 60
@@ -84,19 +85,6 @@ def test_a_film_turns_red_at_contact(make):
     assert reds[reds.argmax() :].all()
 
 
-@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
-def test_the_obstacle_that_was_touched_is_named(name):
-    env = gym.make(name)
-    moved(env, STRAIGHT)
-    inner = env.unwrapped
-    scene, plan = inner.batch._last[:2]
-    movement = Movement.of(inner.task.collision_model, scene, plan, inner.last_rollout)
-    assert movement.contact.obstacle == 1
-    assert movement.contact.step == inner.last_rollout.contact.argmax()
-    tip = np.array([-0.11, 0.4])
-    assert np.linalg.norm(movement.contact.position - tip) < 0.01 + max(inner.task.arm.link_radii)
-
-
 def test_pictures_leave_no_trace_in_the_simulation(make):
     plain, drawn = gym.make(OBSTACLES), make(side=16)
     for env in (plain, drawn):
@@ -110,15 +98,27 @@ def test_pictures_leave_no_trace_in_the_simulation(make):
             env.reset()
 
 
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 @pytest.mark.usefixtures("opengl")
-def test_a_vector_environment_gives_a_picture_of_each():
-    env = gym.make_vec(OBSTACLES, num_envs=2, render_mode="rgb_array", width=32, height=24)
-    env.reset(seed=0)
-    frames = env.render()
-    assert [frame.shape for frame in frames] == [(24, 32, 3)] * 2
-    env.step(np.zeros((2, 3), dtype=np.float32))
-    assert len(env.render()) == 2
-    env.close()
+def test_pictures_of_a_batch_are_those_of_its_environments(mode):
+    """Also of an episode that is over, where the next one has begun."""
+    sizes = {"render_mode": "rgb_array", "width": 48, "height": 32}
+    batch = gym.make_vec(OBSTACLES, num_envs=3, autoreset_mode=mode, **sizes)
+    singles = [gym.make(OBSTACLES, **sizes) for _ in range(3)]
+    batch.reset(seed=0)
+    for seed, single in enumerate(singles):
+        single.reset(seed=seed)
+    for moved_already in (False, True):
+        if moved_already:
+            batch.step(np.tile(STRAIGHT, (3, 1)))
+            for single in singles:
+                single.step(STRAIGHT)
+        for frame, single in zip(batch.render(), singles, strict=True):
+            assert frame.shape == (32, 48, 3)
+            np.testing.assert_array_equal(frame, single.render())
+    batch.close()
+    for single in singles:
+        single.close()
 
 
 def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
@@ -145,36 +145,23 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
     assert shown[-1] == "closed"
 
 
-def test_a_full_scene_is_drawn_in_part_and_not_refused(make, monkeypatch):
-    monkeypatch.setattr(gl, "MAX_GEOMS", 12)
-    env = make(side=16)
-    moved(env, AROUND)
-    assert env.render().shape == (16, 16, 3)
-
-
-PANDA_SCENE = {
-    "start": [0.45, -0.2, 0.2],
-    "goal": [0.45, 0.2, 0.2],
-    "obstacles": [[0.45, 0.0, 0.21, 0.0, 0.0, 0.0, 0.05], [0.7, 0.3, 0.1, 0.0, 0.0, 0.05, 0.02]],
-}
-
-
-@pytest.mark.parametrize("around", [False, True])
-def test_in_space_spheres_are_seen_and_turn_red_with_the_link_that_touches_them(make, around):
+@pytest.mark.parametrize("touches", [True, False])
+def test_in_space_spheres_are_seen_and_turn_red_with_the_link_that_touches_them(make, touches):
+    arm = arm_of("panda")
+    goal = arm.home + np.array([1.2, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    place = arm.hand(0.5 * (arm.home + goal)) if touches else (0.3, -0.5, 0.4)
     env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=160)
-    env.reset(options={name: np.array(value) for name, value in PANDA_SCENE.items()})
+    env.reset(options={"start": arm.home, "goal": goal, "obstacles": [Sphere(0.08, position=place)]})
     before = env.render().astype(int)
-    sphere = (before[..., 0] - before[..., 2] > 40).sum()
-    *_, info = env.step(np.array([0.0, 0.0, 0.9 if around else 0.0, 0.0], np.float32))
-    assert info["collision"] == (not around)
-    assert sphere > 150
-    assert (red(env.render()) > 150) == (not around)
+    assert (before[..., 0] - before[..., 2] > 40).sum() > 150
+    *_, info = env.step(np.zeros(8, np.float32))
+    assert info["collision"] == touches
+    assert (red(env.render()) > 100) == touches
 
 
-def test_a_contact_that_is_with_no_obstacle_is_drawn_as_such():
-    env = gym.make("viapoint.envs:viapoint/PandaReach-v0").unwrapped
-    env.reset(seed=0)
-    scene = env.batch.scenes
-    joints = np.repeat(env.task.arm.inverse_kinematics(scene.start), 3, axis=0)
-    contact = first_contact(env.task.collision_model, scene, joints, np.array([False, True, True]))
-    assert (contact.step, contact.obstacle, contact.link) == (1, -1, None)
+def test_drawn_paths_keep_their_ends_and_have_even_points():
+    points = np.array([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.1, 0.3, 0.0)])
+    found = resampled(points, 0.011)
+    np.testing.assert_allclose(found[[0, -1]], points[[0, -1]], atol=1e-12)
+    assert np.linalg.norm(np.diff(found, axis=0), axis=-1).max() <= 0.011
+    assert resampled(points[:1].repeat(2, axis=0), 0.011).shape == (2, 3)

@@ -1,21 +1,17 @@
 """Capsules contain the geoms that they cover, and contact in MuJoCo implies that spheres overlap."""
 
 import itertools
-import sys
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from self_contact import check_contact_implies_overlap, least_pair_distance
 
 from viapoint.envs.arms import capsule_fit
 from viapoint.envs.arms.capsule_fit import cover_geom, cover_points, polytope_around
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.arms.spheres import bounding_ball
 from viapoint.envs.geometry.shapes import ConvexMesh
-
-sys.path.append(str(Path(__file__).parent))
-from self_contact import check_contact_implies_overlap, least_pair_distance
 
 GEOMS = """<mujoco>
   <asset><mesh name="wedge" vertex="0 0 0  .2 0 0  0 .1 0  .2 .1 0  0 0 .1  0 .1 .1"/></asset>

@@ -1,5 +1,6 @@
 """A headless browser, driven by the Chrome DevTools protocol."""
 
+import base64
 import json
 import shutil
 import subprocess
@@ -95,6 +96,10 @@ class Tab:
     def run(self, script):
         result = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         return result["result"].get("value")
+
+    def screenshot(self):
+        """Return the picture of the tab as a PNG file."""
+        return base64.b64decode(self.call("Page.captureScreenshot")["data"])
 
     def text(self, selector):
         return self.run(f"document.querySelector({selector!r})?.textContent ?? ''")

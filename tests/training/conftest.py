@@ -25,20 +25,15 @@ def one_thread():
 
 @pytest.fixture(scope="session")
 def small_scenes():
-    """Forty scenes, each with the best of 32 random actions as its solution."""
+    """Forty scenes, with the share of 32 random actions that solve each."""
     simulation = SceneSimulation(ENV, 64, threads=1)
     generator = np.random.default_rng(0)
     scenes = simulation.task.sampler()([generator] * 40)
     actions = generator.uniform(-1.0, 1.0, (32, 40, simulation.task.action.size))
-    tried = [simulation(scenes, each) for each in actions]
-    success, reward = np.array([each.success for each in tried]), np.array([each.reward for each in tried])
+    success = np.array([simulation(scenes, each).success for each in actions])
     simulation.close()
     return FrozenScenes(
-        name="small",
-        env_id=ENV,
-        scenes=scenes,
-        share=success.mean(axis=0),
-        solution=actions[reward.argmax(axis=0), np.arange(40)],
+        name="small", task=simulation.task.as_dict(), scenes=scenes, share=success.mean(axis=0)
     )
 
 
@@ -47,8 +42,7 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     """The small scenes in place of every shipped set."""
     path = tmp_path / "shipped.npz"
     small_scenes.save(path)
-    for module in (scene_set, scene_set):
-        monkeypatch.setattr(module, "shipped_path", lambda name, env_id: path)
+    monkeypatch.setattr(scene_set, "shipped_set", lambda name, task: path)
     return small_scenes
 
 

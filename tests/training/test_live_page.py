@@ -1,5 +1,6 @@
 """The live page in a real browser: decisions follow what a user does, and errors are said on the page."""
 
+import dataclasses
 import gc
 import time
 
@@ -12,12 +13,17 @@ pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 from browser import Browser, chromium, wait_for
 from viser import transforms
 
+from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.live.page import LivePage
-from viapoint.training.live.scene_file import LiveScene, to_json
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
-PLANAR, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarTargetJump-v0"
+PLANAR, PANDA, REPLANNING = (
+    "viapoint/PlanarObstacles-v0",
+    "viapoint/PandaObstacles-v0",
+    "viapoint/PlanarTargetJump-v0",
+)
 MESSAGE = "#viapoint-message"
 SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
 """Displacements, [m]."""
@@ -37,8 +43,8 @@ def opened(browser):
     """Open pages and tabs; all are closed in the end."""
     pages, tabs = [], []
 
-    def page(env, **kwargs):
-        pages.append(LivePage(env=env, port=0, seed=3, **kwargs))
+    def page(env, agent=None):
+        pages.append(LivePage(agent, env=env, port=0, seed=1))
         return pages[-1]
 
     def tab(page):
@@ -116,7 +122,7 @@ def test_what_a_user_does_changes_the_plan(opened):
 
     tab.press("[role=tab]", "Methods")
     tab.press("button", "Compare in this scene")
-    wait_for(lambda: "planner" in tab.text("body") and "Each row is simulated" in tab.text("body"))
+    wait_for(lambda: "motion planner" in tab.text("body") and "Each row is simulated" in tab.text("body"))
     settled(session)
 
     via = np.array(session.proposal.plan.waypoints[1])
@@ -125,7 +131,7 @@ def test_what_a_user_does_changes_the_plan(opened):
     np.testing.assert_allclose(session.proposal.plan.waypoints[1], via + UP, atol=0.01)
 
     start = session.scene.start
-    obstacle = session.scene.obstacles[0, :2]
+    obstacle = session.scene.obstacles[0].position
     drag(tab, session, obstacle, start)
     settled(session)
     assert "touches the arm at the start" in tab.text(MESSAGE)
@@ -134,27 +140,50 @@ def test_what_a_user_does_changes_the_plan(opened):
     wait_for(lambda: "plan" in tab.text(MESSAGE))
     assert session.proposal is not None
     np.testing.assert_array_equal(session.scene.goal, goal)
-    np.testing.assert_array_equal(session.scene.obstacles[0, :2], obstacle)
+    np.testing.assert_array_equal(session.scene.obstacles[0].position, obstacle)
 
 
 def test_scenes_that_the_agent_does_not_know_are_searched(opened):
     open_page, open_tab = opened
-    tab, session = open_tab(open_page("viapoint/PandaObstacles-v0"))
-    tab.press("button", "Benchmark")
-    wait_for(lambda: "MotionBenchMaker" in tab.text("body") and "geometry search decides" in tab.text("body"))
-    settled(session)
-    assert session.proposal.predicted is None
-    tab.press("button", "Random")
-    wait_for(lambda: "MotionBenchMaker" not in tab.text("body"))
-    settled(session)
+    agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANAR, num_envs=1), seed=0)
+    tab, session = open_tab(open_page(PLANAR, agent=agent))
     assert session.proposal.predicted is not None
     number = len(session.scene.obstacles)
-    tab.press("button", "cylinder")
-    wait_for(lambda: "trained without cylinder obstacles" in tab.text("body"))
+    tab.press("button", "wall")
+    wait_for(lambda: "trained without half-space obstacles" in tab.text("body"))
     settled(session)
-    assert session.scene.shapes[number:] == ["cylinder"]
+    assert [each.kind for each in session.scene.obstacles[number:]] == ["half_space"]
+    assert session.proposal.predicted is None
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
+    tab.press("button", "Random")
+    wait_for(lambda: "trained without" not in tab.text("body"))
+    settled(session)
+    assert session.proposal.predicted is not None
+
+
+def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page(PANDA))
+    arm, goal = session.setting.task.arm, session.scene.goal
+    place = arm.hand(goal)
+    aside = np.array([0.0, 0.03, 0.0])
+    drag(tab, session, place, place + aside)
+    settled(session)
+    moved = arm.hand(session.scene.goal) - place
+    assert np.abs(moved - aside).max() < 0.01
+    assert np.abs(session.scene.goal - goal).max() < 0.5  # the nearest posture
+
+    tab.press("label", "Turn the goal")
+    settled(session)
+    place = arm.hand(session.scene.goal)
+    turn = transforms.SO3.from_z_radians(0.1) @ transforms.SO3(
+        session.setting.orientation(session.scene.goal)
+    )
+    session.turn(turn.wxyz)
+    settled(session)
+    np.testing.assert_allclose(arm.hand(session.scene.goal), place, atol=1e-3)
+    assert abs(session.setting.orientation(session.scene.goal) @ turn.wxyz) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_tabs_are_independent_and_leave_nothing_behind(opened):
@@ -194,7 +223,7 @@ def test_a_goal_is_dragged_while_the_arm_moves(opened):
         assert np.linalg.norm(session.scene.goal - aside) < 0.01
         if "Success" in tab.text(MESSAGE):
             break
-    hand = np.concatenate([each.hand for each in session.movement])
+    hand = np.concatenate([each.hand[:, :2] for each in session.movement])
     assert "Success" in tab.text(MESSAGE)
     assert np.linalg.norm(hand[-1] - session.scene.goal) < 0.01
     time_ = np.concatenate([each.time for each in session.movement])
@@ -216,13 +245,13 @@ def test_files_are_saved_and_impossible_ones_are_refused(opened):
     assert "gym.make(" in wait_for(lambda: tab.text("#viapoint-code"))
 
     scene = session.scene
-    blocked = LiveScene(*scene)._replace(obstacles=scene.obstacles.copy())
-    blocked.obstacles[0, :2] = scene.goal
-    session.load(to_json(blocked, PLANAR).encode())
+    first, *others = scene.obstacles
+    there = dataclasses.replace(first, position=(*scene.goal, first.position[2]))
+    session.load(scene._replace(obstacles=(there, *others)).to_json(PLANAR).encode())
     wait_for(lambda: "impossible" in tab.text(MESSAGE))
-    assert np.array_equal(session.scene.obstacles, scene.obstacles)
+    assert session.scene is scene
     session.load(b"{}")
     wait_for(lambda: "viapoint-scene" in tab.text(MESSAGE))
-    session.load(to_json(scene._replace(goal=scene.goal + 0.01), PLANAR).encode())
+    session.load(scene._replace(goal=scene.goal + 0.01).to_json(PLANAR).encode())
     wait_for(lambda: "plan" in tab.text(MESSAGE))
     np.testing.assert_allclose(session.scene.goal, scene.goal + 0.01, atol=1e-6)

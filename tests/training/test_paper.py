@@ -26,9 +26,9 @@ FEWER = 9
 def made(tmp_path_factory):
     """The folder that the command wrote, with fewer scenes in row 12."""
     out = tmp_path_factory.mktemp("paper")
-    every = obstacles.light_scenes()
+    every = obstacles.light_scenes
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(obstacles, "light_scenes", lambda: every.take(slice(None, None, FEWER)))
+        patch.setattr(obstacles, "light_scenes", lambda rows: every(rows).take(slice(None, None, FEWER)))
         cli.main(["paper", "--out", str(out)])
     return out
 

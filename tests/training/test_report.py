@@ -10,7 +10,7 @@ from rich.console import Console
 
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning.baselines import StoredSolutions
+from viapoint.training.planning.baselines import make_method
 from viapoint.training.plotting import plots
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -28,7 +28,7 @@ class Still:
 @pytest.fixture(scope="module")
 def record(small_scenes):
     evaluation = evaluate_methods(
-        [Still(), StoredSolutions(small_scenes)], small_scenes, ENV, time_decisions=False
+        [Still(), make_method("search32", ENV)], small_scenes, ENV, time_decisions=False
     )
     return evaluation.to_dict()
 
@@ -38,11 +38,11 @@ def test_the_document_holds_every_method_and_metric(record, tmp_path):
     lines = [line for line in document.read_text().splitlines() if line.startswith("|")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert {len(line) for line in cells} == {len(cells[0])}
-    assert [line[0] for line in cells[2:]] == ["still [bold]", "planner (stored)"]
-    summary = record["methods"]["planner (stored)"]
-    planner = dict(zip(cells[0], cells[3], strict=True))
-    assert planner["success"] == f"{100 * summary['success']['rate']:.1f} %"
-    assert planner["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
+    assert [line[0] for line in cells[2:]] == ["still [bold]", "search, 32 checks"]
+    summary = record["methods"]["search, 32 checks"]
+    search = dict(zip(cells[0], cells[3], strict=True))
+    assert search["success"] == f"{100 * summary['success']['rate']:.1f} %"
+    assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
     assert json.loads(data.read_text()) == record
     assert record["sha256"][:12] in document.read_text()
 

@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, PointCloud, ReachEnv, Sphere
 from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.training import GeometrySearch
 from viapoint.training.plotting.gallery import gallery, play
-from viapoint.training.plotting.top_view import capsule
+from viapoint.training.plotting.top_view import footprint
 from viapoint.training.plotting.video import record_video
 
-OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
+TASKS = tuple(
+    f"viapoint/{task}-v0" for task in ("PlanarObstacles", "PandaObstacles", "PlanarMovingObstacles")
+)
 
 
-@pytest.fixture
-def env():
-    env = gym.make(OBSTACLES, render_mode="rgb_array_list", width=96, height=96)
+@pytest.fixture(params=TASKS)
+def env(request):
+    env = gym.make(request.param, render_mode="rgb_array_list", width=96, height=96)
     yield env
     env.close()
 
@@ -25,15 +29,8 @@ def scenes_of(env, number, seed=0):
     return env.unwrapped.task.sampler()([np.random.default_rng(seed + i) for i in range(number)])
 
 
-def straight(observation, scene):
-    assert observation["hand"].shape == (1, 2)
-    assert scene.start.shape == (1, 2)
-    return np.zeros((1, 3))
-
-
-def entries_of(env, number):
-    titles = [f"scene {seed}" for seed in range(number)]
-    return play(OBSTACLES, scenes_of(env, number), titles, lambda *_: np.zeros(3, dtype=np.float32))
+def search(env):
+    return GeometrySearch(env.unwrapped.task, 8).decide
 
 
 def read(path):
@@ -48,14 +45,15 @@ def check_film(path, count, env, number):
     assert len(frames) == count
     assert meta["fps"] == pytest.approx(env.metadata["render_fps"] / 2.0)
     duration = env.unwrapped.last_rollout.time[-1]
-    assert count >= number * round(duration / 2.0 * meta["fps"])
+    assert count > number * meta["fps"] * 0.4 + duration * env.metadata["render_fps"]
     assert all(frame[:-48].std() > 5.0 for frame in frames)
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
 
 
 def test_a_film_shows_every_movement(env, tmp_path):
-    count = record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), straight)
-    check_film(tmp_path / "film.mp4", count, env, 2)
+    number = 2 if env.spec.id == TASKS[0] else 1
+    count = record_video(tmp_path / "film.mp4", env, scenes_of(env, number), search(env))
+    check_film(tmp_path / "film.mp4", count, env, number)
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
@@ -63,41 +61,70 @@ def test_without_opengl_a_film_is_drawn_and_one_line_names_the_reason(env, tmp_p
     def missing(self):
         raise GLUnavailableError("install libegl1")
 
-    monkeypatch.setattr(type(env), "render", missing)
+    monkeypatch.setattr(ReachEnv, "render", missing)
     with caplog.at_level(logging.WARNING):
-        count = record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), straight)
-    check_film(tmp_path / "film.mp4", count, env, 2)
+        number = 2 if env.spec.id == TASKS[0] else 1
+    count = record_video(tmp_path / "film.mp4", env, scenes_of(env, number), search(env))
+    check_film(tmp_path / "film.mp4", count, env, number)
     (record,) = caplog.records
     assert "libegl1" in record.getMessage()
 
 
+@pytest.mark.parametrize("env", TASKS[:1], indirect=True)
 def test_a_film_that_fails_half_way_leaves_nothing(env, tmp_path):
-    def broken(observation, scene):
-        if broken.calls:
+    calls = []
+
+    def broken(observation, scenes):
+        calls.append(scenes)
+        if len(calls) == 2:
             raise KeyError("policy")
-        broken.calls = 1
         return np.zeros((1, 3))
 
-    broken.calls = 0
     with pytest.raises(KeyError):
         record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), broken)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_gallery_is_a_page_of_movements(env, tmp_path):
-    entries = entries_of(env, 5)
+    titles = [f"scene {seed}" for seed in range(5)]
+    entries = play(env.spec.id, scenes_of(env, 5), titles, search(env))
     path = gallery(tmp_path / "gallery.png", entries, heading="test scenes")
     with Image.open(path) as image:
         pixels = np.asarray(image.convert("RGB"))
         assert image.width > 700
     assert pixels.std() > 5.0
-    assert {entry.outcome for entry in entries} <= {"collision", "missed", "success"}
+    for row, entry in enumerate(entries):
+        observation = env.unwrapped.batch.begin(entry.recorded.scene)
+        assert entry.outcome in ("collision", "missed", "success")
+        assert entry.recorded.history[0][0] == 0.0
+        first = env.unwrapped.batch.execute_actions(search(env)(observation, None))
+        if env.unwrapped.task.whole_movement:
+            assert first.info["is_success"][0] == entry.success, row
 
 
-def test_the_drawn_footprint_is_the_capsule():
-    first, second = np.array([0.1, 0.2]), np.array([-0.2, 0.5])
-    outline = capsule(first, second, 0.03)
-    along = np.clip((outline - first) @ (second - first) / ((second - first) ** 2).sum(), 0.0, 1.0)
-    distance = np.linalg.norm(outline - first - along[:, None] * (second - first), axis=-1)
-    np.testing.assert_allclose(distance, 0.03, rtol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(capsule(first, first, 0.03) - first, axis=-1), 0.03, rtol=1e-9)
+POSE = {"position": (0.3, -0.2, 0.1), "quaternion": (0.7, 0.1, -0.5, 0.5)}
+SHAPES = (
+    Sphere(0.1, **POSE),
+    Capsule(0.05, 0.12, **POSE),
+    Cylinder(0.08, 0.1, **POSE),
+    Box((0.05, 0.1, 0.2), **POSE),
+    ConvexMesh.hull([(0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), (0, 0, 0.2)], **POSE),
+    PointCloud([(0.0, 0.0, 0.0), (0.0, 0.0, 0.2)], radius=0.02, **POSE),
+)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
+@pytest.mark.parametrize("rim", [0.0, 0.03])
+def test_a_footprint_is_the_shadow_of_the_shape(shape, rim):
+    """A vertical line through the outline touches the shape, up to the corners of drawn circles."""
+    heights = np.linspace(-0.3, 0.5, 4001)
+    for polygon in footprint(shape, rim):
+        for x, y in polygon[::5]:
+            line = np.column_stack((np.full_like(heights, x), np.full_like(heights, y), heights))
+            assert shape.distance(line).min() == pytest.approx(rim, abs=1e-3)
+
+
+def test_a_wall_has_a_footprint_and_a_floor_has_none():
+    (wall,) = footprint(HalfSpace.facing((-1.0, 0.0, 0.0), position=(0.8, 0.0, 0.0)))
+    assert wall[:, 0].min() == pytest.approx(0.8)
+    assert not footprint(HalfSpace(position=(0.0, 0.0, -0.1)))

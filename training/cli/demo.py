@@ -88,11 +88,8 @@ def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
     by_difficulty = np.argsort(-frozen.share, kind="stable")
     chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), count)])
     titles = [f"share {BANDS[band]}" for band in chosen.band]
-
-    def act(_: int, observation: Any) -> Any:
-        return agent.predict(observation, deterministic=True)[0]
-
-    return play(agent.env_id, chosen.scenes, titles, act, **agent.env_kwargs)
+    decide = agent_method("agent", agent, 0).decide
+    return play(agent.env_id, chosen.scenes, titles, decide, **agent.env_kwargs)
 
 
 def _trained(config: DemoConfig) -> Run:

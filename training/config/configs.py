@@ -396,7 +396,7 @@ class PaperConfig(Config):
     out: Path = Path("paper")
     """Folder for the figures and the table."""
     agent: Path | None = None
-    """Run folder or model folder of the agent that moves around the rows of lights; default: the shipped agent."""
+    """Run folder or model folder of an agent that moves around the rows of lights; default: the geometry search."""
 
     def _check(self) -> None:
         check_folder("out", self.out)

@@ -16,11 +16,12 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.episodes import jerk_cost_between
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.outcome import straight_jerk_cost
+from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.live.movements import Profile, plan_profile
 from viapoint.training.live.scene import LiveScene
 from viapoint.training.planning.candidates import candidate_actions
-from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import INFEASIBLE, GeometrySearch, merits
+from viapoint.training.planning.problem import Problem, moves_of, worth_of
+from viapoint.training.planning.search import GeometrySearch, merits
 
 N_PROPOSALS = 5
 """Proposals that are shown."""
@@ -52,13 +53,18 @@ class Proposal(NamedTuple):
 
     @property
     def clearance(self) -> float:
-        """Computed clearance of the plan, [m]."""
+        """Computed clearance of the plan from obstacles, [m]."""
         return float(self.profile.clearance.min())
+
+    @property
+    def self_clearance(self) -> float:
+        """Computed clearance of the arm from itself, [m]."""
+        return float(self.profile.own.min())
 
     @property
     def clear(self) -> bool:
         """True if the plan is within reach and touches nothing."""
-        return self.reachable and self.clearance > 0.0
+        return self.reachable and min(self.clearance, self.self_clearance) > 0.0
 
     @property
     def duration(self) -> float:
@@ -124,39 +130,44 @@ class DecisionMaker:
     def action(self, observation: Observation, checks: int = 0) -> Float:
         """Return the chosen action alone, shape (1, m)."""
         if self._agent is None:
-            return _search(self.task).decide(observation)
+            return self.search(observation)
         with self._lock:
             if self.checks:
                 self._agent.policy.checks = checks
             actions, _ = self._agent.predict(observation, deterministic=True)
         return np.asarray(actions, dtype=np.float64)
 
-    def proposals(
-        self, observation: Observation, scenes: Scenes, decision: Decision
-    ) -> tuple[Proposal, ...]:
+    def search(self, observation: Observation) -> Float:
+        """Return the action that the geometry search chooses, shape (1, m)."""
+        return _search(self.task).decide(observation)
+
+    def proposals(self, observation: Observation, scenes: Scenes, decision: Decision) -> tuple[Proposal, ...]:
         """Return the chosen plan and the best others that differ from it, with their ranks."""
         task, by_agent = decision.task, decision.maker.startswith("agent")
         if by_agent and not self.ranks:
             return (decision.chosen,)
         if by_agent:
             with self._lock:
-                actions, values = (part[0] for part in self._agent.policy.propose(observation))
+                problem = Problem.of_observation(observation, task)
+                actions, values = (part[0] for part in self._agent.policy.propose(problem))
         else:
             actions = candidate_actions(task, N_CHECKS, replanning=False)
-            values = _each_merit(task, scenes, actions)
+            values = _each_merit(task, scenes, np.asarray(actions, dtype=np.float64))
         actions = np.asarray(actions, dtype=np.float64)
         order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
         chosen = np.asarray(decision.action, dtype=np.float64)
         known = np.flatnonzero((actions[order] == chosen).all(axis=-1))
         every = np.concatenate((chosen[None], actions[order]))
         kept = _distinct(task, scenes, every)
-        found = evaluated(task, scenes, every[kept])
-        ranks = [int(known[0]) + 1 if known.size else 1, *kept[1:]]
-        expected = [float(values[order[rank - 1]]) if by_agent else None for rank in ranks]
-        return tuple(
-            each._replace(rank=rank, predicted=value)
-            for each, rank, value in zip(found, ranks, expected, strict=True)
-        )
+        first, *others = evaluated(task, scenes, every[kept])
+        # A chosen action that is no candidate comes from refinement, and stands before all candidates.
+        best = int(known[0]) + 1 if known.size else 1
+        expected = [float(value) if by_agent else None for value in values[order]]
+        found = [first._replace(rank=best, predicted=expected[known[0]] if known.size else None)]
+        for each, place in zip(others, kept[1:], strict=True):
+            rank = place if known.size else place + 1
+            found.append(each._replace(rank=rank, predicted=expected[place - 1]))
+        return tuple(found)
 
     def evaluate(self, scenes: Scenes, plan: Plan) -> Proposal:
         """Return a plan made by hand as a proposal of rank 0."""
@@ -174,19 +185,21 @@ def plan_by_hand(scene: LiveScene, vias: Float, duration: float) -> Plan:
 def evaluated(task: Task, scenes: Scenes, actions: Float) -> list[Proposal]:
     """Return proposals of some actions in a batch of one scene, shape (P, m), with computed rewards."""
     problem = Problem.of_scenes(scenes, task)
-    start, goal = (np.repeat(end, len(actions), axis=0) for end in (problem.start, problem.goal))
-    plans = task.action.decode(actions, start, goal)
-    worth = _each_merit(task, scenes, actions)
+    plans = _plans(task, problem, actions)
+    worth = worth_of(task, problem, moves_of(task, problem, actions[None]))[0]
     cost = jerk_cost_between(plans, np.zeros(len(actions)), plans.duration)
-    straight = straight_jerk_cost(norm(goal - start), plans.duration)
+    straight = straight_jerk_cost(norm(problem.goal - problem.start), plans.duration)
     found = []
     for i in range(len(actions)):
         plan = Plan(plans.waypoints[i], plans.durations[i])
         profile = plan_profile(task, scenes, plan)
-        reachable = bool(task.space.inside(profile.coordinates).all())
-        clear = reachable and profile.clearance.min() > 0.0 and worth[i] > 0.5 * INFEASIBLE
-        reward = float(worth[i]) if clear else None
-        found.append(Proposal(1, plan, reward, None, profile, reachable, float(cost[i] / straight[i])))
+        inside = bool(task.space.inside(profile.coordinates).all())
+        proposal = Proposal(1, plan, None, None, profile, inside, float(cost[i] / straight[i]))
+        if proposal.clear:
+            clearance = min(proposal.clearance, proposal.self_clearance, CLEARANCE_RANGE[1])
+            reward = float(worth[i]) + task.weights.clearance * clearance / CLEARANCE_UNIT
+            proposal = proposal._replace(reward=reward)
+        found.append(proposal)
     return found
 
 
@@ -195,7 +208,9 @@ def describe_plan(plan: Proposal) -> str:
     if not plan.reachable:
         return "This plan leaves the arm's reach."
     if plan.clearance <= 0.0:
-        return f"This plan touches an obstacle: {-1e3 * plan.clearance:.0f} mm deep."
+        return f"This plan touches an obstacle: {-1e3 * plan.clearance:.1f} mm deep."
+    if plan.self_clearance <= 0.0:
+        return f"In this plan the arm touches itself: {-1e3 * plan.self_clearance:.1f} mm deep."
     clear = "no obstacle near" if plan.clearance >= 0.999 * FAR else f"{1e3 * plan.clearance:.0f} mm clear"
     jerk = f"{plan.jerk_ratio:.1f} times the jerk of the straight line"
     return f"The plan takes {plan.duration:.2f} s, {clear}, with {jerk}."
@@ -215,11 +230,15 @@ def _each_merit(task: Task, scenes: Scenes, actions: Float) -> Float:
     return np.asarray(merits(task, problem, actions[:, None])[:, 0])
 
 
+def _plans(task: Task, problem: Problem, actions: Float) -> Plan:
+    """Return the plans of actions of shape (P, m) in one problem."""
+    start, goal = (np.repeat(end, len(actions), axis=0) for end in (problem.start, problem.goal))
+    return task.action.decode(actions, start, goal)
+
+
 def _distinct(task: Task, scenes: Scenes, actions: Float) -> list[int]:
     """Return the first action and the next ones whose paths of the tool differ, as indices."""
-    problem = Problem.of_scenes(scenes, task)
-    start, goal = (np.repeat(end, len(actions), axis=0) for end in (problem.start, problem.goal))
-    plans = task.action.decode(actions, start, goal)
+    plans = _plans(task, Problem.of_scenes(scenes, task), actions)
     instants = plans.duration[:, None] * np.linspace(0.0, 1.0, 9)[1:-1]
     paths = task.arm.hand(task.space.joints(np.asarray(plans.trajectory()(instants))))
     kept = [0]

@@ -37,7 +37,7 @@ class JobThread(threading.Thread):
         self._begin, self._animate, self._end, self._tell = begin, animate, end, tell
         self._jobs: dict[str, tuple[float, Job]] = {}
         self._quiet_at = 0.0
-        self.posted = 0.0
+        self.posted = time.perf_counter()
         """Time at which the present job was posted, of `time.perf_counter`, [s]."""
         self._wake, self._busy = threading.Condition(), True
         self.closed = False

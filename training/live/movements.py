@@ -11,7 +11,6 @@ from viapoint.envs import Plan, ReachVectorEnv, Scenes, Task
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Observation
 from viapoint.envs.geometry.clearance import FAR, configuration_clearances
-from viapoint.envs.outcome import Rollout
 from viapoint.training.live.scene import LiveScene
 
 SAMPLES = 80
@@ -39,7 +38,9 @@ class Profile(NamedTuple):
     jerk: Float
     """Jerk of the plan, shape (T,), [m/s^3] or [rad/s^3]; NaN for executed movements."""
     clearance: Float
-    """Clearance from the nearest obstacle and of the arm from itself, shape (T,), [m]; at most 1."""
+    """Clearance from the nearest obstacle, shape (T,), [m]; at most 1."""
+    own: Float
+    """Clearance of the arm from itself, shape (T,), [m]; NaN for executed movements."""
 
 
 class Segment(NamedTuple):
@@ -55,10 +56,10 @@ class Segment(NamedTuple):
     """True where the arm touches something, shape (T,)."""
     clearance: Float
     """Clearance from the nearest obstacle, shape (T,), [m]."""
+    places: Float
+    """Places of the obstacles, shape (T, n, 3), [m]."""
     plan: Plan | None
     """Plan that is followed from now on; None where it is the one already known."""
-    scene: LiveScene
-    """Scene in which it moves."""
     info: Mapping[str, Any]
     """Metrics of the movement so far."""
     restarted: bool = False
@@ -66,18 +67,18 @@ class Segment(NamedTuple):
 
 
 def plan_profile(task: Task, scenes: Scenes, plan: Plan, samples: int = SAMPLES) -> Profile:
-    """Return the profile of a plan from rest in a batch of one scene, whose obstacles may move."""
+    """Return the profile of a plan from rest in a batch of one scene, if obstacles keep their course."""
     arm, space = task.arm, task.space
     time = np.linspace(0.0, float(plan.duration), samples)
     trajectory = plan.trajectory()
     coordinates = np.asarray(trajectory(time))
     joints = space.joints(coordinates)
     tool = arm.hand(joints)
-    obstacles = scenes.take(np.zeros(samples, np.int64)).obstacles_at(time)
+    obstacles = scenes.obstacles.take(np.zeros(samples, np.int64)).at(time)
     each = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(samples))
     speed = norm(np.gradient(tool, time, axis=0))
     jerk = norm(np.asarray(trajectory(time, 3)))
-    return Profile(time, coordinates, tool, speed, jerk, np.asarray(each.min(axis=-1)))
+    return Profile(time, coordinates, tool, speed, jerk, each[:, 0], each[:, 1])
 
 
 def executed_profile(segments: list[Segment]) -> Profile:
@@ -89,26 +90,32 @@ def executed_profile(segments: list[Segment]) -> Profile:
     speed = norm(np.gradient(tool, time, axis=0)) if len(time) > 2 else np.zeros_like(time)
     rows = np.unique(np.linspace(0, len(time) - 1, 2 * SAMPLES).astype(int))
     unknown = np.full(len(rows), np.nan)
-    return Profile(time[rows], joints[rows], tool[rows], speed[rows], unknown, clearance[rows])
+    return Profile(time[rows], joints[rows], tool[rows], speed[rows], unknown, clearance[rows], unknown)
 
 
 def execute_whole(env: ReachVectorEnv, scene: LiveScene, plan: Plan) -> Iterator[Segment]:
     """Execute a plan of one movement as one segment."""
     env.reset(options=scene.options())
-    info = env.execute_plan(_batch(plan)).info
-    yield _segment(env.last_rollout[0], 0, scene, info)
+    info = env.execute_plan(in_batch(plan)).info
+    yield _segment(env, 0, info)
 
 
-def execute_stepwise(env: ReachVectorEnv, agent: Any, scene: LiveScene) -> Iterator[Segment]:
+def execute_stepwise(env: ReachVectorEnv, act: Decide, scene: LiveScene) -> Iterator[Segment]:
     """Execute the velocities of an agent to the end of the episode, as one segment."""
+    info, _ = play_episode(env, scene, act)
+    yield _segment(env, 0, info)
+
+
+def play_episode(env: ReachVectorEnv, scene: LiveScene, decide: Decide) -> tuple[dict[str, Any], float]:
+    """Play one episode in a batch of one, and return its last metrics and its total reward."""
     observation, _ = env.reset(options=scene.options())
-    over = False
+    total, over = 0.0, False
     while not over:
-        actions, _ = agent.predict(observation, deterministic=True)
-        decision = env.execute_actions(actions)
+        decision = env.execute_actions(decide(observation))
         observation = decision.observation
+        total += float(decision.reward[0])
         over = bool(decision.terminated[0] or decision.truncated[0])
-    yield _segment(env.last_rollout[0], 0, scene, decision.info)
+    return decision.info, total
 
 
 def execute_replanning(
@@ -126,10 +133,10 @@ def execute_replanning(
         goal_of: Function that returns the present goal, which the user may drag, shape (D,).
     """
     env.reset(options=scene.options())
-    decision = env.execute_plan(_batch(plan))
+    decision = env.execute_plan(in_batch(plan))
     done, known, offset, restarted = 0, 1, 0.0, False
     while True:
-        segment = _segment(env.last_rollout[0], done, scene, decision.info)
+        segment = _segment(env, done, decision.info)
         history = env.last_plans[0]
         newest = history[-1][1].take(0) if len(history) != known else None
         known, done = len(history), done + len(segment.time)
@@ -137,8 +144,10 @@ def execute_replanning(
         wanted, restarted = goal_of(), False
         moved = not np.array_equal(wanted, scene.goal)
         if decision.terminated[0] or decision.truncated[0]:
-            following = _following(env, scene, segment, wanted) if moved else None
-            if following is None or not decision.info["is_success"][0]:
+            if not moved or not decision.info["is_success"][0]:
+                return
+            following = _following(env, scene, segment, wanted)
+            if following is None:
                 return
             offset += float(segment.time[-1])
             scene, done, known, restarted = following, 0, 0, True
@@ -168,21 +177,26 @@ def _now(env: ReachVectorEnv) -> Any:
     return now._replace(velocity=np.zeros_like(now.velocity))
 
 
-def _segment(rollout: Rollout, first: int, scene: LiveScene, info: Mapping[str, Any]) -> Segment:
-    """Return the states of a rollout from one on."""
+def _segment(env: ReachVectorEnv, first: int, info: Mapping[str, Any]) -> Segment:
+    """Return the states of the last movement from one on."""
+    rollout = env.last_rollout[0]
+    time = rollout.time[first:]
+    assert env.scenes is not None
+    obstacles = env.scenes.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+    present = obstacles.present[0] if len(time) else slice(None)
     return Segment(
-        rollout.time[first:],
-        rollout.joints[first:],
-        rollout.hand[first:],
-        rollout.contact[first:],
-        rollout.clearance[first:],
-        None,
-        scene,
-        info,
+        time=time,
+        joints=rollout.joints[first:],
+        hand=rollout.hand[first:],
+        contact=rollout.contact[first:],
+        clearance=rollout.clearance[first:],
+        places=obstacles.centre[:, present],
+        plan=None,
+        info=info,
     )
 
 
-def _batch(plan: Plan) -> Plan:
+def in_batch(plan: Plan) -> Plan:
     """Return a plan as a batch of one."""
     return Plan(plan.waypoints[None], plan.durations[None])
 
@@ -198,5 +212,5 @@ def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
     if values["collision"]:
         return f"Failure: the arm touches something after {values['first_contact_time']:.2f} s."
     if not values["reachable"]:
-        return "Failure: the plan leaves the arm's reach, so the arm does not start."
+        return "Failure: the plan leaves the arm's reach."
     return f"Failure: {error} from the goal after {values['duration']:.2f} s{clear}."

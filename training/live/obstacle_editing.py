@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 
 from viapoint.envs import Box, Capsule, Cylinder, HalfSpace, Shape, Sphere
+from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float
 
 if TYPE_CHECKING:
+    from viapoint.training.live.scene import LiveScene
     from viapoint.training.live.setting import Setting
 
 KINDS = {
@@ -29,36 +31,43 @@ LEAST_SIZE = 1e-3
 STEEPEST = 89.99
 """Greatest elevation that is set, [deg]: the heading is kept."""
 WALL = 0.15
-"""Distance of a new wall from the movement, [m]."""
+"""Distance of a new wall from the movement, at least, [m]."""
 STEP, PLACES = 0.02, 20
 """Distance and number of the places to either side that are tried for a new obstacle, [m]."""
 
 
-def new_obstacle(setting: Setting, start: Float, goal: Float, others: tuple[Shape, ...], kind: str) -> Shape:
-    """Return a new obstacle beside the middle of a movement, clear of the others if there is room.
+def new_obstacle(setting: Setting, scene: LiveScene, kind: str) -> Shape:
+    """Return a new obstacle beside the middle of a movement, clear of the others and of both ends if there is room.
 
     A half-space is a wall along the movement, on the side away from the base of the arm.
 
     Args:
         setting: Arm and task.
-        start: Place of the tool at the start, shape (3,), [m].
-        goal: Place of the tool at the goal, shape (3,), [m].
-        others: Obstacles of the scene.
+        scene: Scene.
         kind: One of :data:`KINDS`.
     """
+    start, goal = setting.tool(scene.start), setting.tool(scene.goal)
     line, middle = goal - start, 0.5 * (start + goal)
     aside = np.array([-line[1], line[0], 0.0])
     aside /= max(float(np.linalg.norm(aside)), 1e-9)
+    way = STEP * np.arange(1, PLACES)[:, None] * aside
     if kind == "wall":
-        side = aside if aside @ middle >= 0.0 else -aside
-        return HalfSpace(position=middle + WALL * side, quaternion=quaternion_to(-side))
-    shape = _shape(setting, kind, quaternion_to(aside))
-    radius = float(np.min(shape.packed_size[:2])) if kind == "box" else float(shape.packed_size[0])
-    steps = np.arange(1, PLACES)[:, None] * STEP * aside
-    places = middle + np.stack((steps, -steps), axis=1).reshape(-1, 3)
+        side = 1.0 if aside @ middle >= 0.0 else -1.0
+        shape: Shape = HalfSpace(quaternion=quaternion_to(-side * aside))
+        places, radius = middle + side * (WALL * aside + way), 0.0
+    else:
+        shape = _shape(setting, kind, quaternion_to(aside))
+        places = middle + np.stack((way, -way), axis=1).reshape(-1, 3)
+        radius = float(np.min(shape.packed_size[:2])) if kind == "box" else float(shape.packed_size[0])
+    arm = setting.task.arm
     free = np.ones(len(places), bool)
-    for other in others:
-        free &= other.distance(places, radius) > 0.0
+    if kind != "wall":
+        for other in scene.obstacles:
+            free &= other.distance(places, radius) > 0.0
+    for end in (scene.start, scene.goal):
+        centres = sphere_centres(arm.chain, arm.spheres, setting.task.space.joints(end))
+        clear = shape.distance(centres - places[:, None]) > arm.spheres.radius
+        free &= clear.all(axis=-1)
     return dataclasses.replace(shape, position=places[free.argmax()])
 
 

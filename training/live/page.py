@@ -47,7 +47,7 @@ class LivePage:
 
     Example:
         >>> from viapoint.training import LivePage
-        >>> with LivePage("viapoint/PlanarObstacles-v0", port=0) as page:
+        >>> with LivePage(env="viapoint/PlanarObstacles-v0", port=0) as page:
         ...     page.url.rpartition(":")[0]  # page.wait() would serve it until Ctrl-C
         'http://127.0.0.1'
     """
@@ -107,7 +107,6 @@ class LivePage:
             session.join(JOIN)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
-        self._shared.close()
 
     def __enter__(self) -> Self:
         return self

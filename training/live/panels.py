@@ -15,9 +15,9 @@ from viapoint.training.live.obstacle_editing import BOX_SIZES, KINDS
 if TYPE_CHECKING:
     import viser
 
+    from viapoint.training.live.comparison import MethodResult
     from viapoint.training.live.decisions import Proposal
     from viapoint.training.live.movements import Profile
-    from viapoint.training.live.session import MethodResult
     from viapoint.training.live.setting import Setting
 
 WIDTH = 330
@@ -28,7 +28,7 @@ SHOWN_CLEARANCE = 0.25
 """Greatest clearance in the plot, [m]."""
 SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
 """Speeds of the playback."""
-JOINT_DURATIONS = 0.3, 6.0
+JOINT_DURATIONS = 0.3, 12.0
 """Least and greatest duration of the slider in joint space, [s]."""
 MOST_VIAS = 4
 """Greatest number of via-points of the slider."""
@@ -89,7 +89,7 @@ class Panels:
             self._table.content = _note("There is no plan in this scene.")
             return
         names = ("rank", "reward", "agent's value", "clearance", "time")
-        units = ("", "", "mm", "mm", "s")
+        units = ("", "", "", "mm", "s")
         self._table.content = _table(names, units, rows, bold=picked) + _note(
             f"{maker}, decided in {1e3 * seconds:.0f} ms"
         )

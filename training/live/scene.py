@@ -54,15 +54,12 @@ class LiveScene(NamedTuple):
         dimension = task.space.dimension
         start, goal = (finite_array(name, options[name], (dimension,)) for name in ("start", "goal"))
         obstacles = tuple(options.get("obstacles", ()))
-        jumps = options.get("jumps") or np.zeros((0, dimension + 1))
-        turns = options.get("turns") or np.zeros((len(obstacles), 4))
-        return cls(
-            start,
-            goal,
-            obstacles,
-            finite_array("jumps", jumps, (None, dimension + 1)),
-            finite_array("turns", turns, (len(obstacles), 4)),
-        )
+        jumps, turns = np.zeros((0, dimension + 1)), np.zeros((len(obstacles), 4))
+        if options.get("jumps"):
+            jumps = finite_array("jumps", options["jumps"], (None, dimension + 1))
+        if options.get("turns"):
+            turns = finite_array("turns", options["turns"], turns.shape)
+        return cls(start, goal, obstacles, jumps, turns)
 
     def to_json(self, env_id: str) -> str:
         """Return the scene as the text of a JSON file, with the names of its obstacles."""
@@ -71,16 +68,17 @@ class LiveScene(NamedTuple):
 
     def plain(self) -> dict[str, Any]:
         """Return the scene as plain numbers and lists; what does not change is left out."""
-        record: dict[str, Any] = {"start": self.start.tolist(), "goal": self.goal.tolist()}
+        options = self.options()
+        record: dict[str, Any] = {
+            name: np.asarray(value).tolist() for name, value in options.items() if name != "obstacles"
+        }
         record["obstacles"] = [shape.to_dict() for shape in self.obstacles]
-        for name in ("jumps", "turns"):
-            if getattr(self, name).any():
-                record[name] = getattr(self, name).tolist()
         return record
 
     def options(self) -> dict[str, Any]:
-        """Return the options of `reset`."""
-        return {**self._asdict(), "obstacles": list(self.obstacles)}
+        """Return the options of `reset`; what does not change is left out."""
+        changes = {name: getattr(self, name) for name in ("jumps", "turns") if getattr(self, name).any()}
+        return {"start": self.start, "goal": self.goal, "obstacles": list(self.obstacles), **changes}
 
     def with_obstacle(self, shape: Shape, row: int | None = None) -> LiveScene:
         """Return the scene with another obstacle in a row, or with one more."""

@@ -102,7 +102,7 @@ class SceneView:
         if self._planar:
             view: Any = ((-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0)
         else:
-            view = ((2.15, -1.60, 1.55), (0.12, 0.0, 0.34), (0.0, 0.0, 1.0), 34.0)
+            view = ((2.60, -2.00, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0)
         target = np.array(view[1])
         camera.up_direction = view[2]
         camera.position = target + away * (np.array(view[0]) - target)

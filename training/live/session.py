@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import time
 from collections import deque
@@ -11,10 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from viapoint.envs.common.types import Float
+from viapoint.envs import ReachVectorEnv, Scenes, Task
+from viapoint.envs.common.types import Float, Observation
+from viapoint.training.live.comparison import MethodResult, compare
 from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
 from viapoint.training.live.job_thread import TICK, Job, JobThread
 from viapoint.training.live.movements import (
+    SAMPLES,
+    Decide,
     Profile,
     Segment,
     describe_outcome,
@@ -22,18 +27,17 @@ from viapoint.training.live.movements import (
     execute_stepwise,
     execute_whole,
     executed_profile,
-    plan_profile,
 )
 from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes_of
 from viapoint.training.live.panels import BAD, GOOD, RESET, Panels
-from viapoint.training.live.scene_file import LiveScene, to_json, to_python
+from viapoint.training.live.scene import LiveScene, to_python
 from viapoint.training.live.scene_view import SceneView
 
 if TYPE_CHECKING:
     import viser
 
-    from viapoint.envs.mdp.task import Task
-    from viapoint.training.live.setting import MethodResult, Setting, Shared
+    from viapoint.envs import Plan
+    from viapoint.training.live.setting import Setting, Shared
 
 LATENCIES = 200
 """Changes whose latency is kept."""
@@ -61,6 +65,7 @@ class Session:
         self._by_hand: tuple[Float, float] | None = None
         self._duration: float | None = None
         self._selected: int | None = None
+        self._scenes: Scenes | None = None
         self._decision: Decision | None = None
         self._proposals: tuple[Proposal, ...] = ()
         self._picked = 0
@@ -72,8 +77,9 @@ class Session:
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         """Times from the last changes to the messages with their plans, [s]."""
         self._fading = False
-        self._envs: dict[Setting, Any] = {}
-        self._step_env: Any = None
+        self._turning = False
+        self._envs: dict[Setting, ReachVectorEnv] = {}
+        self._step_env: ReachVectorEnv | None = None
         self._origin = ""
         self._jobs = JobThread(
             f"viapoint-tab-{client.client_id}", begin=self._open, animate=self._animate, end=self._end,
@@ -85,6 +91,11 @@ class Session:
     def scene(self) -> LiveScene:
         """Present scene."""
         return self._scene
+
+    @property
+    def setting(self) -> Setting:
+        """Setting of the present scene: its task and who decides."""
+        return self._setting
 
     @property
     def proposal(self) -> Proposal | None:
@@ -127,6 +138,10 @@ class Session:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
         self._act("load", content)
 
+    def turn(self, quaternion: Float) -> None:
+        """Turn the tool at the goal to another orientation."""
+        self.post("drag turn", lambda: self._turn(quaternion))
+
     def _act(self, control: str, *values: Any) -> None:
         """Post the job of a control of the panels, with its values."""
         jobs: dict[str, Callable[..., None]] = {
@@ -145,6 +160,7 @@ class Session:
             "load": lambda content: self._take(self._shared.read(content), ""),
             "code": self._code,
             "picture": self._picture,
+            "rings": self._show_rings,
             "view": lambda: self._view.look_at_everything(),
         }
         self.post(control, lambda: jobs[control](*values))
@@ -154,12 +170,7 @@ class Session:
         return self._setting.task
 
     @property
-    def _fitted(self) -> LiveScene:
-        """Present scene with the rows of the present setting."""
-        return self._scene.with_shapes(self._task.scenes.shapes)
-
-    @property
-    def _env(self) -> Any:
+    def _env(self) -> ReachVectorEnv:
         """Environment of the present setting."""
         if self._setting not in self._envs:
             self._envs[self._setting] = self._setting.make_env()
@@ -171,15 +182,16 @@ class Session:
         shared = self._shared
         self._step_env = shared.own.make_step_env()
         self._kinds = shared.scene_kinds()
-        floor = float(shared.own.model.geom("table").pos[2])
+        floor = float(shared.model.geom("table").pos[2])
         self._client.gui.set_panel_label("Viapoint")
-        self._panels = Panels(self._client, shared.own, tuple(self._kinds), self._act)
+        self._panels = Panels(self._client, shared.own, shared.env_id, tuple(self._kinds), self._act)
         with self._client.atomic():
             self._view = SceneView(
-                self._client, self._task, shared.drawing(), floor,
+                self._client, shared.own, shared.drawing(), floor,
                 on_drag=lambda *event: self.post(f"drag {event[0]}", lambda: self._drag(*event)),
                 on_pick=lambda index: self.post("pick", lambda: self._pick(index)),
                 on_select=lambda row: self.post("select", lambda: self._select(row)),
+                on_turn=self.turn,
             )  # fmt: skip
         self._jobs.guard(lambda: self._draw_scene(next(iter(self._kinds))))
 
@@ -234,51 +246,74 @@ class Session:
         if changed:
             self._origin = origin
         with self._client.atomic():
-            self._view.show_scene(scene, self._selected)
-            self._view.pose(np.asarray(self._task.arm.inverse_kinematics(scene.start)))
+            self._show_ends()
+            self._view.show_obstacles(scene.obstacles, self._selected)
+            self._view.pose(self._task.space.joints(scene.start))
         if changed:
             self._panels.show_comparison(())
         self._decide()
 
-    def _drag(self, name: str, point: Float) -> None:
-        """Move what is dragged."""
+    def _show_ends(self) -> None:
+        scene, setting = self._scene, self._setting
+        joints = self._task.space.joints(scene.goal)
+        self._view.show_ends(setting.tool(scene.start), setting.tool(scene.goal), joints)
+
+    def _show_rings(self, shown: bool) -> None:
+        """Show the rings that turn the tool at the goal, or hide them."""
+        self._turning = shown
+        self._view.show_rings(self._setting.orientation(self._scene.goal) if shown else None)
+
+    def _turn(self, quaternion: Float) -> None:
+        """Turn the tool at the goal."""
+        scene, setting = self._scene, self._setting
+        goal = setting.moved(scene.goal, setting.tool(scene.goal), self._scenes, quaternion)
+        self._by_hand = None
+        self._set_scene(scene.at_rest()._replace(goal=goal), changed=True)
+
+    def _drag(self, name: str, place: Float) -> None:
+        """Move what is dragged to another place, shape (3,), [m]."""
         kind, _, number = name.partition(" ")
         if kind == "goal" and self._playing is not None and self._task.replanning:
-            self._move_goal(point)
+            self._move_goal(place)
         elif kind == "via":
-            self._move_via(int(number), point)
+            self._move_via(int(number), place)
         elif kind == "obstacle":
-            if int(number) >= len(self._scene.obstacles):
-                return
-            row = self._scene.obstacles[int(number)].copy()
-            row[: len(point)] = point
-            if self._selected != int(number):
-                self._select(int(number))
-            self._set_scene(self._scene.with_row(int(number), row), changed=True)
+            self._move_obstacle(int(number), place)
         else:
-            self._by_hand = None
-            scene = self._scene._replace(start=point)
-            if kind == "goal":
-                scene = self._scene._replace(goal=point, jumps=self._scene.jumps[:0])
-            self._set_scene(scene, changed=True)
+            self._move_end(kind, place)
 
-    def _move_goal(self, point: Float) -> None:
+    def _move_end(self, name: str, place: Float) -> None:
+        scene, setting = self._scene, self._setting
+        moved = setting.moved(getattr(scene, name), place, self._scenes)
+        self._by_hand = None
+        scene = scene._replace(start=moved) if name == "start" else scene.at_rest()._replace(goal=moved)
+        self._set_scene(scene, changed=True)
+        if self._turning:
+            self._show_rings(True)
+
+    def _move_obstacle(self, row: int, place: Float) -> None:
+        if row >= len(self._scene.obstacles):
+            return
+        shape = dataclasses.replace(self._scene.obstacles[row], position=place)
+        if self._selected != row:
+            self._select(row)
+        self._set_scene(self._scene.with_obstacle(shape, row), changed=True)
+
+    def _move_goal(self, place: Float) -> None:
         """Move the goal while the arm moves; an impossible one is refused."""
-        scene = self._scene._replace(goal=point, jumps=self._scene.jumps[:0])
-        margin = float(self._task.arm.reach_margin(point))
-        if margin < 0.0:
-            self._view.move_handle("goal", self._scene.goal)
-            raise ValueError(f"the goal would be {-margin:.3f} m out of the arm's reach")
-        self._scene = scene
-        self._view.move_handle("goal", point)
+        goal = self._setting.moved(self._scene.goal, place, None)
+        if not self._task.space.inside(goal):
+            raise ValueError("the goal would be out of the arm's reach")
+        self._scene = self._scene.at_rest()._replace(goal=goal)
+        self._show_ends()
 
-    def _move_via(self, number: int, point: Float) -> None:
+    def _move_via(self, number: int, place: Float) -> None:
         """Plan through a via-point that was dragged."""
         if self.proposal is None:
             return
         vias = np.array(self.proposal.plan.waypoints[1:-1])
         if number < len(vias):
-            vias[number] = point
+            vias[number] = self._setting.moved(vias[number], place, None)
             self._by_hand = vias, self.proposal.duration
             self._set_scene(self._scene, changed=False)
 
@@ -287,56 +322,66 @@ class Session:
         if row < len(self._scene.obstacles):
             self._selected = row
             self._view.show_obstacles(self._scene.obstacles, row)
-            self._panels.show_selected(f"obstacle {row}", sizes_of(self._scene.obstacles[row]))
+            self._show_selected()
+
+    def _show_selected(self) -> None:
+        if self._selected is None:
+            self._panels.show_selected("", None)
+            return
+        shape = self._scene.obstacles[self._selected]
+        name = shape.name or f"obstacle {self._selected}"
+        self._panels.show_selected(name, sizes_of(shape, self._setting.planar))
 
     def _resize(self, name: str, value: float) -> None:
         if self._selected is not None:
-            numbers = resized(self._scene.obstacles[self._selected], name, value)
-            self._set_scene(self._scene.with_row(self._selected, numbers), changed=True)
+            shape = resized(self._scene.obstacles[self._selected], name, value, self._setting.planar)
+            self._set_scene(self._scene.with_obstacle(shape, self._selected), changed=True)
 
     def _add(self, kind: str) -> None:
-        scene = self._scene.with_obstacle(new_obstacle(self._scene, kind))
+        scene = self._scene.with_obstacle(new_obstacle(self._setting, self._scene, kind))
         self._shared.setting_of(scene)
         self._selected = len(scene.obstacles) - 1
         self._set_scene(scene, changed=True)
-        self._panels.show_selected(f"obstacle {self._selected}", sizes_of(scene.obstacles[-1]))
+        self._show_selected()
 
     def _remove(self) -> None:
         row, self._selected = self._selected, None
         if row is not None:
             self._set_scene(self._scene.without(row), changed=True)
-        self._panels.show_selected("", None)
+        self._show_selected()
 
     # Decisions
 
     def _decide(self) -> None:
         """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
         self._decision, self._proposals, self._picked = None, (), 0
+        self._scenes = None
         try:
-            observation = self._setting.observe(self._fitted, self._env)
+            observation, _ = self._env.reset(options=self._scene.options())
         except ValueError:
-            self._view.show_plan(None, np.zeros((0, self._task.arm.dimension)), clear=False)
+            self._view.show_plan(None, np.zeros((0, 3)), clear=False)
             self._view.show_proposals([])
             self._panels.show_proposals((), 0, "", 0.0)
             self._panels.show_plots(None, None)
             raise
-        self._decision = decision = self._setting.decisions.choose(
-            observation, n_via=self._n_via, checks=self._checks
+        scenes = self._env.scenes
+        assert scenes is not None
+        self._scenes, decisions = scenes, self._setting.decisions
+        self._decision = decision = decisions.choose(
+            observation, scenes, n_via=self._n_via, checks=self._checks
         )
         chosen = decision.chosen
         if self._by_hand is not None:
-            chosen = self._setting.decisions.evaluate(observation, plan_by_hand(self._scene, *self._by_hand))
+            chosen = decisions.evaluate(scenes, plan_by_hand(self._scene, *self._by_hand))
         elif self._duration is not None:
             vias = np.asarray(chosen.plan.waypoints[1:-1])
-            chosen = self._setting.decisions.evaluate(
-                observation, plan_by_hand(self._scene, vias, self._duration)
-            )
+            chosen = decisions.evaluate(scenes, plan_by_hand(self._scene, vias, self._duration))
         self._proposals = (chosen,)
         self._show_plan()
         self._client.flush()
         self.decisions += 1
         self.latencies.append(time.perf_counter() - self._jobs.posted)
-        self.post("later proposals", lambda: self._add_proposals(observation, decision))
+        self.post("later proposals", lambda: self._add_proposals(observation, scenes, decision))
 
     def _show_plan(self) -> None:
         """Show the picked proposal, and say what it does."""
@@ -346,18 +391,20 @@ class Session:
         if limit and self._shared.own.agent is not None:
             remarks.append(f"The agent was trained {limit}, so the geometry search decides.")
         remark = " ".join(filter(None, remarks))
+        tool = self._setting.tool
         with self._client.atomic():  # one message
-            self._view.show_plan(plan.path(), np.asarray(plan.plan.waypoints[1:-1]), clear=plan.clear)
+            vias = tool(np.asarray(plan.plan.waypoints[1:-1]))
+            self._view.show_plan(tool(plan.profile.coordinates), vias, clear=plan.clear)
             if self._proposals[1:] == ():
                 self._view.show_proposals([])
             self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
             self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, remark)
 
-    def _add_proposals(self, observation: Any, decision: Decision) -> None:
+    def _add_proposals(self, observation: Observation, scenes: Scenes, decision: Decision) -> None:
         """Show the other proposals, and the profile of the plan."""
         if decision is not self._decision or self._playing is not None:
             return
-        others = self._setting.decisions.proposals(observation, decision)
+        others = self._setting.decisions.proposals(observation, scenes, decision)
         own = self._proposals[0]
         self._proposals = others if own.rank else (own, *others)
         self._show_details()
@@ -366,11 +413,12 @@ class Session:
         plan, decision = self.proposal, self._decision
         if plan is None or decision is None:
             return
-        others, profile = self._proposals, plan_profile(self._task, self._fitted, plan.plan)
+        others = self._proposals
+        paths = [self._setting.tool(each.profile.coordinates) for each in others]
         with self._client.atomic():
-            self._view.show_proposals([each.path() for each in others], [each.clear for each in others])
+            self._view.show_proposals(paths, [each.clear for each in others])
             self._panels.show_proposals(others, self._picked, decision.maker, decision.seconds)
-            self._panels.show_plots(profile, executed)
+            self._panels.show_plots(plan.profile, executed)
 
     def _pick(self, index: int) -> None:
         """Show another proposal as the plan."""
@@ -406,16 +454,15 @@ class Session:
         self._next_picture = 0.0
 
     def _segments(self) -> Iterator[Segment]:
-        plan = self.proposal
+        plan, setting = self.proposal, self._setting
         assert plan is not None
         if self._task.replanning:
-            decisions = self._setting.decisions
-            return execute_replanning(
-                self._env, decisions, self._fitted, plan.plan, lambda: self._scene.goal, self._checks
-            )
-        if self._step_env is not None and plan.rank == 1 and self._setting is self._shared.own:
-            return execute_stepwise(self._step_env, self._setting.agent, self._fitted)
-        return execute_whole(self._env, self._fitted, plan.plan)
+            checks, goal_of = self._checks, lambda: self._scene.goal
+            decide: Decide = lambda seen: setting.decisions.action(seen, checks)  # noqa: E731
+            return execute_replanning(self._env, decide, self._scene, plan.plan, goal_of)
+        if self._step_env is not None and plan.rank == 1 and setting is self._shared.own:
+            return execute_stepwise(self._step_env, setting.act, self._scene)
+        return execute_whole(self._env, self._scene, plan.plan)
 
     def _play(self, segments: Iterator[Segment], speed: float) -> Iterator[float]:
         """Show a movement at a speed relative to real time, and yield the time until the next picture, [s].
@@ -429,8 +476,8 @@ class Session:
                 began = time.monotonic() - float(segment.time[0]) / speed
             if segment.restarted:
                 hand = []
-            if segment.path is not None:
-                self._view.show_plan(segment.path, np.zeros((0, segment.hand.shape[-1])), clear=True)
+            if segment.plan is not None:
+                self._view.show_plan(self._path(segment.plan), np.zeros((0, 3)), clear=True)
             self._movement.append(segment)
             shown = 0
             while shown < len(segment.time):
@@ -447,35 +494,37 @@ class Session:
             self._view.pose(segment.joints[row])
             path = np.concatenate((*hand, segment.hand[: row + 1]))
             self._view.show_executed(path, contact=bool(segment.contact[: row + 1].any()))
-            scene = self._scene.batch()
-            if scene.courses.any():
-                self._view.show_obstacles(scene.places(segment.time[None, row : row + 1])[0, 0])
+            self._view.move_obstacles(segment.places[row])
+
+    def _path(self, plan: Plan) -> Float:
+        """Return places of the tool along a plan, shape (SAMPLES, 3), [m]."""
+        time = np.linspace(0.0, float(plan.duration), SAMPLES)
+        return self._setting.tool(np.asarray(plan.trajectory()(time)))
 
     def _finish(self) -> None:
-        """Say what came of the movement, and show its profile."""
+        """Tell the outcome of the movement, and show its profile."""
         segments = self._movement
-        info = segments[-1].info
-        text = describe_outcome({name: np.asarray(value).reshape(-1)[0] for name, value in info.items()})
+        text = describe_outcome(segments[-1].info, in_joints=not self._task.space.of_hand)
         self._panels.tell(text, GOOD if text.startswith("Success") else BAD)
         if not any(each.restarted for each in segments):
             self._show_details(executed_profile(segments))
 
     def _compare(self) -> None:
         """Compare methods, one job for each, so that changes of the scene come between."""
-        scene, setting = self._scene, self._setting
-        results: list[MethodResult] = []
-        setting.observe(self._fitted, self._env)  # an impossible scene is refused
-        rows = setting.compare(self._fitted, self._checks)
+        scene, results = self._scene, list[MethodResult]()
+        if self._scenes is None:
+            raise ValueError("methods are compared in possible scenes: move what stands in the way first")
+        methods = compare(self._setting, scene, self._shared.planner, self._checks)
 
         def step() -> None:
             if scene is not self._scene:
+                methods.close()
                 return
-            following = next(rows, None)
+            following = next(methods, None)
             self._panels.show_comparison(results, running=following[0] if following else "")
             if following is not None:
                 self._client.flush()
-                with setting.comparing:
-                    results.append(following[1]())
+                results.append(following[1]())
                 self.post("later comparison", step)
 
         step()
@@ -483,12 +532,12 @@ class Session:
     # Files
 
     def _save(self) -> None:
-        text = to_json(self._scene, self._setting.env_id)
-        self._download("scene.json", text.encode())
+        self._download("scene.json", self._scene.to_json(self._shared.env_id).encode())
 
     def _code(self) -> None:
-        setting, changing = self._setting, self._task.replanning
-        self._panels.show_code(to_python(self._fitted, setting.env_id, setting.env_kwargs, changing=changing))
+        shared = self._shared
+        code = to_python(self._scene, shared.env_id, shared.arguments(self._setting))
+        self._panels.show_code(code)
 
     def _picture(self) -> None:
         """Save a picture of the present view, rendered by the browser, as a PNG file on white."""

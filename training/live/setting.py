@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -13,13 +15,18 @@ import numpy as np
 
 from viapoint.envs import ReachVectorEnv, Scenes, Task, inverse_kinematics
 from viapoint.envs.arms.kinematics import forward
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import KINDS, quaternions_of
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.live.decisions import DecisionMaker
+from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene import LiveScene
+from viapoint.training.paper.lights import rows_of_lights
+from viapoint.training.planning.ompl_planner import MotionPlanner
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.scene_sets.scene_set import load, shipped_set
 
 MOST_SHOWN = 24
 """Greatest number of obstacles of a scene."""
@@ -66,6 +73,11 @@ class Setting:
         if self.stepwise is None or self.agent is None:
             return None
         return make_env(self.stepwise)
+
+    def act(self, observation: Observation) -> Float:
+        """Return the velocities that an agent of control steps chooses, shape (1, D)."""
+        actions, _ = self.agent.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=np.float64)
 
     def tool(self, coordinates: Float) -> Float:
         """Return places of the tool, shape (..., 3), [m], for coordinates of shape (..., D)."""
@@ -123,19 +135,59 @@ class Shared:
     Args:
         env_id: Id of the environment.
         agent: Agent; None for the geometry search.
+        model_file: MJCF file whose visible geoms are drawn as the arm.
         seed: Seed of the random scenes.
         env_kwargs: Arguments of the environment.
     """
 
-    def __init__(self, env_id: str, agent: Any, *, seed: int | None, env_kwargs: Mapping[str, Any]) -> None:
-        self.env_id, self.env_kwargs, self._seed = env_id, dict(env_kwargs), seed
-        env: Any = gym.make_vec(env_id, num_envs=1, **env_kwargs)
+    def __init__(
+        self,
+        env_id: str,
+        agent: Any = None,
+        *,
+        model_file: str | Path | None = None,
+        seed: int | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.env_id, self._env_kwargs, self._seed = env_id, dict(env_kwargs or {}), seed
+        self._model_file = model_file
+        env: Any = gym.make_vec(env_id, num_envs=1, **self._env_kwargs)
         self.model = env.unwrapped.model
         self.own = Setting(env.unwrapped.task, agent)
         """Setting of the agent."""
         env.close()
         self._wide: Setting | None = None
         self._making = threading.Lock()
+        self.drawing()  # a file that cannot be drawn is refused
+        self._decide_once()
+
+    def _decide_once(self) -> None:
+        """Make one decision, which loads compiled functions: the first decision takes no longer than others."""
+        env = self.own.make_env()
+        observation, _ = env.reset(seed=0)
+        assert env.scenes is not None
+        self.own.decisions.choose(observation, env.scenes)
+        env.close()
+
+    def drawing(self) -> ArmDrawing:
+        """Return the parts of the arm."""
+        return ArmDrawing(self.own.task.arm, self.model, self._model_file)
+
+    @functools.cached_property
+    def planner(self) -> MotionPlanner | None:
+        """Motion planner; None where plans are revised, and without its library."""
+        if self.own.task.replanning:
+            return None
+        try:
+            return MotionPlanner(SceneSimulation(self.env_id, 1, **self._env_kwargs))
+        except ValueError:
+            return None
+
+    def arguments(self, setting: Setting) -> dict[str, Any]:
+        """Return the arguments of an environment that has the scenes of a setting."""
+        if setting is self.own:
+            return self._env_kwargs
+        return {**self._env_kwargs, "shapes": setting.task.shapes, "n_obstacles": setting.task.n_obstacles}
 
     def setting_of(self, scene: LiveScene) -> Setting:
         """Return the agent's setting, or one with room for more obstacles of any shape, where the agent is not used.
@@ -181,27 +233,21 @@ class Shared:
 
         kinds: dict[str, Draw] = {"Random": random}
         for label, name in (("Test", "test"), ("Hard", "hard")):
-            scenes = frozen_scenes(name, self.env_id, self.env_kwargs)
-            if scenes is not None:
-                endless = _endless(scenes, task, name)
-                kinds[label] = lambda endless=endless: next(endless)  # type: ignore[misc]
+            path = shipped_set(name, task)
+            if path is not None:
+                kinds[label] = functools.partial(next, _endless(load(path, name).scenes, task, name))
+        if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
+            kinds["Lights 1985"] = functools.partial(next, _lights(self.own.height))
         return kinds
 
 
 def make_env(task: Task) -> ReachVectorEnv:
     """Return a batch of one environment of a task."""
-    arguments = {**task.as_dict(), "arm": task.arm}
-    return ReachVectorEnv(1, **{name: _argument(value) for name, value in arguments.items()}, threads=1)
-
-
-def frozen_scenes(name: str, env_id: str, env_kwargs: Mapping[str, Any]) -> Scenes | None:
-    """Return the scenes of a shipped set of an environment; None if there is none for these arguments."""
-    from viapoint.training.scene_sets.scene_set import frozen_fit, load
-
-    if not frozen_fit(name, env_id, env_kwargs):
-        return None
-    scenes: Scenes = load(name, env_id).scenes
-    return scenes
+    record = {**task.as_dict(), "arm": task.arm}
+    arguments: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in record.items()
+    }
+    return ReachVectorEnv(1, **arguments, threads=1)
 
 
 def _endless(scenes: Scenes, task: Task, name: str) -> Iterator[tuple[LiveScene, str]]:
@@ -210,6 +256,8 @@ def _endless(scenes: Scenes, task: Task, name: str) -> Iterator[tuple[LiveScene,
         yield LiveScene.of(scenes, task, row), f"Scene {row} of the set {name}."
 
 
-def _argument(value: Any) -> Any:
-    """Return a value of a task as an argument of an environment."""
-    return tuple(value) if isinstance(value, list) else value
+def _lights(half_height: float) -> Iterator[tuple[LiveScene, str]]:
+    """Yield the obstacle paradigm of Flash & Hogan 1985, pair by pair, again and again."""
+    for row in itertools.cycle(rows_of_lights(half_height=half_height)):
+        scene = LiveScene(row.start, row.goal, (row.lights,), np.zeros((0, 3)), np.zeros((1, 4)))
+        yield scene, f"From {row.first} to {row.last} past a row of lights, Flash & Hogan 1985."

@@ -12,19 +12,20 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import withStroke
 
-from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.scene import TARGETS
+from viapoint.envs.geometry.obstacles import unpack
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.io.files import MARK
+from viapoint.training.paper.lights import TARGETS
 from viapoint.training.paper.movements import (
+    ADULT,
     EDGE,
     Profile,
     SimulatedMovements,
     arm_profile,
     curved,
-    joint_velocity,
+    joint_motion,
     minimum_jerk_through,
     model_profile,
     passage_share,
@@ -69,7 +70,7 @@ from viapoint.training.paper.rows.double_step import (
 )
 from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
 from viapoint.training.paper.rows.straight import DURATION
-from viapoint.training.plotting.top_view import capsule
+from viapoint.training.plotting.top_view import footprint
 
 WIDTH = 8.5 / 2.54
 """Width of a column, [inch]."""
@@ -264,9 +265,8 @@ def joints() -> Figure:
 
 def _joint_column(ax: Float, movement: Trajectory, motion: SimulatedMovements) -> None:
     time = np.linspace(0.0, DURATION, 401)
-    position, velocity = movement.sample(401, (0, 1))
-    angle = np.asarray(ADULT.inverse_kinematics(position))
-    planned = (angle, joint_velocity(angle, velocity), required_torque(movement))
+    plan = joint_motion(movement)
+    planned = (plan.position, plan.velocity, required_torque(movement))
     reached = (motion.joints[0], np.gradient(motion.joints[0], motion.time, axis=0), motion.torque[0])
     within = motion.time[:-1] <= DURATION
     for row in range(3):
@@ -350,7 +350,7 @@ def _same_scales(axes: Float, duration: float) -> None:
 def obstacles(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 8: two movements around rows of lights, and the model through their points of greatest curvature."""
     figure, axes = sheet(3, 2, 10.5)
-    found = features(avoidance.executed, avoidance.scenes)
+    found = features(avoidance.executed, avoidance.plan)
     depth = np.array([each.valley_depth for each in avoidance.executed])
     for column, row in enumerate(np.argsort(depth)[[0, len(depth) // 2]].tolist()):
         _obstacle_column(axes[:, column], avoidance, row, found.bend[row])
@@ -368,13 +368,13 @@ def obstacles(avoidance: ObstacleMovements) -> Figure:
 
 
 def _obstacle_column(ax: Float, avoidance: ObstacleMovements, row: int, bend: float) -> None:
-    profile, scene = avoidance.executed[row], avoidance.scenes.take([row])
+    profile, (start, *_, goal) = avoidance.executed[row], avoidance.plan.waypoints[row]
     via = profile.place(bend)
     end = float(avoidance.motion.duration[row])
-    movement = minimum_jerk_through(np.stack((scene.start[0], via, scene.goal[0])), end)
+    movement = minimum_jerk_through(np.stack((start, via, goal)), end)
     plane(ax[0])
-    centre, half, radius = scene.obstacles[0, 0, :2], scene.obstacles[0, 0, 2:4], scene.obstacles[0, 0, 4]
-    ax[0].fill(*(100.0 * capsule(centre - half, centre + half, float(radius)).T), color=PALETTE.obstacle)
+    (lights,) = unpack(avoidance.scenes.obstacles, row)
+    ax[0].fill(*(100.0 * footprint(lights)[0].T), color=PALETTE.obstacle)
     path(ax[0], movement.sample(201, 0)[0], **MODEL)
     path(ax[0], profile.position, **ARM)
     dot(ax[0], via)
@@ -427,7 +427,7 @@ SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))
 def isochrony(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 10: passage times and their residuals on the simulated arm."""
     figure, axes = sheet(2, 2, 8.4)
-    found = features(avoidance.executed, avoidance.scenes)
+    found = features(avoidance.executed, avoidance.plan)
     along = np.linspace(0.001, 0.999, 400)
     for height, width in ((0.1, 0.6), (-HEIGHT, 2.2), (1.0, 1.1)):
         share = passage_share(curved(*ENDS, along, height))

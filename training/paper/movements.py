@@ -7,13 +7,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from viapoint.envs.arms.base import CollisionModel
-from viapoint.envs.arms.planar import ADULT
+from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
-from viapoint.envs.scenes.scene import TARGETS
-from viapoint.envs.sim.outcome import SETTLING
-from viapoint.envs.sim.simulator import Simulator
+from viapoint.envs.geometry.obstacles import no_obstacles
+from viapoint.envs.outcome import SETTLING
+from viapoint.envs.plans import Motion
+from viapoint.envs.simulator import Simulator
+from viapoint.envs.spaces import HandPlane
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
+from viapoint.training.paper.lights import TARGETS
+
+ADULT = arm_of("planar")
+"""Arm of an adult."""
+PLANE = HandPlane(ADULT)
+"""Plane of its hand."""
 
 
 def target(name: str) -> Float:
@@ -136,16 +144,15 @@ def instants(duration: float) -> Float:
 def track(duration: Float, position: Float, velocity: Float, acceleration: Float) -> SimulatedMovements:
     """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
     number, count = position.shape[:2]
-    simulator = Simulator(CollisionModel(ADULT, whole_arm=False), n_obstacles=0, num_envs=number, threads=1)
-    sims, start = np.arange(number), np.asarray(ADULT.inverse_kinematics(position[:, 0]))
-    simulator.place(sims, start, np.zeros((number, 0, 5)), np.zeros((number, 0), dtype=bool))
-    controls = ADULT.controls(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])
+    simulator = Simulator(ADULT, n_obstacles=0, num_envs=number)
+    planned = PLANE.joint_motion(Motion(position, velocity, acceleration))
+    start = planned.position[:, 0]
+    simulator.place(np.arange(number), start, no_obstacles(number))
+    controls = ADULT.controls(*planned)[:, :-1]
     ran = simulator.batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
     joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
     time, torque = TIMESTEP * np.arange(count), _torque(ran["qvel"], ran["actuator_force"])
-    return SimulatedMovements(
-        np.asarray(time), duration, position, np.asarray(ADULT.hand_position(joints)), joints, torque
-    )
+    return SimulatedMovements(np.asarray(time), duration, position, PLANE.coordinates(joints), joints, torque)
 
 
 def _torque(rates: Float, force: Float) -> Float:
@@ -155,33 +162,17 @@ def _torque(rates: Float, force: Float) -> Float:
     force at its limit does not depend on the rates.
     """
     change = np.diff(rates, axis=1, prepend=0.0)
-    return np.where(
-        np.abs(force) < np.array(ADULT.torque_limit), force - np.array(ADULT.damping) * change, force
-    )
+    return np.where(np.abs(force) < ADULT.torque_limit, force - ADULT.damping * change, force)
 
 
-def joint_velocity(joints: Float, hand_velocity: Float) -> Float:
-    """Return joint rates (..., 2), [rad/s], from hand velocities (..., 2), [m/s], by the inverse Jacobian."""
-    both = joints[..., 0] + joints[..., 1]
-    hand, fore = np.asarray(ADULT.hand_position(joints)), ADULT.lengths[1]
-    first = np.stack((-hand[..., 1], hand[..., 0]), axis=-1)
-    second = fore * np.stack((-np.sin(both), np.cos(both)), axis=-1)
-    jacobian = np.stack((first, second), axis=-1)
-    return np.asarray(np.linalg.solve(jacobian, hand_velocity[..., None])[..., 0])
+def joint_motion(movement: Trajectory, count: int = 401) -> Motion:
+    """Return angles, rates and accelerations of shoulder and elbow in a plan, shape (..., count, 2)."""
+    return PLANE.joint_motion(Motion(*movement.sample(count)))
 
 
 def required_torque(movement: Trajectory, count: int = 401) -> Float:
-    """Return the torque of shoulder and elbow that a plan requires, shape (..., count, 2), [N m].
-
-    The inverse dynamics with viscosity are the arm's controls less those of its servo:
-
-        torque = controls - stiffness angle - damping rate
-    """
-    position, velocity, acceleration = movement.sample(count)
-    joints = np.asarray(ADULT.inverse_kinematics(position))
-    rates = joint_velocity(joints, velocity)
-    servo = np.array(ADULT.stiffness) * joints + np.array(ADULT.damping) * rates
-    return np.asarray(ADULT.controls(position, velocity, acceleration) - servo)
+    """Return the torque of shoulder and elbow that a plan requires, with viscosity, shape (..., count, 2), [N m]."""
+    return torques(ADULT.chain, *joint_motion(movement, count))
 
 
 EDGE = 0.08

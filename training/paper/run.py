@@ -36,7 +36,7 @@ ROWS: dict[int, Callable[[], list[Claim]]] = {
     11: double_step.replanning_claims,
     13: double_step.double_step_claims,
 }
-"""Functions of the rows without an agent; row 12 needs its movements."""
+"""Functions of the rows; row 12 needs movements around obstacles."""
 
 
 class Drawing(NamedTuple):
@@ -45,7 +45,7 @@ class Drawing(NamedTuple):
     name: str
     caption: str
     draw: Callable[..., Figure]
-    of_agent: bool = False
+    around_lights: bool = False
     """True if `draw` takes the movements around obstacles."""
 
 
@@ -61,12 +61,12 @@ DRAWINGS = (
             "relative to d1 + d2. Dotted: passage of the via-point.", figures.height),
     Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", figures.place),
     Drawing("fig07_turned", "The same in other directions (Fig. 7).", figures.turned),
-    Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and the one "
-            "with the median depth (B), each with the model through its point of greatest curvature.",
-            figures.obstacles, of_agent=True),
+    Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and a "
+            "median one (B), each with the model through its point of greatest curvature.",
+            figures.obstacles, around_lights=True),
     Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
             "B, D: difference from the model. Grey squares: movements around rows of lights.",
-            figures.isochrony, of_agent=True),
+            figures.isochrony, around_lights=True),
     Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", figures.scaling),
     Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
             figures.valleys),
@@ -85,20 +85,20 @@ DRAWINGS = (
 
 
 def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
-    """Compute every row, row 12 with an agent, and draw every figure; each of the `STEPS` steps is reported."""
+    """Compute every row, row 12 with an agent or a search, and draw every figure; each step is reported."""
     claims: list[Claim] = []
     for row, compute in ROWS.items():
         report_step(f"row {row}")
         claims += compute()
     report_step("row 12")
-    avoidance = obstacles.agent_movements(agent)
+    avoidance = obstacles.light_movements(agent)
     claims += obstacles.obstacle_claims(avoidance)
     claims.sort(key=lambda claim: claim.row)
     pictures = []
     for drawing in DRAWINGS:
         report_step(drawing.name)
         with mpl.rc_context(figures.STYLE):
-            figure = drawing.draw(avoidance) if drawing.of_agent else drawing.draw()
+            figure = drawing.draw(avoidance) if drawing.around_lights else drawing.draw()
             picture, _ = figures.save(figure, out, drawing.name)
         pictures.append((picture, drawing.caption))
     return Reproduction(claims, pictures)

@@ -144,6 +144,31 @@ def position_at(
 
 
 @kernel
+def joints_at(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    instant: int,
+    start: Float,
+    offsets: Float,
+    position: Float,
+    joints: Float,
+) -> bool:
+    """Fill in position and joints at an instant of a movement, and return True within reach and joint ranges.
+
+    The arguments are those of :func:`place_arm`.
+    """
+    position_at(table, times, instant, start, offsets, position)
+    if setting.of_hand:
+        return bool(solve_planar(setting.chain, setting.joint_range, position[0], position[1], joints))
+    for j in range(len(joints)):
+        joints[j] = position[j]
+        if joints[j] < setting.joint_range[j, 0] or joints[j] > setting.joint_range[j, 1]:
+            return False
+    return True
+
+
+@kernel
 def place_arm(
     setting: Setting,
     table: MovementTable,
@@ -160,15 +185,8 @@ def place_arm(
     `position`, shape (D,), `joints`, shape (J,), and `placed` are memory; the other arguments are those of
     :func:`least_clearance`.
     """
-    position_at(table, times, instant, start, offsets, position)
-    if setting.of_hand:
-        if not solve_planar(setting.chain, setting.joint_range, position[0], position[1], joints):
-            return False
-    else:
-        for j in range(len(joints)):
-            joints[j] = position[j]
-            if joints[j] < setting.joint_range[j, 0] or joints[j] > setting.joint_range[j, 1]:
-                return False
+    if not joints_at(setting, table, times, instant, start, offsets, position, joints):
+        return False
     if setting.hand_alone:
         placed.ball[0, 0] = position[0]
         placed.ball[0, 1] = position[1]
@@ -221,7 +239,9 @@ def least_clearance(
     for k in range(len(table.order)):
         instant = table.order[k]
         time = duration * instant / (INSTANTS - 1)
-        if time > until:
+        if time > until:  # obstacles may change course until then, joint ranges do not
+            if not joints_at(setting, table, times, instant, start, offsets, place_of_hand, joints):
+                return OUTSIDE
             continue
         if not place_arm(setting, table, times, instant, start, offsets, place_of_hand, joints, placed):
             return OUTSIDE

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.replanning import NEARBY, revised_waypoints
@@ -29,6 +29,9 @@ Numbers = NDArray[np.floating[Any]]
 
 NEAR = 0.05
 """Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
+
+PROLONGED = 1.5
+"""Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints."""
 
 
 class Problem(NamedTuple):
@@ -104,6 +107,8 @@ class Moves(NamedTuple):
     """Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)."""
     relative: Float
     """Durations relative to that of the zero action, shape (B, H)."""
+    fast: Bool
+    """True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them."""
 
 
 def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
@@ -127,8 +132,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
             problem.remaining[:, None],
             vectors,
         )
-        offsets[..., -2, :] = problem.velocity[:, None] * duration[..., None]
-        offsets[..., -1, :] = problem.acceleration[:, None] * duration[..., None] ** 2
+        _set_motion(problem, duration, offsets)
     offsets[..., : task.n_via + 1, :] = waypoints[..., 1:, :] - waypoints[..., :1, :]
     flat = offsets.reshape(-1, columns, dimension)
     if layout.timing == "learned" and problem.remaining is None:
@@ -137,20 +141,39 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
         cost = np.einsum("hij,hid,hjd->h", table.cost[times], flat, flat)
     else:
         times, cost = table_costs(table, flat)
-    if layout.space == "joints" and problem.remaining is None:
+    fast = np.zeros(batch, bool)
+    if layout.space == "joints":
         limits = np.array(layout.rate_limit)
-        duration = duration * shortest_durations(table, times, flat, limits).reshape(batch)
+        shortest = shortest_durations(table, times, flat, limits).reshape(batch)
+        if problem.remaining is None:
+            duration = duration * shortest
+        else:
+            # A first plan is relative to the shortest; the environment prolongs later ones beyond the limits.
+            factor = np.exp(vectors[..., task.n_via * dimension] * layout.log_half_range)
+            resting = ~(problem.velocity.any(axis=-1) | problem.acceleration.any(axis=-1))
+            longer = np.clip(shortest / duration, 1.0, PROLONGED) * duration
+            duration = np.where(resting[:, None], layout.centre * factor * shortest, longer)
+            _set_motion(problem, duration, offsets)
+            times, cost = table_costs(table, flat)
+            fast = shortest_durations(table, times, flat, limits).reshape(batch) > 1.02 * duration
     length = np.maximum(norm(problem.goal - problem.start), NEARBY[layout.space])
     whole = layout.zero_duration(problem.start, problem.goal)
     straight = straight_jerk_cost(length, whole)[:, None]
     rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
-    return Moves(offsets, times.reshape(batch), duration, rough, duration / whole[:, None])
+    return Moves(offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)
+
+
+def _set_motion(problem: Problem, duration: Float, offsets: Float) -> None:
+    """Fill in the columns of offsets for the present motion, of plans of some durations, shape (B, H)."""
+    offsets[..., -2, :] = problem.velocity[:, None] * duration[..., None]
+    offsets[..., -1, :] = problem.acceleration[:, None] * duration[..., None] ** 2
 
 
 def worth_of(task: Task, problem: Problem, moves: Moves) -> Float:
     """Return the reward of plans that succeed, without the term for clearance, shape (B, H)."""
     weights = task.weights
     worth = weights.success - weights.smoothness * moves.rough - weights.duration * moves.relative
+    worth = worth - np.where(moves.fast, weights.success, 0.0)
     if problem.time_left is not None:
         late = moves.duration + SETTLING > problem.time_left[:, None]
         worth = worth - np.where(late, weights.success + weights.goal_error, 0.0)

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.arms.base import Arm
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Observation
+from viapoint.envs.episodes import Recorded
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Rollout
+from viapoint.envs.task import Task
 from viapoint.training.io.files import MARK
-from viapoint.training.plotting.top_view import draw_movement
+from viapoint.training.plotting.top_view import View, draw_movement
+from viapoint.training.rollouts.rollout import Decide
 
 TILE = 2.6
 """Width of one picture, [inch]."""
@@ -29,51 +29,54 @@ COLUMNS = 4
 """Greatest number of pictures in a row."""
 LINE = 28
 """Greatest number of characters of the heading above one picture."""
-VIEW = ((-0.53, 0.45), (-0.09, 0.75))
-"""Limits of x and y, [m]."""
+PLANE_VIEW: View = ((-0.53, 0.45), (-0.14, 0.75))
+"""View of the arm in the plane: limits of x and y, [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
     """Movement of a gallery."""
 
-    arm: Arm
-    scene: Scenes
-    """One row."""
-    plan: Plan
-    """One row."""
-    rollout: Rollout
+    task: Task
+    recorded: Recorded
+    """Episode."""
     title: str
     """Text beside the outcome, such as the difficulty of the scene."""
     success: bool
-    whole_arm: bool = False
-    """True where the links can touch obstacles, too."""
 
     @property
     def outcome(self) -> str:
         """Outcome in one word."""
         if self.success:
             return "success"
-        return "collision" if self.rollout.contact.any() else "missed"
+        return "collision" if self.recorded.rollout.contact.any() else "missed"
 
 
-def play(
-    env_id: str, scenes: Scenes, titles: Sequence[str], act: Callable[[int, Observation], Any], **kwargs: Any
-) -> list[Entry]:
-    """Simulate one movement in each scene; `act` returns the action from its row and its first observation."""
-    env: Any = gym.make(env_id, **kwargs)
-    inner, entries = env.unwrapped, []
+def play(env_id: str, scenes: Scenes, titles: Sequence[str], decide: Decide, **kwargs: Any) -> list[Entry]:
+    """Simulate an episode in each of N scenes.
+
+    Args:
+        env_id: Id of an environment.
+        scenes: Scenes.
+        titles: Title of each scene.
+        decide: Function of observations and scenes that returns actions, shape (N, m).
+        **kwargs: Keyword arguments of the environment.
+    """
+    envs: Any = gym.make_vec(env_id, num_envs=len(titles), **kwargs)
+    inner = envs.unwrapped
+    observation = inner.begin(scenes)
+    running, success = np.ones(len(titles), bool), np.zeros(len(titles), bool)
+    while running.any():
+        decision = inner.execute_actions(decide(observation, scenes), running)
+        observation = decision.observation
+        success = np.where(running, decision.info["is_success"], success)
+        running &= ~(decision.terminated | decision.truncated)
+    entries = []
     for row, title in enumerate(titles):
-        scene = scenes.take([row])
-        observation, _ = env.reset(options=scene.as_options())
-        success = bool(env.step(act(row, observation))[-1]["is_success"])
-        entries.append(
-            Entry(
-                arm=inner.task.arm, scene=scene, plan=inner.last_plan, rollout=inner.last_rollout, title=title,
-                success=success, whole_arm=inner.task.whole_arm,
-            )
-        )  # fmt: skip
-    env.close()
+        recorded = Recorded(scenes.take([row]), inner.last_plans[row], inner.last_rollout[row])
+        entry = Entry(task=inner.task, recorded=recorded, title=title, success=bool(success[row]))
+        entries.append(entry)
+    envs.close()
     return entries
 
 
@@ -87,7 +90,9 @@ def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
         raise ValueError("entries must hold at least one movement")
     columns = min(COLUMNS, len(entries))
     rows = -(-len(entries) // columns)
-    tall = TILE * (VIEW[1][1] - VIEW[1][0]) / (VIEW[0][1] - VIEW[0][0]) + 0.3
+    plane = entries[0].task.space_name == "hand"
+    (left, right), (low, high) = PLANE_VIEW if plane else ((0.0, 1.0), (0.0, 1.0))
+    tall = TILE * (high - low) / (right - left) + 0.3
     lines = textwrap.wrap(heading, LINE * columns)
     margin = 0.45 + 0.3 * bool(lines) + 0.2 * len(lines[1:]) + 0.3 * (columns == 1)
     figure = Figure(figsize=(TILE * columns, tall * rows + margin), dpi=RESOLUTION)
@@ -96,8 +101,8 @@ def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
     for axes in grid.flat[len(entries) :]:
         axes.set_axis_off()
     for axes, entry in zip(grid.flat, entries, strict=False):
-        shown = entry.arm, entry.scene, entry.plan, entry.rollout
-        draw_movement(axes, *shown, whole_arm=entry.whole_arm, view=VIEW, scale=0.7)
+        view = PLANE_VIEW if plane else None
+        draw_movement(axes, entry.task, entry.recorded, view=view, scale=0.7)
         colour = PALETTE.goal if entry.success else PALETTE.contact
         axes.set_title(entry.outcome, loc="left", fontsize=8.5, color=colour, fontweight="bold", pad=3)
         axes.set_title(entry.title, loc="right", fontsize=8, color=PALETTE.joint, pad=3)

@@ -2,93 +2,186 @@
 
 from __future__ import annotations
 
-from typing import Any
+import itertools
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 from scipy.spatial import ConvexHull
 
-from viapoint.envs.actions.via_points import Plan
-from viapoint.envs.arms.base import Arm, CollisionModel
+from viapoint.envs import Box, ConvexMesh, Cylinder, HalfSpace, PointCloud, Shape, Task
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.rows import obstacles_from_rows
-from viapoint.envs.rendering.overlay import FirstContact, Movement
+from viapoint.envs.episodes import Recorded
+from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.outcome import Rollout
+from viapoint.envs.plans import Plan
+from viapoint.envs.rendering.renderer import picture_of
+from viapoint.envs.rendering.scene_view import FADED, Picture
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.sim.outcome import Rollout
 
-VIEW = ((-0.56, 0.48), (-0.14, 0.90))
+View = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, [m]."""
-GOAL_RADIUS, START_RADIUS = 0.026, 0.018
+
+PLANE_VIEW: View = ((-0.56, 0.48), (-0.14, 0.90))
+"""View of the arm in the plane."""
+MARGIN = 0.1
+"""Margin around the movement of an arm in space, [m]."""
+GOAL_RADIUS, START_RADIUS, HAND_RADIUS = 0.026, 0.018, 0.015
 """Radii of the drawn circles, [m]."""
+CONTACT_TOLERANCE = 0.01
+"""Greatest clearance of an obstacle that counts as the one in contact, [m]."""
+CIRCLE = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
+"""Angles of the points of a drawn circle, [rad]."""
+
+
+class Contact(NamedTuple):
+    """First contact of a movement."""
+
+    obstacle: int
+    """Index among the obstacles of the scene; -1 if the arm touched itself."""
+    position: Float
+    """Centre of the nearest sphere of the arm, shape (3,), [m]."""
 
 
 def draw_movement(
     axes: Axes,
-    arm: Arm,
-    scene: Scenes,
-    plan: Plan | None = None,
-    rollout: Rollout | None = None,
+    task: Task,
+    recorded: Recorded,
     *,
-    whole_arm: bool = False,
     step: int | None = None,
     arm_shown: bool = True,
-    view: tuple[tuple[float, float], tuple[float, float]] = VIEW,
+    view: View | None = None,
     scale: float = 1.0,
 ) -> None:
-    """Draw a scene and, if given, a plan and its execution.
+    """Draw a scene, the plan, its execution up to a step, and the posture there or at the first contact.
 
     Args:
         axes: Axes to draw on; their frame and ticks are removed.
-        arm: Arm of the task.
-        scene: One scene.
-        plan: One plan, drawn as its path and via-points.
-        rollout: Its execution, drawn as the path, the first contact, and the posture there or at the end.
-        whole_arm: True where the links can touch obstacles, too.
+        task: Task.
+        recorded: Episode, or one of :func:`planned_only`.
         step: Last state that is drawn, 0 for the start; None for the whole movement.
         arm_shown: False to leave out the arm.
-        view: Limits of x and y, [m].
+        view: Limits of x and y, [m]; by default those of :func:`view_of`.
         scale: Factor on line widths.
     """
-    _prepare(axes, view)
-    _draw_ends(axes, scene, scale)
-    if plan is not None:
-        _draw_plan(axes, plan, scale)
-    joints, hand, contact = np.asarray(arm.inverse_kinematics(scene.start))[0], scene.start[0], None
-    if plan is not None and rollout is not None:
-        movement = Movement.of(CollisionModel(arm, whole_arm), scene, plan, rollout)
-        last = len(movement.hand) - 1 if step is None else step
-        _draw_execution(axes, movement, last, scale)
-        contact = movement.contact if movement.contact is not None and last >= movement.contact.step else None
-        pose = contact.step if contact is not None and step is None else last
-        joints, hand = movement.joints[pose], movement.hand[pose]
-    _draw_obstacles(axes, arm, scene, None if contact is None else contact.obstacle)
+    last = len(recorded.rollout.time) if step is None else step
+    picture = picture_of(task, recorded, last)
+    if step is None and picture.touched < last:
+        picture = picture_of(task, recorded, picture.touched)
+    touched = picture.touched < len(picture.done)
+    contact = first_contact(task.arm, picture) if touched else None
+    plane = task.space_name == "hand"
+    _prepare(axes, view_of(task, recorded) if view is None else view)
+    _draw_ends(axes, picture, scale)
+    _draw_paths(axes, picture, scale)
+    rim = HAND_RADIUS if plane and not task.whole_arm else 0.0
+    for number, shape in enumerate(unpack(picture.obstacles, 0)):
+        hit = contact is not None and contact.obstacle == number
+        _draw_obstacle(axes, shape, PALETTE.contact if hit else PALETTE.obstacle, rim)
     if arm_shown:
-        _draw_arm(axes, arm, joints, above=not whole_arm)
-        colour = PALETTE.contact if contact is not None and contact.link is None else PALETTE.executed
-        axes.add_patch(Circle(_xy(hand), arm.hand_radius, color=colour, linewidth=0, zorder=7))
+        _draw_arm(axes, task.arm, picture.joints, 0.38 if rim else 0.75)
+        colour = PALETTE.executed if contact is None else PALETTE.contact
+        axes.add_patch(Circle(_xy(picture.done[-1]), HAND_RADIUS, color=colour, linewidth=0, zorder=7))
     if contact is not None:
-        _draw_contact(axes, contact, scale)
+        _draw_cross(axes, contact.position, scale)
 
 
-def capsule(first: Float, second: Float, radius: float) -> Float:
-    """Return the outline of a capsule in the plane, shape (66, 2), [m]."""
-    along = np.arctan2(*(second - first)[1::-1]) if np.any(first != second) else 0.0
-    angle = along + np.linspace(-np.pi / 2, np.pi / 2, 33)
-    arc = radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    return np.concatenate((second[:2] + arc, first[:2] - arc))
+def planned_only(scene: Scenes, plan: Plan | None = None) -> Recorded:
+    """Return the record of a scene, and a plan of one row, that has not been executed."""
+    joints = scene.start.shape[1]
+    empty = np.zeros(0)
+    rollout = Rollout(
+        time=empty,
+        planned=np.zeros((0, 0 if plan is None else plan.waypoints.shape[-1])),
+        joints=np.zeros((0, joints)),
+        hand=np.zeros((0, 3)),
+        contact=np.zeros(0, bool),
+        clearance=empty,
+    )
+    return Recorded(scene, [] if plan is None else [(0.0, plan)], rollout)
 
 
-def widened_outline(outline: Float, distance: float) -> Float:
-    """Return the outline of all points within a distance of a convex outline, shape (K, 2) both, [m]."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
-    circle = distance * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    points = (outline[:, None] + circle).reshape(-1, 2)
-    return np.asarray(points[ConvexHull(points).vertices])
+def view_of(task: Task, recorded: Recorded) -> View:
+    """Return the part of the plane that shows an episode: a square."""
+    if task.space_name == "hand":
+        return PLANE_VIEW
+    arm, scene = task.arm, recorded.scene
+    joints = np.concatenate((scene.start, scene.goal, recorded.rollout.joints[::50]))
+    places = sphere_centres(arm.chain, arm.spheres, joints).reshape(-1, 3)[:, :2]
+    shapes = [shape for shape in unpack(scene.obstacles, 0) if not isinstance(shape, HalfSpace)]
+    points = np.concatenate([places, *(outline for shape in shapes for outline in footprint(shape))])
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.5 * float((high - low).max()) + MARGIN
+    x, y = _xy(0.5 * (low + high))
+    return (x - half, x + half), (y - half, y + half)
 
 
-def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) -> None:
+def first_contact(arm: Arm, picture: Picture) -> Contact:
+    """Return the obstacle that is nearest to a moving link of the arm in a picture of a contact."""
+    moving = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) > 0
+    centres = sphere_centres(arm.chain, arm.spheres, picture.joints)[moving]
+    found, least = Contact(-1, picture.done[-1]), CONTACT_TOLERANCE
+    for number, shape in enumerate(unpack(picture.obstacles, 0)):
+        clearance = shape.distance(centres) - arm.spheres.radius[moving]
+        if clearance.min() < least:
+            found, least = Contact(number, centres[clearance.argmin()]), float(clearance.min())
+    return found
+
+
+def footprint(shape: Shape, rim: float = 0.0) -> list[Float]:
+    """Return the outlines of a shape from above, widened by a rim, convex polygons of shape (K, 2) each, [m].
+
+    A half-space is a large square if it is a wall; a floor or a ceiling has no outline.
+    """
+    if isinstance(shape, HalfSpace):
+        normal = shape.rotation[:2, 2]
+        if np.linalg.norm(normal) < 0.7:
+            return []
+        normal = normal / np.linalg.norm(normal)
+        along = np.array([-normal[1], normal[0]])
+        corners = [4.0 * (way * along - depth * normal) for way in (-1.0, 1.0) for depth in (0.0, 1.0)]
+        return [outline(shape.position[:2] + np.array(corners), rim)]
+    points, radius = _outer_points(shape)
+    places = (points @ shape.rotation.T + shape.position)[:, :2]
+    if isinstance(shape, PointCloud):
+        return [outline(place[None], radius + rim) for place in places]
+    return [outline(places, radius + rim)]
+
+
+def outline(points: Float, radius: Any) -> Float:
+    """Return the outline of the convex hull of discs around points, shape (K, 2), [m].
+
+    Args:
+        points: Centres of the discs, shape (n, 2), [m].
+        radius: Radius of all discs, or of each, shape (n,), [m].
+    """
+    circle = np.stack((np.cos(CIRCLE), np.sin(CIRCLE)), axis=-1)
+    discs = points[:, None] + np.reshape(radius, (-1, 1, 1)) * circle
+    around = discs.reshape(-1, 2)
+    return np.asarray(around[ConvexHull(around).vertices])
+
+
+def _outer_points(shape: Shape) -> tuple[Float, float]:
+    """Return points in the frame of a shape, (n, 3), and the radius of balls of which it is the hull, [m]."""
+    if isinstance(shape, Box):
+        return np.array(list(itertools.product(*((-half, half) for half in shape.size)))), 0.0
+    if isinstance(shape, ConvexMesh):
+        return np.asarray(shape.vertices), 0.0
+    if isinstance(shape, PointCloud):
+        return np.asarray(shape.points), shape.radius
+    if isinstance(shape, Cylinder):
+        rim = [shape.radius * np.cos(CIRCLE), shape.radius * np.sin(CIRCLE)]
+        ends = [np.stack((*rim, np.full(len(CIRCLE), way * shape.half_length)), axis=-1) for way in (-1, 1)]
+        return np.concatenate(ends), 0.0
+    radius, half, _ = shape.packed_size
+    return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(radius)
+
+
+def _prepare(axes: Axes, view: View) -> None:
     axes.set(xlim=view[0], ylim=view[1], xticks=[], yticks=[], aspect="equal", facecolor=PALETTE.table)
     for spine in axes.spines.values():
         spine.set_visible(False)
@@ -98,59 +191,49 @@ def _prepare(axes: Axes, view: tuple[tuple[float, float], tuple[float, float]]) 
             lines(place, color="black", alpha=0.045, linewidth=0.8, zorder=0)
 
 
-def _draw_obstacles(axes: Axes, arm: Arm, scene: Scenes, touched: int | None) -> None:
-    """Draw footprints with a rim of the hand's radius, which the centre of the hand must not enter."""
-    rows = np.flatnonzero(scene.present[0])
-    for row, shape in zip(rows, obstacles_from_rows(scene.obstacles[0, rows]), strict=True):
-        colour: Colour = PALETTE.contact if row == touched else PALETTE.obstacle
-        for outline in shape.footprint():
-            rim = widened_outline(outline, arm.hand_radius)
-            axes.add_patch(Polygon(rim, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
-            axes.add_patch(Polygon(outline, facecolor=colour, linewidth=0, zorder=3))
+def _draw_obstacle(axes: Axes, shape: Shape, colour: Colour, rim: float) -> None:
+    """Draw the footprint of an obstacle with a rim, which the centre of the hand must not enter."""
+    for wide in footprint(shape, rim) if rim else []:
+        axes.add_patch(Polygon(wide, facecolor=colour, alpha=0.20, linewidth=0, zorder=2))
+    for each in footprint(shape):
+        alpha = 1.0 if rim else 0.8
+        axes.add_patch(Polygon(each, facecolor=colour, alpha=alpha, linewidth=0, zorder=3))
 
 
-def _draw_ends(axes: Axes, scene: Scenes, scale: float) -> None:
-    start, goal = _xy(scene.start[0]), _xy(scene.goal[0])
-    axes.add_patch(
-        Circle(start, START_RADIUS, fill=False, color=PALETTE.start, linewidth=1.8 * scale, zorder=1)
-    )
-    axes.add_patch(Circle(goal, GOAL_RADIUS, fill=False, color=PALETTE.goal, linewidth=2.2 * scale, zorder=1))
-    axes.add_patch(Circle(goal, 0.6 * GOAL_RADIUS, color=PALETTE.goal, linewidth=0, zorder=1))
+def _draw_ends(axes: Axes, picture: Picture, scale: float) -> None:
+    start, goal = (_xy(end) for end in picture.ends)
+    thin = {"fill": False, "zorder": 4.1}
+    axes.add_patch(Circle(start, START_RADIUS, color=PALETTE.start, linewidth=1.8 * scale, **thin))
+    axes.add_patch(Circle(goal, GOAL_RADIUS, color=PALETTE.goal, linewidth=2.2 * scale, **thin))
+    axes.add_patch(Circle(goal, 0.6 * GOAL_RADIUS, color=PALETTE.goal, linewidth=0, zorder=4.1))
 
 
-def _draw_plan(axes: Axes, plan: Plan, scale: float) -> None:
-    """Draw the planned path and its via-points, wide enough to show as a rim of the executed path."""
-    single = Plan(np.asarray(plan.waypoints).reshape(-1, plan.waypoints.shape[-1]), np.ravel(plan.durations))
-    path = np.asarray(single.trajectory()(np.linspace(0.0, float(single.durations.sum()), 121)))
-    axes.plot(*path[:, :2].T, color=PALETTE.plan, linewidth=4.6 * scale, solid_capstyle="round", zorder=4)
-    vias = single.waypoints[1:-1]
-    axes.plot(
-        *vias[:, :2].T, "o", color=PALETTE.via, markersize=7.5 * scale, markeredgecolor="white", zorder=6
-    )  # fmt: skip
+def _draw_paths(axes: Axes, picture: Picture, scale: float) -> None:
+    """Draw plans, wide enough to show as rims of the executed path, and this path, red after contact."""
+    wide: Any = {"linewidth": 4.6 * scale, "solid_capstyle": "round", "zorder": 4}
+    for path in picture.replaced:
+        axes.plot(*path[:, :2].T, color=FADED, **wide)
+    axes.plot(*picture.planned[:, :2].T, color=PALETTE.plan, **wide)
+    style: Any = {"markersize": 7.5 * scale, "markeredgecolor": "white", "zorder": 6}
+    axes.plot(*picture.vias[:, :2].T, "o", color=PALETTE.via, **style)
+    done, free = picture.done[:, :2], picture.touched
+    for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
+        axes.plot(*part.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
 
 
-def _draw_execution(axes: Axes, movement: Movement, step: int, scale: float) -> None:
-    """Draw the executed path up to a step, red after contact."""
-    free = step if movement.contact is None else min(step, movement.contact.step)
-    for first, last, colour in ((0, free, PALETTE.executed), (free, step, PALETTE.contact)):
-        executed = movement.hand[first : last + 1, :2]
-        axes.plot(*executed.T, color=colour, linewidth=1.9 * scale, solid_capstyle="round", zorder=5)
+def _draw_arm(axes: Axes, arm: Arm, joints: Float, alpha: float) -> None:
+    """Draw the bodies of the arm as hulls of their spheres."""
+    centres = sphere_centres(arm.chain, arm.spheres, joints)[:, :2]
+    for first, last in itertools.pairwise(arm.spheres.first):
+        hull = outline(centres[first:last], arm.spheres.radius[first:last])
+        axes.add_patch(Polygon(hull, facecolor=PALETTE.arm, alpha=alpha, linewidth=0, zorder=6.5))
+        axes.add_patch(Polygon(hull, fill=False, edgecolor=PALETTE.joint, linewidth=0.7, zorder=6.6))
 
 
-def _draw_arm(axes: Axes, arm: Arm, joints: Float, *, above: bool) -> None:
-    """Draw the links, transparent where they pass above the obstacles."""
-    for (first, second), radius in zip(np.asarray(arm.links(joints)), arm.link_radii, strict=True):
-        outline = capsule(first[:2], second[:2], radius)
-        alpha = 0.38 if above else 0.75
-        axes.add_patch(Polygon(outline, facecolor=PALETTE.arm, alpha=alpha, linewidth=0, zorder=6.5))
-        axes.add_patch(Polygon(outline, fill=False, edgecolor=PALETTE.joint, linewidth=0.7, zorder=6.6))
-        axes.add_patch(Circle(_xy(first), 0.4 * radius, color=PALETTE.joint, linewidth=0, zorder=6.7))
-
-
-def _draw_contact(axes: Axes, contact: FirstContact, scale: float) -> None:
+def _draw_cross(axes: Axes, position: Float, scale: float) -> None:
     """Draw a cross at the first contact."""
     for colour, size, width in (("white", 10.5, 4.4), (PALETTE.contact, 9.5, 2.4)):
-        (cross,) = axes.plot(*_xy(contact.position), "x", color=colour, zorder=8)
+        (cross,) = axes.plot(*_xy(position), "x", color=colour, zorder=8)
         cross.set(markersize=size * scale, markeredgewidth=width * scale)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Frame, Observation
+from viapoint.envs.common.types import Frame
+from viapoint.envs.episodes import Recorded
 from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.io.files import MARK, check_ours
-from viapoint.training.plotting.top_view import draw_movement
-
-Decide = Callable[[Observation, Scenes], Any]
+from viapoint.training.plotting.top_view import draw_movement, view_of
+from viapoint.training.rollouts.rollout import Decide
 
 CAPTION = 48
 """Height of the caption below the picture, [pixels]."""
@@ -41,14 +41,14 @@ log = logging.getLogger(__name__)
 def record_video(
     path: str | Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, *, name: str = "agent"
 ) -> int:
-    """Record one movement in each scene as an MP4, and return the number of frames.
+    """Record one episode in each scene as an MP4, and return the number of frames.
 
     Without an OpenGL library the movements are drawn from above, and one warning names the package to install.
 
     Args:
         path: MP4 file; its folder must exist.
         env: Environment made with `render_mode="rgb_array_list"`.
-        scenes: Scenes with no more obstacles than the environment has rows.
+        scenes: Scenes with as many rows for obstacles as the environment has.
         decide: Function from observation and scene, of one row each, to actions, shape (1, m).
         name: Name of the method, for the caption.
 
@@ -79,15 +79,10 @@ def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterat
     number = len(scenes.start)
     for i in range(number):
         scene = scenes.take([i])
-        observation, _ = camera.env.reset(options=scene.as_options())
-        over = False
-        while not over:
-            action = np.asarray(decide({k: v[None] for k, v in observation.items()}, scene))[0]
-            observation, _, terminated, truncated, info = camera.env.step(action.astype(np.float32))
-            over = terminated or truncated
+        info = camera.play(scene, decide)
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
         hold = round(PAUSE * SPEED * camera.fps)
-        yield from _with_captions(camera.frames(scene), left, *describe_outcome(info), hold=hold)
+        yield from _with_captions(camera.frames(), left, *describe_outcome(info), hold=hold)
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
@@ -123,36 +118,45 @@ def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:
 
 
 class Camera:
-    """Source of the frames of an environment's last movement, rendered with OpenGL if available."""
+    """Source of the frames of an environment's episodes, rendered with OpenGL if available."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self.env = env
+        self._env: Any = env.unwrapped
         self.fps = float(env.metadata["render_fps"])
         self.rendered = True
         """False once OpenGL has failed."""
 
-    def frames(self, scene: Scenes) -> Iterator[Frame]:
-        """Yield the frames of the last movement, which took place in `scene`, each of shape (height, width, 3)."""
+    def play(self, scene: Scenes, decide: Decide) -> dict[str, Any]:
+        """Simulate an episode, and return the info of its last decision."""
+        batch = self._env.batch
+        observation = batch.begin(scene)
+        while True:
+            decision = batch.execute_actions(decide(observation, scene))
+            observation = decision.observation
+            if decision.terminated[0] or decision.truncated[0]:
+                return {name: value[0] for name, value in decision.info.items()}
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames of the last episode, each of shape (height, width, 3)."""
         if self.rendered:
             try:
-                yield from self.env.render()  # type: ignore[misc]
+                yield from self._env.render()
                 return
             except GLUnavailableError as error:
                 self.rendered = False
                 log.warning("the video shows a drawn view from above: %s", error)
-        yield from self._drawn(scene)
+        yield from self._drawn()
 
-    def _drawn(self, scene: Scenes) -> Iterator[Frame]:
-        inner: Any = self.env.unwrapped
+    def _drawn(self) -> Iterator[Frame]:
+        batch, task = self._env.batch, self._env.task
+        recorded = Recorded(batch.scenes, batch.last_plans[0], batch.last_rollout[0])
         figure = Figure(figsize=(4.8, 4.8), dpi=100)
         canvas: Any = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        for step in frame_steps(inner.last_rollout.time, round(self.fps)):
+        view = view_of(task, recorded)
+        for step in frame_steps(recorded.rollout.time, round(self.fps)):
             axes.clear()
-            draw_movement(
-                axes, inner.task.arm, scene, inner.last_plan, inner.last_rollout,
-                whole_arm=inner.task.whole_arm, step=int(step),
-            )  # fmt: skip
+            draw_movement(axes, task, recorded, step=int(step), view=view)
             canvas.draw()
             yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

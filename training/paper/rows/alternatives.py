@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.types import Float
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
 from viapoint.training.paper.movements import (
+    ADULT,
+    PLANE,
     SimulatedMovements,
     curved,
     instants,
@@ -29,10 +30,10 @@ ONSET = 0.02
 
 def joint_space(ends: Float) -> SimulatedMovements:
     """Simulate movements of minimum joint jerk between starts and goals, shape (N, 2, 2), [m]."""
-    joints = np.asarray(ADULT.inverse_kinematics(ends))
+    joints = PLANE.joints(ends)
     time = instants(DURATION)
     angles = np.asarray(point_to_point(joints[:, 0], joints[:, 1], DURATION)(time))
-    position = np.asarray(ADULT.hand_position(angles))
+    position = PLANE.coordinates(angles)
     velocity = np.gradient(position, time, axis=1)
     acceleration = np.gradient(velocity, time, axis=1)
     return track(np.full(len(ends), DURATION), position, velocity, acceleration)
@@ -237,13 +238,13 @@ def torque_limited() -> Trajectory:
 
 def _relative_torque(movement: Trajectory) -> float:
     """Return the greatest torque of either joint relative to its limit."""
-    return float((np.abs(required_torque(movement)) / np.array(ADULT.torque_limit)).max())
+    return float((np.abs(required_torque(movement)) / ADULT.torque_limit).max())
 
 
 def _torque_claims() -> list[Claim]:
     fastest = torque_limited()
     motion, late = simulate(fastest), simulate(fastest.stretched(HURRY * fastest.duration))
-    used = float((np.abs(motion.torque) / np.array(ADULT.torque_limit)).max())
+    used = float((np.abs(motion.torque) / ADULT.torque_limit).max())
     return [
         Claim(
             row=10, claim=f"T3-T6 in the least time within the torque limits ({float(fastest.duration):.3f} s): peak "

@@ -1,7 +1,9 @@
-"""Row 12: comparison of an agent that avoids the paper's rows of lights with the paper's subjects."""
+"""Row 12: comparison of a method that avoids the paper's rows of lights with the paper's subjects."""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -9,15 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.actions.via_points import Plan
 from viapoint.envs.common.types import Float
-from viapoint.envs.registration import TASKS
-from viapoint.envs.scenes.scene import Scenes, check_scenes, rows_of_lights
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.plans import Plan
+from viapoint.envs.scenes.scene import Scenes, check_scenes, resting
+from viapoint.envs.task import Task
 from viapoint.primitives import speed_valleys
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
+from viapoint.training.paper.lights import rows_of_lights
 from viapoint.training.paper.movements import (
+    PLANE,
     Profile,
     SimulatedMovements,
     arm_profile,
@@ -28,19 +33,20 @@ from viapoint.training.paper.movements import (
     simulate,
 )
 from viapoint.training.paper.rows.curved import FAST, SLOW
-from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.baselines import Method, agent_method
+from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)
 """Lengths of the rows of lights, [m]; the paper's were up to 25 cm."""
 RADII = (0.008, 0.02)
-"""Radii of the rows of lights, [m]."""
+"""Half widths of the rows of lights, [m]."""
 SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
 """Offsets of a row's middle from the middle of the line between the targets, along and across it, [m]."""
 
 
 class ObstacleMovements(NamedTuple):
-    """Successful movements of an agent around rows of lights."""
+    """Successful movements of a method around rows of lights."""
 
     name: str
     scenes: Scenes
@@ -53,39 +59,47 @@ class ObstacleMovements(NamedTuple):
     executed: list[Profile]
 
 
-def light_scenes() -> Scenes:
-    """Return 252 scenes with rows of lights of several lengths, widths and places between each two targets."""
-    parts = [_shifted(length, radius, shift) for length in LENGTHS for radius in RADII for shift in SHIFTS]
-    return Scenes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+def light_scenes(n_rows: int) -> Scenes:
+    """Return 252 scenes with rows of lights of several lengths, widths and places between each two targets.
+
+    Args:
+        n_rows: Rows for obstacles, of which the first is used.
+    """
+    ends, lights = [], []
+    for length, radius, shift in itertools.product(LENGTHS, RADII, SHIFTS):
+        for row in rows_of_lights(length, radius):
+            along = (row.goal - row.start) / np.linalg.norm(row.goal - row.start)
+            left = np.array([-along[1], along[0]])
+            moved = row.lights.position + np.append(shift[0] * along + shift[1] * left, 0.0)
+            lights.append([dataclasses.replace(row.lights, position=moved)])
+            ends.append((row.start, row.goal))
+    joints = PLANE.joints(np.array(ends))
+    return resting(joints[:, 0].copy(), joints[:, 1].copy(), pack(lights, n_rows))
 
 
-def _shifted(length: float, radius: float, shift: tuple[float, float]) -> Scenes:
-    _, scenes = rows_of_lights(length, radius)
-    line = scenes.goal - scenes.start
-    along = line / np.linalg.norm(line, axis=-1, keepdims=True)
-    left = np.stack((-along[:, 1], along[:, 0]), axis=-1)
-    scenes.obstacles[:, 0, :2] += shift[0] * along + shift[1] * left
-    return scenes
-
-
-def agent_movements(agent: Path | None) -> ObstacleMovements:
-    """Simulate the agent of a run folder, or the shipped one, around the rows of lights."""
-    scenes = light_scenes()
-    found = load_agent(agent or DEFAULT_ENV)
-    method = agent_method("agent", found, 0)
-    simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
-    check_scenes(scenes, simulation.task.collision_model)
-    missing = simulation.task.scenes.n_obstacles[1] - scenes.obstacles.shape[1]
-    padded = scenes._replace(obstacles=np.pad(scenes.obstacles, ((0, 0), (0, missing), (0, 0))))
-    action = method.decide(simulation.observe(padded), padded)
+def light_movements(agent: Path | None) -> ObstacleMovements:
+    """Simulate the movements of an agent, or without one of a search, around the rows of lights."""
+    method: Method
+    if agent is None:
+        simulation = SceneSimulation(DEFAULT_ENV, 256)
+        method = GeometrySearch(simulation.task)
+    else:
+        found = load_agent(agent)
+        simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
+        method = agent_method("agent", found, 0)
+    task = simulation.task
+    scenes = light_scenes(task.observation.n_rows)
+    check_scenes(scenes, task.arm)
+    action = method.decide(simulation.observe(scenes), scenes)
     success = simulation(scenes, action).success
     simulation.close()
     if not success.any():
         raise ValueError(f"{method.name} gets around none of {len(scenes.start)} rows of lights")
     kept = scenes.take(success)
-    plan = simulation.task.action.decode(action[success], kept.start, kept.goal)
-    movement = plan.trajectory()
-    motion = simulate(movement)
+    plan = task.action.decode(
+        action[success], task.space.coordinates(kept.start), task.space.coordinates(kept.goal)
+    )
+    motion = simulate(plan.trajectory())
     number = range(int(success.sum()))
     planned = [model_profile(plan.take(row).trajectory()) for row in number]
     executed = [arm_profile(motion, row) for row in number]
@@ -96,13 +110,14 @@ def check_agent(agent: Path) -> None:
     """Check that the scenes of the paper are scenes of an agent's task.
 
     Raises:
-        ValueError: The task is spatial, has no obstacles, or needs several decisions for a movement.
+        ValueError: The task is not of the hand in the plane, has no boxes, or needs several decisions for a movement.
     """
     found = load_agent(agent)
-    (task,) = found.get_env().get_attr("task", 0)  # type: ignore[union-attr]
-    if found.env_id not in TASKS or task.arm.dimension != 2 or not task.scenes.n_obstacles[1]:
+    task: Task = found.get_env().get_attr("task", 0)[0]  # type: ignore[union-attr]
+    fits = task.whole_movement and task.space_name == "hand" and task.arm.name == "planar"
+    if not fits or not task.n_obstacles[1] or "box" not in task.shapes:
         raise ValueError(
-            f"agent must be of a task of the plane with obstacles in which one decision is a whole movement, such as "
+            f"agent must be of a task of the plane with boxes in which one decision is a whole movement, such as "
             f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
         )
 
@@ -124,14 +139,15 @@ class Features(NamedTuple):
     """Greatest distance from the model through that point / distance of the targets, as in Fig. 8."""
 
 
-def features(profiles: list[Profile], scenes: Scenes) -> Features:
+def features(profiles: list[Profile], plan: Plan) -> Features:
     """Compute the features of the paper's analysis, with the point of greatest curvature as via-point."""
     valley = np.array([each.valley for each in profiles])
     bend = np.array([each.bend[0] for each in profiles])
     agrees = np.zeros(len(bend), dtype=bool)
     via, (residual, apart) = np.full((len(bend), 2), np.nan), np.full((2, len(bend)), np.nan)
     for row in np.flatnonzero(np.isfinite(bend)):
-        points = np.stack((scenes.start[row], profiles[row].place(bend[row]), scenes.goal[row]))
+        start, *_, goal = plan.waypoints[row]
+        points = np.stack((start, profiles[row].place(bend[row]), goal))
         model = minimum_jerk_through(points)
         via[row] = construction(points)
         residual[row] = bend[row] - passage_share(model)
@@ -143,7 +159,7 @@ def features(profiles: list[Profile], scenes: Scenes) -> Features:
 
 def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
     """Return the claims of row 12."""
-    both = features(avoidance.planned, avoidance.scenes), features(avoidance.executed, avoidance.scenes)
+    both = features(avoidance.planned, avoidance.plan), features(avoidance.executed, avoidance.plan)
     worst = avoidance.motion.worst
     who = f"{avoidance.name}, {len(avoidance.executed)} movements"
 

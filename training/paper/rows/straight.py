@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from viapoint.envs.arms.planar import ADULT
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import (
     SimulatedMovements,
-    joint_velocity,
+    joint_motion,
     minimum_jerk_through,
     required_torque,
     simulate,
@@ -170,9 +169,8 @@ def same_movement_elsewhere() -> tuple[Trajectory, SimulatedMovements]:
 
 def _profiles(movement: Trajectory) -> tuple[Float, Float]:
     """Return hand speed (T,) and joint velocities (T, 2) of the plan, each relative to its peak."""
-    position, velocity = movement.sample(401, (0, 1))
-    rates = joint_velocity(np.asarray(ADULT.inverse_kinematics(position)), velocity)
-    return _relative(np.linalg.norm(velocity, axis=-1)), _relative(rates)
+    speed = np.linalg.norm(movement.sample(401, 1)[0], axis=-1)
+    return _relative(speed), _relative(joint_motion(movement).velocity)
 
 
 def _arm_profiles(motion: SimulatedMovements) -> tuple[Float, Float]:

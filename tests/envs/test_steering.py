@@ -1,0 +1,147 @@
+"""Tasks with an action in every control step."""
+
+import itertools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from episodes import GOAL, START, STEP, WALL, given
+
+from viapoint.envs.outcome import SETTLING
+from viapoint.envs.plans import Motion
+from viapoint.envs.steering import Steering
+
+
+def steering(timestep=0.002, physics_steps=20, space="hand"):
+    return Steering(
+        space=space,
+        names=("along", "across"),
+        top_speed=(1.5, 1.5),
+        bandwidth=25.0,
+        physics_steps=physics_steps,
+        timestep=timestep,
+    )
+
+
+def some_motion(number=5, seed=0):
+    values = np.random.default_rng(seed).normal(size=(4, number, 2))
+    return Motion(*values[:3]), values[3]
+
+
+def towards(env, observation, points):
+    """Steer the hand past points to the last of them, and return all steps of the episode."""
+    points = [np.asarray(point, dtype=float) for point in points]
+    along = (GOAL - START) / np.linalg.norm(GOAL - START)
+    frame = np.stack((along, (-along[1], along[0])))
+    steps = []
+    while True:
+        hand = observation["hand"][:2]
+        if len(points) > 1 and np.linalg.norm(hand - points[0]) < 0.03:
+            points = points[1:]
+        velocity = 8.0 * (points[0] - hand) - 0.3 * observation["velocity"]
+        action = frame @ velocity / np.array(env.task.steering.top_speed)
+        observation, *rest = env.step(action.astype(np.float32))
+        steps.append((observation, *rest))
+        if rest[1] or rest[2]:
+            return steps
+
+
+def test_each_derivative_of_the_reference_is_that_of_the_one_before_and_control_steps_join():
+    fine = steering(2e-4, 200)
+    motion, _ = some_motion()
+    for _, wanted in (some_motion(seed=seed) for seed in range(3)):
+        whole = fine.follow(motion, wanted, 200)
+        for value, rate in itertools.pairwise(whole):
+            slope = (value[:, 2:] - value[:, :-2]) / (2.0 * fine.timestep)
+            np.testing.assert_allclose(slope, rate[:, 1:-1], atol=1e-4 * np.abs(rate).max())
+        for part, begin in zip(whole, motion, strict=True):
+            np.testing.assert_allclose(part[:, 0], begin, rtol=1e-12)
+        motion = Motion(*(part[:, -1] for part in whole))
+
+
+def test_the_filter_obeys_its_equation_and_the_jerk_cost_is_its_integral():
+    fine = steering(1e-4, 400)
+    motion, wanted = some_motion()
+    reference, w = fine.follow(motion, wanted, 400), fine.bandwidth
+    law = w**2 * (wanted[:, None] - reference.velocity) - 2.0 * w * reference.acceleration
+    slope = np.gradient(reference.acceleration, fine.timestep, axis=1)
+    np.testing.assert_allclose(slope[:, 1:-1], law[:, 1:-1], atol=1e-4 * np.abs(law).max())
+    cost = 0.5 * np.trapezoid((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
+    np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-5)
+
+
+@pytest.mark.parametrize("space", ["hand", "joints"])
+def test_the_zero_action_brings_to_rest_and_no_action_exceeds_the_bounds(space):
+    usual, generator = steering(space=space), np.random.default_rng(1)
+    motion = Motion.at_rest(np.zeros((64, 2)))
+    for _ in range(200):
+        action = np.sign(generator.normal(size=(64, 2)))
+        wanted = usual.decode(action, np.zeros((64, 2)), generator.normal(size=(64, 2)))
+        whole = usual.follow(motion, wanted, 20)
+        assert np.abs(whole.velocity).max() <= 2.0 * max(usual.top_speed) + 1e-12
+        assert np.abs(whole.acceleration).max() <= usual.greatest_acceleration + 1e-12
+        motion = Motion(*(part[:, -1] for part in whole))
+    for _ in range(15):
+        motion = Motion(*(part[:, -1] for part in usual.follow(motion, np.zeros((64, 2)), 20)))
+    assert np.abs(motion.velocity).max() < 1e-4
+
+
+def test_it_arrives_where_nothing_is_in_the_way():
+    steps = towards(*given(STEP), [GOAL])
+    *_, terminated, truncated, info = steps[-1]
+    assert terminated
+    assert not truncated
+    assert info["is_success"]
+    assert len(steps) * 0.04 == pytest.approx(info["duration"] + SETTLING, abs=0.041)
+    assert info["path_length"] == pytest.approx(0.4, abs=0.02)
+    assert info["tracking_error"] < 1e-3
+
+
+def test_the_way_round_succeeds_where_the_straight_line_crashes():
+    crash = towards(*given(STEP, [WALL]), [GOAL])[-1]
+    assert crash[2]
+    assert crash[-1]["collision"]
+    assert not crash[-1]["is_success"]
+    around = towards(*given(STEP, [WALL]), [(-0.2, 0.56), (-0.05, 0.56), GOAL])
+    info = around[-1][-1]
+    assert info["is_success"]
+    assert 0.0 < info["min_clearance"] < 0.1
+    progress = sum(step[-1]["reward_progress"] for step in around)
+    assert progress == pytest.approx(1.0 - info["goal_error"] / 0.4)
+
+
+def test_time_runs_out():
+    env, observation = given(STEP, [WALL])
+    number = int(np.ceil(env.task.time_limit / 0.04 - 1e-9))
+    assert observation["time_left"] == pytest.approx(env.task.time_limit)
+    zero = np.zeros(2, np.float32)
+    for step in range(1, number + 1):
+        observation, _, terminated, truncated, info = env.step(zero)
+        assert not terminated
+        assert truncated == (step == number)
+    assert not info["is_success"]
+    assert info["goal_error"] == pytest.approx(0.4, abs=1e-3)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(zero)
+
+
+def test_a_reference_out_of_reach_ends_the_episode():
+    env, _ = given(STEP)
+    terminated = False
+    while not terminated:
+        before = env.physics_steps
+        observation, _, terminated, truncated, info = env.step(np.array([0.0, 1.0], np.float32))
+        assert not truncated
+    assert not any(info[name] for name in ("reachable", "is_success", "collision"))
+    assert env.physics_steps == before
+    assert env.observation_space.contains(observation)
+
+
+def test_the_rollout_is_the_movement_so_far():
+    env, observation = given(STEP)
+    towards(env, observation, [GOAL])
+    rollout = env.last_rollout
+    assert rollout.planned.shape == (len(rollout.time), 2)
+    assert np.abs(rollout.hand[:, :2] - rollout.planned).max() < 2e-3
+    np.testing.assert_allclose(rollout.hand[-1, :2], GOAL, atol=0.01)
+    assert len(rollout.time) % env.task.steering.physics_steps == 0
