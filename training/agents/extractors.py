@@ -22,7 +22,7 @@ SHORTEST = 1e-6
 class SceneExtractor(BaseFeaturesExtractor):
     """Features of a scene that do not depend on the order or the maximum number of its obstacles.
 
-    Where plans are made in hand space, obstacles are seen from the middle of the line from hand to goal, in a frame along
+    Where plans are of the hand, obstacles are seen from the middle of the line from hand to goal, in a frame along
     it; in joint space, from the base. One network encodes each row; the features are the sum and the maximum over the
     obstacles that are present (Zaheer et al. 2017, Deep Sets, arXiv 1703.06114). The other parts of the observation are
     scaled to order one.

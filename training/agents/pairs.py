@@ -1,11 +1,11 @@
 """Pairs of a sphere of the arm and an obstacle during planned movements, as inputs of one network, and this network.
 
-The clearance of a movement is a minimum over time, spheres of the arm and obstacles. A critic with this structure learns
-from the outcome of single movements which pair determined it:
+The clearance of a movement is a minimum over time, spheres of the arm and obstacles. A critic with this structure
+learns from the outcome of single movements which pair determined it:
 
     m(s, a) = min over obstacles i, spheres h, instants t of q(centre of h in the frame of i at t, size and kind of i)
 
-Kinematics places the spheres. For each obstacle and link, the pair whose sphere is nearest to the obstacle's bounding box
+Kinematics places the spheres. For each obstacle and link the pair whose sphere is nearest to the obstacle's box
 stands for all instants; of these, the network sees the nearest ones. The distance from the surface is learned, not
 computed.
 """
@@ -105,9 +105,7 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
 
 
 @kernel
-def _box_gap(
-    rotation: Float, dx: float, dy: float, dz: float, half: Float, local: Float
-) -> float:
+def _box_gap(rotation: Float, dx: float, dy: float, dz: float, half: Float, local: Float) -> float:
     """Fill in a point in the frame of a box, and return its signed distance from the box, [m]."""
     largest, outside = -NOWHERE, 0.0
     for axis in range(3):
@@ -216,7 +214,11 @@ class PairNetwork(nn.Module):
     def __init__(self, kinds: int, width: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(LENGTHS + kinds, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
+            nn.Linear(LENGTHS + kinds, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, 1),
         )
         self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]))
         """Slope and offset of a skip connection from the distance of the bounding box. It makes the nearest pair the

@@ -257,7 +257,9 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         shape = len(batch.ended), self.next_candidates
         chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
         chosen[:, 0] = 0
-        values = critic(policy.inputs(Problem.of_observation(batch.next_observations, policy.task), every[chosen]))
+        values = critic(
+            policy.inputs(Problem.of_observation(batch.next_observations, policy.task), every[chosen])
+        )
         worth = critic.value(values)
         worth[:, 0] += KEEP
         best = worth.argmax(dim=1, keepdim=True)

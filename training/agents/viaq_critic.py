@@ -74,8 +74,8 @@ class _Saturated(torch.autograd.Function):
 class ViaQCritic(nn.Module):
     """Network that predicts the value of plans from their margin and effort.
 
-    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement stays
-    within reach and joint ranges, and how far the arm is from itself, s(a):
+    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement
+    stays within reach and joint ranges, and how far the arm is from itself, s(a):
 
         P(clear) = sigmoid(k m + b) sigmoid(k' s + b'),  P(success) = P(clear) sigmoid(d + r(s, a)),
         Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(min(m, s)) + e(s, a)

@@ -427,7 +427,9 @@ class DemoConfig(Config):
     def _check(self) -> None:
         check_env(self.env)
         if not registered_task(self.env).whole_movement:
-            raise ValueError(f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}")
+            raise ValueError(
+                f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}"
+            )
         check_folder("out", self.out)
 
     @property

@@ -77,9 +77,7 @@ class OpenLoopBaseline:
 
     def __init__(self, method: Method, simulation: SceneSimulation) -> None:
         self.name, self._method = f"{method.name}, no revision", method
-        self._simulation = SceneSimulation(
-            simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()}
-        )
+        self._simulation = SceneSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the decision of the method, see :class:`Method`."""

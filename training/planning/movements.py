@@ -216,7 +216,7 @@ def least_clearance(
     joints: Float,
     placed: Placed,
 ) -> float:
-    """Return the least clearance of a movement, at most `least`, [m]; OUTSIDE where it leaves the reach or joint ranges.
+    """Return the least clearance of a movement, at most `least`, [m]; OUTSIDE where it leaves reach or joint ranges.
 
     The search stops at the first clearance below `floor`.
 

@@ -35,8 +35,8 @@ def candidate_margins(observation: Mapping[str, NDArray[Any]], task: Task, numbe
     """Return the computed margins of fixed candidate plans, shape (B, number), [m].
 
     The margin of a plan is its clearance, clipped to +- BOUND; -BOUND where it leaves the reach. Candidate k is the
-    same action in every observation, see :func:`~viapoint.training.planning.candidates.candidate_actions`; the first one
-    is the zero action.
+    same action in every observation, see :func:`~viapoint.training.planning.candidates.candidate_actions`; the first
+    one is the zero action.
     """
     actions = candidate_actions(task, number, replanning=task.replanning)
     every = np.broadcast_to(actions, (len(observation["hand"]), *actions.shape))

@@ -100,7 +100,7 @@ class MotionPlanner:
         return float(found.min())
 
     def _path(self, scene: Scenes, margin: float) -> Float | None:
-        """Return the corners of a clear path with start and goal, shape (P, J), [rad]; None if none is found in time."""
+        """Return corners of a clear path with start and goal, shape (P, J), [rad]; None if none is found in time."""
         ends = np.concatenate((scene.start, scene.goal))
 
         def is_clear(first: Float, second: Float) -> bool:

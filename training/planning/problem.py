@@ -150,9 +150,9 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
         else:
             # A first plan is relative to the shortest; the environment prolongs later ones beyond the limits.
             factor = np.exp(vectors[..., task.n_via * dimension] * layout.log_half_range)
-            resting = ~(problem.velocity.any(axis=-1) | problem.acceleration.any(axis=-1))
+            resting = ~np.asarray((problem.velocity != 0.0) | (problem.acceleration != 0.0)).any(axis=-1)
             longer = np.clip(shortest / duration, 1.0, PROLONGED) * duration
-            duration = np.where(resting[:, None], layout.centre * factor * shortest, longer)
+            duration = np.where(np.asarray(resting)[:, None], layout.centre * factor * shortest, longer)
             _set_motion(problem, duration, offsets)
             times, cost = table_costs(table, flat)
             fast = shortest_durations(table, times, flat, limits).reshape(batch) > 1.02 * duration

@@ -47,10 +47,10 @@ INFEASIBLE = -1e6
 class GeometrySearch:
     """Planner that checks a fixed set of actions with computed geometry and takes the best one.
 
-    The candidates are the zero action and the points of a Sobol sequence, the same ones in every scene. They are checked
+    The candidates are the zero action and the points of a Sobol sequence, the same in every scene. They are checked
     in the order of the reward that they would have without obstacles, until no other one can be better. Where nothing
-    moves, clearance does not depend on the duration; then all candidates but the first have the duration of the greatest
-    reward.
+    moves, clearance does not depend on the duration; then all candidates but the first have the duration of the
+    greatest reward.
 
     When replanning, the present plan is kept as long as it is clear and no other plan is better by KEEP_BONUS. Where no
     plan is clear to its end, the search takes one that is clear for the longest of HORIZONS.

@@ -1,4 +1,4 @@
-"""Rollouts of actions and of methods in given scenes: whole movements, replanning, and actions in every control step."""
+"""Rollouts of actions and of methods in given scenes: whole movements, replanning, actions in every control step."""
 
 from __future__ import annotations
 

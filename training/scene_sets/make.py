@@ -14,13 +14,13 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import tyro
 
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.registration import ENV_IDS, twin_of
+from viapoint.envs.registration import ENV_IDS, TASKS, twin_of
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.sampler import is_planar
 from viapoint.envs.scenes.scene import Scenes, check_scenes
@@ -64,12 +64,20 @@ HARD_SHARE = 0.01
 class MakeConfig:
     """Make the frozen sets of scenes."""
 
-    env: tuple[str, ...] = tuple(dict.fromkeys(twin_of(each) for each in ENV_IDS))
+    env: tuple[str, ...] = field(default_factory=lambda: _ids())
     """Ids of environments."""
     sets: tuple[str, ...] = SETS
     """Names of sets."""
     check: bool = False
     """Make the sets that ship again, and compare their hashes."""
+
+
+def _ids() -> tuple[str, ...]:
+    """Return the ids of environments whose scenes differ; a set fits every task with the same scenes."""
+    first: dict[str, str] = {}
+    for env_id in dict.fromkeys(twin_of(each) for each in ENV_IDS):
+        first.setdefault(str(TASKS[env_id]), env_id)
+    return tuple(first.values())
 
 
 @dataclass(frozen=True)
@@ -207,9 +215,7 @@ class Maker:
 
 def _take(candidates: Candidates, rows: Bool) -> Candidates:
     """Return some of the candidates."""
-    return dataclasses.replace(
-        candidates, scenes=candidates.scenes.take(rows), share=candidates.share[rows]
-    )
+    return dataclasses.replace(candidates, scenes=candidates.scenes.take(rows), share=candidates.share[rows])
 
 
 def _hardest(found: list[Candidates], number: int) -> Candidates:
