@@ -427,7 +427,7 @@ class Episodes:
         """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
         assert self.scenes is not None
         return {
-            "scenes": copy.deepcopy(self.scenes),
+            "scenes": self.scenes.as_dict(),
             "metrics": {name: part.copy() for name, part in self.executor.state._asdict().items()},
             "plan": {name: part.copy() for name, part in self.plan._asdict().items()},
             "motion": {name: part.copy() for name, part in self._motion._asdict().items()},
@@ -439,7 +439,7 @@ class Episodes:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same task and number."""
-        self.start(np.arange(len(self.begun)), copy.deepcopy(state["scenes"]))
+        self.start(np.arange(len(self.begun)), Scenes.from_dict(state["scenes"]))
         put(self.executor.state, slice(None), type(self.executor.state)(**state["metrics"]))
         self.plan = Plan(**{name: np.array(part) for name, part in state["plan"].items()})
         put(self._motion, slice(None), Motion(**state["motion"]))

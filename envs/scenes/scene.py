@@ -90,6 +90,21 @@ class Scenes(NamedTuple):
             turn_velocity=np.concatenate([part.turn_velocity for part in parts]),
         )
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return copies of all arrays in nested dictionaries, for :meth:`from_dict`."""
+        obstacles = self.obstacles._asdict()
+        for name in ("meshes", "clouds"):
+            obstacles[name] = obstacles[name]._asdict()
+        return copy.deepcopy({**self._asdict(), "obstacles": obstacles})
+
+    @classmethod
+    def from_dict(cls, record: Mapping[str, Any]) -> Scenes:
+        """Return the scenes of a record of :meth:`as_dict`, with arrays of their own."""
+        parts = copy.deepcopy(dict(record))
+        meshes, clouds = Meshes(**parts["obstacles"]["meshes"]), Clouds(**parts["obstacles"]["clouds"])
+        parts["obstacles"] = Obstacles(**{**parts["obstacles"], "meshes": meshes, "clouds": clouds})
+        return cls(**parts)
+
     @property
     def jump_times(self) -> Float:
         """Times of the jumps, shape (N, MOST_JUMPS), [s]; NEVER for none."""

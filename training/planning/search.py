@@ -96,7 +96,8 @@ class GeometrySearch:
     @property
     def name(self) -> str:
         """Name in tables of results."""
-        return f"search, {self.total_checks} checks"
+        kind = "search, {} checks" if self.refinements else "{} fixed plans"
+        return kind.format(self.total_checks)
 
     def decide(self, observation: Mapping[str, Any], scenes: Any = None) -> Float:
         """Return the best action of each of B observations, shape (B, m).

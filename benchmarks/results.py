@@ -1,0 +1,103 @@
+"""Measure the shipped agents and the methods without learning in the frozen sets, and write the tables of results.md.
+
+python benchmarks/results.py --out docs/results.csv
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from viapoint.training import evaluate, load_agent
+from viapoint.training.config.checks import SHIPPED_IDS
+from viapoint.training.planning.search import registered_task
+from viapoint.training.scene_sets.scene_set import SETS, shipped_set
+
+BASELINES = ("straight", "sobol512", "search512")
+FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Measure shipped agents, searches and the straight movement in all frozen sets but `validation`."""
+
+    out: Path = Path("docs/results.csv")
+    """File of the numbers."""
+    env: tuple[str, ...] = SHIPPED_IDS
+    """Ids of environments with a shipped agent."""
+    n_scenes: int | None = None
+    """Number of scenes of each set; default: all of them."""
+
+
+def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, Any]]:
+    """Yield the numbers of each method in one set."""
+    result = evaluate(
+        load_agent(env_id),
+        env=env_id,
+        scenes=name,
+        n_scenes=n_scenes,
+        checks=[0, 64],
+        baselines=list(BASELINES),
+    )
+    for row in result.rows:
+        success = row["success"]
+        yield {
+            "env": env_id,
+            "scenes": name,
+            "method": row["method"],
+            "success": round(100.0 * success["rate"], 1),
+            "low": round(100.0 * success["low"], 1),
+            "high": round(100.0 * success["high"], 1),
+            "count": success["of"],
+            "jerk_ratio": _rounded(row["jerk_ratio"], 1.0),
+            "milliseconds": _rounded(row["decision_time"], 1e3),
+        }
+
+
+def _rounded(value: float | None, unit: float) -> float | str:
+    """Return a number with two decimals; an empty text where there is none."""
+    return "" if value is None else round(unit * value, 2)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of one environment: success with its interval in each set, jerk and time in `test`."""
+    sets = [name for name in SETS if any(row["scenes"] == name for row in rows)]
+    lines = [
+        f"| method | {' | '.join(f'`{name}`' for name in sets)} | jerk | time |",
+        "|---" * (len(sets) + 3) + "|",
+    ]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = {row["scenes"]: row for row in rows if row["method"] == method}
+        cells = [f"{mine[name]['success']} ({mine[name]['low']}-{mine[name]['high']})" for name in sets]
+        last = mine["test"]
+        lines.append(f"| {method} | {' | '.join(cells)} | {last['jerk_ratio']} | {last['milliseconds']} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure, print the tables, and write the file."""
+    config = tyro.cli(Config)
+    torch.set_num_threads(1)
+    every = []
+    for env_id in config.env:
+        task = registered_task(env_id)
+        rows = []
+        for name in SETS:
+            if name != "validation" and shipped_set(name, task) is not None:
+                rows += list(rows_of(env_id, name, config.n_scenes))
+        print(f"\n## {env_id.removeprefix('viapoint/').removesuffix('-v0')}\n\n{table(rows)}", flush=True)
+        every += rows
+    with config.out.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        writer.writeheader()
+        writer.writerows(every)
+
+
+if __name__ == "__main__":
+    main()
