@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 RUN    := runs/demo
 
-.PHONY: help demo test check format scenes hashes versions bench clean
+.PHONY: help demo test check format scenes versions bench clean
 
 help:            ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -34,16 +34,13 @@ format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff check --fix .
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
-	@PYTHONPATH=benchmarks $(BIN)/python -m scene_sets.generate
-
-hashes: $(READY) ## hash a thousand episodes of every environment anew
-	@$(BIN)/python benchmarks/reliability_determinism.py --write
+	@$(BIN)/python -m viapoint.training.scene_sets.make --check
 
 versions: $(READY) ## the suite with the oldest versions that are allowed, in an environment of its own
 	@$(BIN)/python benchmarks/versions.py oldest
 
 bench: $(READY)  ## throughput as ratios
-	@$(BIN)/python benchmarks/throughput.py
+	@$(BIN)/python benchmarks/speed.py
 
 clean:           ## remove the virtual environment, caches and runs
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

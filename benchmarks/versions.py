@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BOUND = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<version>[0-9.]+)")
-EXTRAS = ("training", "tuning")
+EXTRAS = ("training", "study")
 TOOLS = [
     "pytest",
     "pytest-xdist",
@@ -35,7 +35,6 @@ TOOLS = [
     "ruff",
     "mypy",
     "coal",
-    "ray",
 ]
 
 

@@ -58,6 +58,12 @@ class Task:
 
     Create it with :meth:`of`, which checks the values and fills in those that depend on the arm. The environments
     document the fields, see :class:`~viapoint.envs.vector_env.ReachVectorEnv`.
+
+    Example:
+        >>> from viapoint.envs import Task
+        >>> task = Task.of(arm="panda", n_via=2)
+        >>> task.space_name, task.action.size
+        ('joints', 15)
     """
 
     arm: Arm

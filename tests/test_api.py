@@ -12,8 +12,9 @@ from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from viapoint import envs, primitives, training
-from viapoint.envs import SHAPES
-from viapoint.envs.scenes import families
+from viapoint.envs import Cylinder
+from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.scenes import families_registry
 from viapoint.training import GeometrySearch, TrainConfig, ViaQ, ViaVecEnv, evaluate, load_agent, train
 
 ROOT = Path(__file__).parents[1]
@@ -26,11 +27,7 @@ SMALL = {"learning_starts": 16, "gradient_steps": 1, "policy_kwargs": {"candidat
 def registered(monkeypatch):
     """Leave shapes and families as they were, to which an example may add."""
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(families, "_FAMILIES", {d: dict(each) for d, each in families._FAMILIES.items()})
-    before = dict(SHAPES)
-    yield
-    SHAPES.clear()
-    SHAPES.update(before)
+    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
 
 
 @pytest.mark.parametrize(("package", "name"), EXPORTS)
@@ -75,14 +72,14 @@ def test_a_planned_movement_is_the_one_that_an_environment_executes():
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
         scene = env.unwrapped.batch.scenes.take([0])
-        present = scene.obstacles[0][scene.present[0]]
-        plan = agent.plan(start=scene.start[0], goal=scene.goal[0], obstacles=present)
+        start, goal = env.unwrapped.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
+        plan = agent.plan(start=start, goal=goal, obstacles=unpack(scene.obstacles, 0))
         env.step(agent.predict(observation, deterministic=True)[0])
         executed = env.unwrapped.last_plan
         np.testing.assert_allclose(plan.waypoints, executed.waypoints, atol=1e-6)
         np.testing.assert_allclose(plan.durations, executed.durations, atol=1e-6)
         ends = plan.trajectory()(np.array([0.0, plan.durations.sum()]))
-        np.testing.assert_allclose(ends, [scene.start[0], scene.goal[0]], atol=1e-9)
+        np.testing.assert_allclose(ends, [start, goal], atol=1e-9)
 
 
 def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
@@ -94,6 +91,9 @@ def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
     assert low <= result.success_rate <= high
     assert result.to_dict()["methods"]["agent"]["success"]["rate"] == result.success_rate
     assert evaluate(search, env=ENV, n_scenes=10).success_rate == result.rows[-1]["success"]["rate"]
+
+
+POST = Cylinder(0.03, 0.1, position=(0.0, 0.35, 0.0))
 
 
 def planned(env_id, **arguments):
@@ -108,11 +108,11 @@ def planned(env_id, **arguments):
         lambda: load_agent(Path("nowhere")),
         lambda: load_agent(ROOT),
         lambda: load_agent(Path(__file__)),
-        lambda: planned(ENV, obstacles=[(0.0, 0.35, 0.0, 0.0, 0.01)] * 6),
+        lambda: planned(ENV, obstacles=[POST] * 9),
         lambda: planned(ENV, obstacles=[(0.0, 0.35, 0.03)]),
         lambda: planned(ENV, start=(0.0, 9.0)),
         lambda: planned(ENV, goal=(np.nan, 0.3)),
-        lambda: planned("viapoint/PlanarReach-v0", obstacles=[(0.0, 0.35, 0.0, 0.0, 0.03)]),
+        lambda: planned("viapoint/PlanarReach-v0", obstacles=[POST]),
         lambda: planned(REPLANNING),
         lambda: evaluate(),
         lambda: evaluate(env=ENV),

@@ -337,7 +337,7 @@ def _collides(model: mujoco.MjModel, body: int) -> bool:
 
 
 def _set_contacts(spec: mujoco.MjSpec, arm: Arm) -> None:
-    """Let exactly the pairs of bodies collide that must not touch, and moving bodies with obstacles.
+    """Enable collisions of exactly the pairs of bodies that must not touch, and moving bodies with obstacles.
 
     Bit 1 is for the arm with itself; moving bodies have bit 2, too, which is that of obstacles.
     """

@@ -64,6 +64,14 @@ def register_arm(arm: Arm) -> None:
     Raises:
         TypeError: It is no arm.
         ValueError: The name is that of a built-in arm.
+
+    Example:
+        >>> from viapoint.envs import arm_of, load_arm, register_arm
+        >>> joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+        >>> arm = load_arm("docs/ur5e.xml", hand_site="hand", joints=joints, velocity_limit=3.14)
+        >>> register_arm(arm)
+        >>> arm_of(arm.name) is arm
+        True
     """
     if not isinstance(arm, Arm):
         raise TypeError(f"arm must be an Arm, as load_arm returns it, got {arm!r:.60}")
@@ -77,6 +85,11 @@ def arm_of(arm: Any) -> Arm:
 
     Raises:
         ValueError: There is no such arm.
+
+    Example:
+        >>> from viapoint.envs import arm_of
+        >>> arm_of("panda").joint_names[0]
+        'joint1'
     """
     if isinstance(arm, Arm):
         return arm

@@ -53,6 +53,13 @@ class Obstacles(NamedTuple):
     The meaning of `size` depends on the kind, in MuJoCo's convention: sphere (radius, -, -), capsule and cylinder
     (radius, half length, -), box (three half lengths), half-space (-, -, -), mesh and point cloud (index of the table,
     radius of the bounding sphere around the origin of the frame, -).
+
+    Example:
+        >>> from viapoint.envs import Box, Sphere
+        >>> from viapoint.envs.geometry.obstacles import pack
+        >>> obstacles = pack([[Sphere(0.1)], [Sphere(0.1), Box((0.1, 0.1, 0.2))]])
+        >>> obstacles.present.tolist()
+        [[True, False], [True, True]]
     """
 
     kind: Int
@@ -326,6 +333,13 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
 
     Raises:
         ValueError: A row is a mesh without a name or a point cloud, which rows do not describe.
+
+    Example:
+        >>> from viapoint.envs import Sphere, obstacles_from_rows
+        >>> from viapoint.envs.geometry.obstacles import observation_rows, pack
+        >>> rows = observation_rows(pack([[Sphere(0.1)]]), ["sphere", "box"])
+        >>> obstacles_from_rows(rows, ["sphere", "box"]).size[0, 0, 0].round(6)
+        np.float64(0.1)
     """
     named = {name: mesh for name in kinds if (mesh := REGISTERED_MESHES.get(name)) is not None}
     numbers = np.array([MESH if name in named else KINDS.index(name) for name in kinds])

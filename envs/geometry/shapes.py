@@ -176,6 +176,11 @@ class Shape:
     """Obstacle of some shape at some pose, which may move with a constant velocity.
 
     Numbers are checked, and kept in double precision. Arrays are read-only.
+
+    Example:
+        >>> from viapoint.envs import Shape, Sphere
+        >>> isinstance(Sphere(0.1, position=(0.5, 0.0, 0.2), velocity=(0.1, 0.0, 0.0)), Shape)
+        True
     """
 
     number: ClassVar[int]

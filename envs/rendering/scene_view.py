@@ -32,7 +32,7 @@ FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.ta
 
 
 class Picture(NamedTuple):
-    """What one picture shows."""
+    """Arm, obstacles and paths of one picture."""
 
     joints: Float
     """Joint positions, shape (J,), [rad]."""

@@ -34,7 +34,7 @@ ROLL = 0.3
 SEED_SPREAD = 0.3
 """Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints."""
 BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
-"""What becomes of a straight movement."""
+"""Outcome of a straight movement."""
 
 
 class Mover(NamedTuple):

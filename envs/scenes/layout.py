@@ -32,6 +32,11 @@ class Room(NamedTuple):
     """Conditions that a layout must meet.
 
     Families use the sizes of a reference arm, with its base at the origin; :class:`Furniture` converts them.
+
+    Example:
+        >>> from viapoint.envs import Room
+        >>> Room(kinds=("sphere", "box"), fewest=1, most=4).most
+        4
     """
 
     kinds: tuple[str, ...]
@@ -93,7 +98,13 @@ class Layout(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Place where one would reach."""
+    """Place where one would reach.
+
+    Example:
+        >>> from viapoint.envs import Place
+        >>> Place((0.5, 0.0, 0.3), approach=(0.0, 0.0, -1.0)).half  # from above, at this very point
+        (0.0, 0.0, 0.0)
+    """
 
     position: Vector
     """Middle of the box in which positions of the tool are drawn, [m]."""
@@ -115,6 +126,10 @@ class Furniture:
         x: Origin of the frame, seen from the base, [m].
         y: Origin of the frame, [m].
         yaw: Angle from the x axis of the base to that of the frame, [rad].
+
+    Example:
+        >>> from viapoint.envs import Furniture, Room
+        >>> table = Furniture(Room(kinds=("box",), fewest=1, most=4), x=0.5)
     """
 
     def __init__(self, room: Room, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> None:

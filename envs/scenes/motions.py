@@ -84,7 +84,7 @@ def time_unit(mover: Mover, start: Float, goal: Float) -> float:
 
 @compiled
 def draw_courses(draft: Draft, changes: Changes, which: Int, numbers: Float) -> None:
-    """Let the obstacles of some scenes move; half-spaces, and obstacles of which no course fits, stand still.
+    """Set the obstacles of some scenes in motion; half-spaces, and obstacles of which no course fits, stand still.
 
     Args:
         draft: N scenes with W obstacles each.

@@ -270,6 +270,14 @@ def scene_to_json(
         space: Space of the task; by default, that of the arm.
         scene: Index of the scene.
         env_id: Environment of the scene, for readers of the file.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs import Task, scene_from_json, scene_to_json
+        >>> task = Task.of()
+        >>> text = scene_to_json(task.sampler()([np.random.default_rng(0)]), task.arm)
+        >>> sorted(scene_from_json(text))
+        ['goal', 'obstacles', 'start']
     """
     of_hand = (arm.space if space is None else space) == "hand"
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance
-from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Clouds, Meshes, Obstacles, no_obstacles
 
 MOST_JUMPS = 4
 """Greatest number of jumps of the target in an episode."""
@@ -33,7 +34,15 @@ FASTEST = 1.0
 
 
 class Scenes(NamedTuple):
-    """N scenes of up to n obstacles each, for an arm of J joints."""
+    """N scenes of up to n obstacles each, for an arm of J joints.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs import Task
+        >>> scenes = Task.of(arm="panda").sampler()([np.random.default_rng(0), np.random.default_rng(1)])
+        >>> scenes.start.shape, scenes.take([1]).obstacles.kind.shape[0]
+        ((2, 7), 1)
+    """
 
     start: Float
     """Joint positions at the start, shape (N, J), [rad] or [m]."""

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from viapoint.envs.arms import ARMS, PANDA
+from viapoint.envs import arm_of, register_arm
+from viapoint.envs.arms import registry
 from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
@@ -56,12 +57,13 @@ def test_a_model_decides_the_same_after_a_round_trip(algo, env, tmp_path):
 
 
 def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_path, monkeypatch):
-    own = dataclasses.replace(PANDA, name="mine")
-    monkeypatch.setitem(ARMS, "mine", own)
+    monkeypatch.setattr(registry, "_OWN", {})
+    own = dataclasses.replace(arm_of("panda"), name="mine")
+    register_arm(own)
     env = ViaVecEnv("viapoint/Reach-v0", 1, arm=own, threads=1)
     save_model(new("viaq", env), tmp_path)
     assert load_model(tmp_path).get_env().env_kwargs["arm"] == "mine"
-    monkeypatch.delitem(ARMS, "mine")
+    registry._OWN.clear()
     with pytest.raises(BadFileError, match=r"'mine'.*register_arm"):
         load_model(tmp_path)
 

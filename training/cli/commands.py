@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
@@ -17,7 +18,7 @@ from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import SETS, FrozenScenes, scenes_for
+from viapoint.training.scene_sets.scene_set import NUMBERS, SETS, FrozenScenes, scenes_for
 
 
 class EvaluationStoppedError(Exception):
@@ -69,7 +70,9 @@ def evaluate(config: EvaluateConfig) -> None:
 def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
     """Return a file name that is unique to the scenes of an evaluation and to their number."""
     name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
-    name += "" if number == len(whole.share) else f".first-{number}"
+    is_drawn = bool(np.isnan(whole.share).any())  # no more of them than are asked for
+    every = NUMBERS[scenes] if is_drawn and scenes in NUMBERS else len(whole.share)
+    name += "" if number == every else f".first-{number}"
     return name + (".partial" if partial else "")
 
 

@@ -19,3 +19,7 @@ def main() -> None:
         print(f"viapoint: {doctor.explain_import_error(error)}", file=sys.stderr)
         raise SystemExit(2) from None
     run()
+
+
+if __name__ == "__main__":
+    main()

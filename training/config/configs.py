@@ -457,7 +457,7 @@ class StudyConfig(Config):
 
     The same command continues a study that was stopped, and does what was added to its file.
 
-    Example: viapoint study benchmarks/results.yaml --workers 2
+    Example: viapoint study study.yaml --workers 2
     """
 
     file: tyro.conf.Positional[Path]

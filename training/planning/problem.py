@@ -1,4 +1,4 @@
-"""What a planner knows: start, goal and obstacles of B scenes, and the plans that actions stand for."""
+"""Planning problems: start, goal and obstacles of B scenes, and the plans that actions stand for."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}
 NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}
 """Number of scenes of each set."""
 FEWER = {"validation": 200, "test": 250}
-"""The same in tasks without obstacles at rest, which have no other sets."""
+"""Number of scenes of each set of tasks without obstacles at rest, which have no other sets."""
 MOST_DRAWN = 40
 """Greatest number of drawn scenes for each one that is wanted."""
 TOGETHER = 250
