@@ -1,37 +1,41 @@
-"""Laws of measuring where plans are revised: whole episodes, the true course for the planner alone."""
+"""Laws of measuring where plans are revised, and of agents that act in every control step."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from scene_sets.replanning import SIZES, solution_shares
 
+from viapoint.envs.scenes.options import scene_from_json, scene_to_json
+from viapoint.training.agents.model_io import build
+from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning.baselines import make_method
-from viapoint.training.rollouts.rollout import EpisodeSimulation
-from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.planning.baselines import Straight, agent_method, make_method
+from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
+from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.scene_sets.scene_set import scenes_for
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
+STEP = "viapoint/PlanarObstaclesStep-v0"
 
 
-def results(env_id, *names, number=12):
-    frozen = load("validation", env_id).take(slice(0, number))
-    methods = [make_method(name, env_id) for name in names]
-    found = evaluate_methods(methods, frozen, env_id, time_decisions=False).results
-    return {name: each.summary()["success"]["rate"] for name, each in zip(names, found, strict=True)}
+def rate(env_id, name, number=12):
+    simulation = SceneSimulation(env_id, number)
+    frozen = scenes_for("validation", simulation.task)
+    some = frozen.take(np.arange(number) * (len(frozen.share) // number))
+    found = evaluate_methods([make_method(name, env_id)], some, env_id, time_decisions=False)
+    return found.success_rate
 
 
-def test_the_planner_solves_frozen_scenes_and_straight_movements_do_not():
-    rates = results(MOVING, "planner", "straight")
-    assert rates["planner"] == 1.0
-    assert rates["straight"] < 0.3
+def test_the_search_revises_around_moving_obstacles():
+    assert rate(MOVING, "search256") > 0.9
+    assert rate(MOVING, "straight") < 0.5
 
 
 def test_a_jumping_target_is_reached_by_revision_only():
-    rates = results(JUMPS, "straight", "unrevised")
-    assert rates == {"straight": 1.0, "unrevised": 0.0}
+    assert (rate(JUMPS, "straight"), rate(JUMPS, "unrevised")) == (1.0, 0.0)
 
 
 def test_an_episode_is_the_same_alone_and_among_others():
-    simulation = EpisodeSimulation(MOVING, 8)
+    simulation = SceneSimulation(MOVING, 8)
     scenes = simulation.draw(11, seed=4)
     actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, simulation.task.action.size))
     together = simulation(scenes, actions)
@@ -41,28 +45,57 @@ def test_an_episode_is_the_same_alone_and_among_others():
             np.testing.assert_array_equal(value[0], together.info[name][row])
 
 
-def test_drawn_scenes_are_the_same_for_the_same_seed():
-    one, other = (EpisodeSimulation(MOVING, size).draw(5, seed=9) for size in (3, 70))
-    for mine, theirs in zip(one, other, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+@pytest.fixture(scope="module")
+def model():
+    preset = STEP_PRESETS["sac"]
+    return build("sac", preset.policy, ViaVecEnv(STEP, 4), {**preset.arguments(), "buffer_size": 10}, seed=0)
 
 
-@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
-def test_shipped_sets_hold_what_they_promise(env_id):
-    for name, size in SIZES.items():
-        frozen = load(name, env_id)
-        assert len(frozen.share) == size
-        assert len(np.unique(frozen.number)) == size
-        if env_id == MOVING:
-            simulation, some = EpisodeSimulation(env_id, 4), frozen.take(slice(0, 4))
-            np.testing.assert_allclose(
-                solution_shares(simulation, some.scenes)[:1], some.share[:1], atol=1e-3
-            )
+class Forwards:
+    """Steers straight ahead, faster for some goals than for others, so that episodes end at different times."""
+
+    def predict(self, observation, deterministic):
+        speed = 0.3 + 0.3 * (1.0 + np.sin(50.0 * observation["goal"][..., :1]))
+        return np.concatenate((speed, 0.1 * speed), axis=-1), None
 
 
-def test_files_of_changing_scenes_come_back_whole(tmp_path):
-    frozen = load("validation", JUMPS).take(slice(0, 3))
-    frozen.save(tmp_path / "some.npz")
-    again = load(tmp_path / "some.npz", JUMPS)
-    assert again.sha256 == frozen.sha256
-    np.testing.assert_array_equal(again.scenes.jumps, frozen.scenes.jumps)
+def test_the_whole_movement_of_a_step_wise_task_has_no_reward_for_progress():
+    given = {"n_obstacles": 3, "reward_weights": {"progress": 2.0, "success": 3.0}}
+    whole = SceneSimulation(STEP, 2, **whole_task(STEP, given)).task
+    assert whole.whole_movement
+    assert (whole.weights.success, whole.weights.progress) == (3.0, 0.0)
+    assert whole_task(MOVING, {"n_via": 2}) == {"n_via": 2}
+
+
+def test_what_a_method_carries_out_is_what_the_single_environment_does():
+    method = StepAgentMethod("forwards", Forwards(), STEP, {})
+    simulation = SceneSimulation(STEP, 6)
+    scenes = simulation.draw(6, seed=1)
+    together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
+    env = gym.make(STEP)
+    for i in range(6):
+        text = scene_to_json(scenes, simulation.task.arm, "hand", scene=i)
+        observation, _ = env.reset(options=scene_from_json(text))
+        total, over = 0.0, False
+        while not over:
+            action, _ = method._model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, over = total + reward, terminated or truncated
+        assert together.reward[i] == pytest.approx(total, abs=1e-3)
+        for name in ("is_success", "collision", "reachable"):
+            assert together.info[name][i] == info[name]
+        for name in ("goal_error", "path_length", "min_clearance"):
+            assert together.info[name][i] == pytest.approx(info[name], abs=1e-3), name
+    assert len(np.unique(together.info["duration"])) > 1
+
+
+def test_an_agent_of_steps_stands_in_one_table_with_the_others(model, small_scenes):
+    assert isinstance(agent_method("agent", model), StepAgentMethod)
+    env_kwargs = whole_task(STEP, {})
+    methods = [agent_method("agent", model), Straight(SceneSimulation(STEP, 4, **env_kwargs))]
+    found = evaluate_methods(
+        methods, small_scenes.take(slice(0, 12)), STEP, env_kwargs=env_kwargs, batch=5, time_decisions=False
+    )
+    for each in found.results:
+        assert each.summary()["scenes"] == 12
+    assert set(found.results[1].outcomes) <= set(found.results[0].outcomes)

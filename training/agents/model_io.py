@@ -25,6 +25,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from viapoint.envs.arms.arm import Arm
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import EXTRACTORS
@@ -307,7 +308,7 @@ def _encode(value: Any) -> Any:
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if hasattr(value, "reach_margin"):
+    if isinstance(value, Arm):
         return value.name  # of an arm; whoever loads the model makes it known first
     raise ValueError(f"a {type(value).__name__} cannot be written as JSON: {value!r}")
 
