@@ -264,7 +264,7 @@ class ActionLayout:
             return np.asarray(primitives.passage_durations(waypoints, np.ones(waypoints.shape[:-2])))
         split = action[..., self.n_via * self.dimension + 1 :]
         logs = np.cumsum(np.array(self.straight_split) + LOG_SPLIT * split, axis=-1)
-        shares = np.exp(np.concatenate((np.zeros_like(logs[..., :1]), logs), axis=-1))
+        shares = np.exp(np.concatenate((np.zeros((*logs.shape[:-1], 1)), logs), axis=-1))
         return np.asarray(shares / shares.sum(axis=-1, keepdims=True))
 
 

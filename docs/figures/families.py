@@ -49,7 +49,7 @@ def draw_families(path: Path) -> None:
 def main() -> None:
     """Draw the figure of the documentation."""
     parser = argparse.ArgumentParser(description="Draw scenes of every family.")
-    parser.add_argument("--out", type=Path, default=Path("docs/images/hard_families.png"), help="the picture")
+    parser.add_argument("--out", type=Path, default=Path("docs/images/families.png"), help="the picture")
     out: Path = parser.parse_args().out
     draw_families(out)
     print(f"{out}  {out.stat().st_size / 1000:.0f} kB")

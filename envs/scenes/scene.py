@@ -13,9 +13,11 @@ from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
+from viapoint.envs.geometry.clouds import Clouds
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance
-from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Clouds, Meshes, Obstacles, no_obstacles
+from viapoint.envs.geometry.meshes import Meshes
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
 
 MOST_JUMPS = 4
 """Greatest number of jumps of the target in an episode."""

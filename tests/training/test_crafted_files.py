@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save, save_file
 
-from viapoint.envs.actions.via_points import MOST_VIAS
-from viapoint.envs.scenes.families import MOST_OBSTACLES
+from viapoint.envs.plans import MOST_VIAS
+from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError

@@ -175,7 +175,7 @@ def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
         >>> import gymnasium as gym
         >>> from viapoint.training import load_agent
         >>> env = gym.make("viapoint.envs:viapoint/PlanarObstacles-v0")
-        >>> observation, _ = env.reset(seed=3)
+        >>> observation, _ = env.reset(seed=0)
         >>> agent = load_agent("viapoint/PlanarObstacles-v0")
         >>> action, _ = agent.predict(observation, deterministic=True)
         >>> *_, info = env.step(action)

@@ -26,7 +26,7 @@ from viapoint.envs.geometry.kernels import kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, MovementTable, Setting, place_arm
-from viapoint.training.planning.problem import Moves, Problem, setting_of, table_of
+from viapoint.training.planning.problem import Moves, Problem, setting_of
 
 SCALE = 8.0
 """Scale of lengths at the input of the network, [1/m]."""
@@ -81,7 +81,7 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
     least, inside = np.full((number, plans), CLEAR), np.ones((number, plans), np.bool_)
     _gather(
         setting,
-        table_of(task),
+        moves.table,
         problem.start,
         moves,
         obstacles,

@@ -227,8 +227,8 @@ class ViaQPolicy(BasePolicy):
             values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
         refined = min(count // 2, values.shape[1] - self.candidates)
         spread = min(count - refined, self.candidates)
-        first = np.argsort(-values[:, : self.candidates], axis=1)[:, :spread]
-        last = np.argsort(-values[:, self.candidates :], axis=1)[:, :refined]
+        first = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, :spread]
+        last = np.argsort(-values[:, self.candidates :], axis=1, kind="stable")[:, :refined]
         return np.concatenate((first, last + self.candidates), axis=1)
 
     def forward(self, observation: Any, deterministic: bool = True) -> Tensor:

@@ -366,7 +366,7 @@ class PlayConfig(AgentConfig):
 class LiveConfig(AgentConfig):
     """Serve a page in the browser on which scenes are changed by hand and the agent decides anew.
 
-    Example: viapoint live --pretrained viapoint/PandaObstacles-v0
+    Example: viapoint live --pretrained viapoint/PlanarObstacles-v0
     """
 
     env: Annotated[str | None, ENV] = None

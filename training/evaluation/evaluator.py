@@ -202,8 +202,8 @@ def evaluate(
         checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
             agent's own setting if not given.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `random16`, `random80`, `ompl`, `searchN` and `sobolN` (N checked plans) and,
-            in tasks with replanning, `unrevised` (the first plan alone).
+            training), `straight`, `random`, `random16`, `random80`, `ompl`, `searchN` and `sobolN` (N checked plans)
+            and, in tasks with replanning, `unrevised` (the first plan alone).
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 

@@ -16,7 +16,6 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from viapoint import primitives
 from viapoint.envs.arms.chain import Chain, Spheres
@@ -78,7 +77,12 @@ class Setting(NamedTuple):
 def movement_table(n_via: int) -> MovementTable:
     """Return the table of movements through some via-points."""
     sets = TABLES.get(n_via, [tuple(np.arange(1, n_via + 1) / (n_via + 1))])
-    durations = np.array([np.diff((0.0, *times, 1.0)) for times in sets])
+    return table_with(np.array([np.diff((0.0, *times, 1.0)) for times in sets]))
+
+
+def table_with(durations: Float) -> MovementTable:
+    """Return the table of movements whose segments take some durations in unit time, shape (M, K + 1)."""
+    n_via = durations.shape[1] - 1
     number, columns = len(durations), n_via + 3
     # One movement in one dimension for each column: a unit offset, or a unit of initial velocity or acceleration.
     waypoints = np.zeros((number, columns, n_via + 2, 1))
@@ -268,11 +272,6 @@ def table_costs(table: MovementTable, offsets: Float) -> tuple[Int, Float]:
     for i in range(number):
         times[i], cost[i] = best_times(table, offsets[i], gram)
     return times, cost
-
-
-def nearest_times(table: MovementTable, durations: Float) -> Int:
-    """Return the passage times nearest to given ones, as indices of the table, for durations of shape (H, K + 1)."""
-    return np.asarray(KDTree(table.durations).query(durations)[1], np.int64)
 
 
 @compiled

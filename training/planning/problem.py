@@ -20,9 +20,9 @@ from viapoint.training.planning.movements import (
     MovementTable,
     Setting,
     movement_table,
-    nearest_times,
     shortest_durations,
     table_costs,
+    table_with,
 )
 
 Numbers = NDArray[np.floating[Any]]
@@ -97,6 +97,8 @@ class Problem(NamedTuple):
 class Moves(NamedTuple):
     """Plans of H actions in each of B problems, as products of a table."""
 
+    table: MovementTable
+    """Table of movements."""
     offsets: Float
     """Offsets from the start, see :mod:`viapoint.training.planning.movements`, shape (B, H, K + 3, D)."""
     times: Int
@@ -137,8 +139,9 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
     flat = offsets.reshape(-1, columns, dimension)
     if layout.timing == "learned" and problem.remaining is None:
         shares = layout.shares(waypoints, vectors)
-        times = nearest_times(table, shares.reshape(-1, task.n_via + 1))
-        cost = np.einsum("hij,hid,hjd->h", table.cost[times], flat, flat)
+        table = table_with(shares.reshape(-1, task.n_via + 1))  # each plan has passage times of its own
+        times = np.arange(len(flat))
+        cost = np.einsum("hij,hid,hjd->h", table.cost, flat, flat)
     else:
         times, cost = table_costs(table, flat)
     fast = np.zeros(batch, bool)
@@ -160,7 +163,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
     whole = layout.zero_duration(problem.start, problem.goal)
     straight = straight_jerk_cost(length, whole)[:, None]
     rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
-    return Moves(offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)
+    return Moves(table, offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)
 
 
 def _set_motion(problem: Problem, duration: Float, offsets: Float) -> None:
@@ -188,11 +191,6 @@ def setting_of(task: Task, obstacles: Obstacles) -> Setting:
         spheres = _within_height(spheres, arm.chain.origin[:, 2], obstacles)
         alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
     return Setting(arm.chain, spheres, arm.joint_range, task.space.of_hand, alone)
-
-
-def table_of(task: Task) -> MovementTable:
-    """Return the table of movements of a task."""
-    return movement_table(task.n_via)
 
 
 def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Spheres:

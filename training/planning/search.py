@@ -26,7 +26,6 @@ from viapoint.training.planning.problem import (
     Problem,
     moves_of,
     setting_of,
-    table_of,
     worth_of,
 )
 
@@ -181,7 +180,7 @@ def merits(task: Task, problem: Problem, actions: Numbers) -> Float:
     setting = setting_of(task, problem.obstacles)
     horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
     gain = task.weights.clearance / CLEARANCE_UNIT
-    return _merits(setting, table_of(task), problem.start, moves, worth, problem.obstacles, horizons, gain)
+    return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
 
 
 def plan_clearances(task: Task, problem: Problem, actions: Numbers, most: float, least: float) -> Float:
@@ -196,9 +195,7 @@ def plan_clearances(task: Task, problem: Problem, actions: Numbers, most: float,
     """
     moves = moves_of(task, problem, actions)
     setting = setting_of(task, problem.obstacles)
-    return np.asarray(
-        _clearances(setting, table_of(task), problem.start, moves, problem.obstacles, most, least)
-    )
+    return np.asarray(_clearances(setting, moves.table, problem.start, moves, problem.obstacles, most, least))
 
 
 @compiled
@@ -279,9 +276,15 @@ def _merits(
 
 
 def registered_task(env_id: str, **kwargs: Any) -> Task:
-    """Return the task of a registered environment made with `kwargs`."""
+    """Return the task of a registered environment made with `kwargs`.
+
+    Raises:
+        ValueError: There is no such environment, it is not of this package, or an argument is not allowed.
+    """
     check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
-    task: Task = env.unwrapped.task
+    task = getattr(env.unwrapped, "task", None)
     env.close()
+    if not isinstance(task, Task):
+        raise ValueError(f"{env_id} is not an environment of this package")
     return task
