@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
-from dataflow import window
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,11 +18,13 @@ from matplotlib.patches import FancyArrowPatch
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.episodes import Recorded
+from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import plan_clearances
-from viapoint.training.plotting.top_view import View, draw_movement, planned_only
+from viapoint.training.plotting.top_view import View, draw_movement, footprint, planned_only
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19
@@ -34,6 +35,8 @@ SIZE, WIDTH, BOTTOM, HEIGHT = (12.6, 3.3), 0.176, 0.17, 0.66
 """Size of the figure, [inch]; width, lower edge and height of a panel in fractions of it."""
 ASPECT = HEIGHT * SIZE[1] / (WIDTH * SIZE[0])
 """Height of a panel divided by its width."""
+MARGIN = 0.035
+"""Margin around a scene, [m]."""
 GREY = (0.45, 0.47, 0.52)
 
 
@@ -154,6 +157,16 @@ PANELS: tuple[tuple[str, Callable[[Axes, Decision], str]], ...] = (
     ("checks", checks),
     ("action", action),
 )
+
+
+def window(scene: Scenes, points: Float, aspect: float) -> View:
+    """Return limits of x and y around points and the obstacles of a scene, with a given height per width, [m]."""
+    outlines = [each for shape in unpack(scene.obstacles, 0) for each in footprint(shape)]
+    points = np.concatenate((points, *outlines))
+    middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2.0, np.ptp(points, axis=0)
+    half = max(extent[0], extent[1] / aspect) / 2.0 + MARGIN
+    x, y = (float(m) for m in middle)
+    return (x - half, x + half), (y - half * aspect, y + half * aspect)
 
 
 def main() -> None:

@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from dataflow import Data, draw_flow
 from PIL import Image
 
 from viapoint.envs import load_arm
 from viapoint.envs.common.types import Frame
-from viapoint.envs.episodes import Recorded
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
@@ -31,24 +29,20 @@ STILLS = {
     "planar_whole_arm.png": "viapoint/PlanarWholeArm-v0",
 }
 """Tasks of the pictures of single movements."""
-FILMS = {
-    "reaching.webp": ((IN_PLANE, 4),),
-    "revising.webp": (("viapoint/PlanarMovingObstacles-v0", 2), ("viapoint/PlanarTargetJump-v0", 1)),
-    "panda.webp": ((IN_SPACE, 3),),
-}
-"""Tasks of the animations, and numbers of their scenes."""
+FILMED = 4
+"""Number of scenes of the animation."""
 TRIED = 100
 """Scenes among which those that are shown are chosen."""
 CLEAREST = 0.012
 """Least clearance of a movement that is shown, [m]."""
-MOMENTS = (0.3, 0.45, 0.6, 1.0)
-"""Moments of a movement that are shown, as fractions of its duration."""
+MOMENT = 0.45
+"""Moment of a movement that is shown, as a fraction of its duration."""
 SPEED = 0.5
-"""Speed of the animations relative to real time."""
+"""Speed of the animation relative to real time."""
 GAP = 6
 """Gap between frames side by side, [pixels]."""
 PAUSE = 700
-"""Pause after each movement of an animation, [ms]."""
+"""Pause after each movement of the animation, [ms]."""
 
 
 class Shown(NamedTuple):
@@ -98,14 +92,12 @@ def still(path: Path, env_id: str) -> None:
     Image.fromarray(frame).save(path, optimize=True)
 
 
-def animation(path: Path, tasks: Sequence[tuple[str, int]], size: int = 320) -> None:
-    """Save episodes of some tasks as an endless animation."""
-    films = []
-    for env_id, number in tasks:
-        env = gym.make(env_id, render_mode="rgb_array_list", width=size, height=size)
-        some = shown(env_id, number)
-        films += [film(env, some.scenes.take([row]), some.method) for row in range(number)]
-        env.close()
+def animation(path: Path, env_id: str, size: int = 320) -> None:
+    """Save episodes of a task as an endless animation."""
+    env = gym.make(env_id, render_mode="rgb_array_list", width=size, height=size)
+    some = shown(env_id, FILMED)
+    films = [film(env, some.scenes.take([row]), some.method) for row in range(FILMED)]
+    env.close()
     each = round(1000.0 / (env.metadata["render_fps"] * SPEED))
     images = [Image.fromarray(frame) for frames in films for frame in frames]
     durations = [time for frames in films for time in (*[each] * (len(frames) - 1), PAUSE)]
@@ -119,18 +111,17 @@ def side_by_side(frames: Sequence[Frame]) -> Image.Image:
     return Image.fromarray(np.concatenate([part for frame in frames for part in (gap, frame)][1:], axis=1))
 
 
-def beside_straight(path: Path, env: gym.Env[Any, Any], some: Shown, moments: Sequence[float]) -> None:
-    """Render moments of a movement beside the contact of the straight one."""
+def beside_straight(path: Path, env: gym.Env[Any, Any], some: Shown) -> None:
+    """Render a moment of a movement beside the contact of the straight one."""
     frames, hit = (film(env, some.scenes, method) for method in (some.method, some.straight))
-    images = [frames[round(moment * (len(frames) - 1))] for moment in moments]
-    side_by_side((*images, hit[-1])).save(path, optimize=True)
+    side_by_side((frames[round(MOMENT * (len(frames) - 1))], hit[-1])).save(path, optimize=True)
     env.close()
 
 
-def in_space(path: Path, side: int, moments: Sequence[float]) -> None:
+def in_space(path: Path, side: int = 480) -> None:
     """Render the Panda among furniture."""
     env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
-    beside_straight(path, env, shown(IN_SPACE, 1), moments)
+    beside_straight(path, env, shown(IN_SPACE, 1))
 
 
 def own_arm(path: Path, seed: int = 7, side: int = 480) -> None:
@@ -145,21 +136,7 @@ def own_arm(path: Path, seed: int = 7, side: int = 480) -> None:
     simulation = SceneSimulation("viapoint/Obstacles-v0", arm=ur5e)
     some = Shown(GeometrySearch(simulation.task), Straight(simulation), simulation.draw(1, seed))
     env = gym.make("viapoint/Obstacles-v0", arm=ur5e, render_mode="rgb_array_list", width=side, height=side)
-    beside_straight(path, env, some, MOMENTS[1:2])
-
-
-def flow(path: Path) -> None:
-    """Draw the flow from action to observation with the data of one movement."""
-    some = shown(IN_PLANE, 1)
-    envs: Any = gym.make_vec(IN_PLANE, num_envs=1, render_mode="rgb_array").unwrapped
-    observation = envs.begin(some.scenes)
-    action = some.method.decide(observation, some.scenes)
-    info = envs.execute_actions(action).info
-    recorded = Recorded(some.scenes, envs.last_plans[0], envs.last_rollout[0])
-    first = {name: part[0] for name, part in observation.items()}
-    last = {name: value[0] for name, value in info.items()}
-    draw_flow(path, Data(envs.task, recorded, action[0], first, last, envs.render()[0]))
-    envs.close()
+    beside_straight(path, env, some)
 
 
 def main() -> None:
@@ -170,12 +147,9 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for name, env_id in STILLS.items():
         still(out / name, env_id)
-    for name, tasks in FILMS.items():
-        animation(out / name, tasks)
-    in_space(out / "panda_agent.png", 300, MOMENTS)
-    in_space(out / "panda_obstacles.png", 480, MOMENTS[1:2])
+    animation(out / "reaching.webp", IN_PLANE)
+    in_space(out / "panda_obstacles.png")
     own_arm(out / "own_arm.png")
-    flow(out / "flow.png")
     for path in sorted(out.iterdir()):
         print(f"{path}  {path.stat().st_size / 1000:.0f} kB")
 
