@@ -1,185 +1,186 @@
-"""Frozen scenes are what their files say, planners certify them, and difficulty is measured right."""
+"""Frozen scenes are what their files say, can be made again, and difficulty is measured right."""
 
 import contextlib
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
-from scene_sets.difficulty import solution_share
-from scene_sets.generate import SEEDS, SETS, hard_families, lots, remake, size_of
-from scene_sets.scene_search import Kinds, Source, first_solved, redrawn, search
 
-from viapoint.envs.scenes.sampler import UniformSampler
+from viapoint.envs import ConvexMesh, Task
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.registration import ENV_IDS, twin_of
 from viapoint.envs.scenes.scene import check_scenes
-from viapoint.training.planning.cma_planner import Planner, PlannerBudget, screen
-from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.planning.baselines import make_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import scene_set
-from viapoint.training.scene_sets.scene_set import BANDS, bands, load
+from viapoint.training.scene_sets import make, scene_set
+from viapoint.training.scene_sets.scene_set import (
+    BANDS,
+    SETS,
+    bands,
+    load,
+    scenes_for,
+    shipped_path,
+    shipped_set,
+)
 
-ENV_ID, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
-SHIPPED = [(env_id, name) for env_id, names in SETS.items() for name in names]
+ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
+SHIPPED = sorted(shipped_path("test", ENV).parent.glob("*.npz"))
+TASKS = sorted({path.stem.rpartition("_")[0] for path in SHIPPED})
 
 
 @pytest.fixture(scope="module")
-def simulations():
-    made = {}
-    yield lambda env_id: made.setdefault(env_id, SceneSimulation(env_id, 128, threads=1))
-    for each in made.values():
-        each.close()
-
-
-@pytest.fixture
-def simulation(simulations):
-    return simulations(ENV_ID)
-
-
-@pytest.fixture(params=SHIPPED, ids=lambda pair: f"{pair[0][9:-3]} {pair[1]}")
-def shipped(request):
-    """Every set there is; loading one compares its hash."""
-    return load(request.param[1], request.param[0])
+def simulation():
+    simulation = SceneSimulation(ENV, 250, threads=1)
+    yield simulation
+    simulation.close()
 
 
 @pytest.fixture
 def some():
-    return load("test", ENV_ID).take(slice(0, 5))
+    return load(shipped_path("test", ENV)).take(slice(0, 5))
 
 
-def test_shipped_sets_are_whole_distinct_and_of_the_kind_that_they_promise(shipped, simulations):
-    task, size = simulations(shipped.env_id).task, len(shipped.share)
-    assert size == size_of(task, shipped.name)
-    assert len(np.unique(shipped.scenes.start, axis=0)) == size
-    if shipped.name == "uniform":
-        assert np.isnan(shipped.share).all()
-        return
-    assert ((shipped.share > 0.0) & (shipped.share <= 1.0)).all()
-    if shipped.name == "hard":
-        families = hard_families(task)
-        names, counts = np.unique(shipped.family, return_counts=True)
-        assert dict(zip(names, counts, strict=True)) == dict.fromkeys(families, 100)
-        assert set(shipped.family[: len(families)]) == set(families)  # in turn, so that any part is mixed
-        assert (shipped.share < 0.05).all()
-    elif "Reach" not in shipped.env_id:
-        assert (np.bincount(shipped.band, minlength=len(BANDS)) == size / len(BANDS)).all()
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_sets_are_whole_possible_and_of_the_kind_that_they_promise(path):
+    frozen = load(path)
+    check_scenes(frozen.scenes, Task.from_dict(frozen.task).arm)
+    name = path.stem.rpartition("_")[2]
+    changing = frozen.task["moving_obstacles"] or not frozen.task["n_obstacles"][1]
+    wanted = (make.FEWER if changing else make.NUMBERS)[name]
+    assert 0.95 * wanted <= len(frozen.share) <= wanted
+    assert ((frozen.share >= 0.0) & (frozen.share <= 1.0)).all()
+    if not frozen.task["n_obstacles"][1]:
+        assert (frozen.share == 1.0).all()
+    elif name == "hard":
+        assert (frozen.share < 0.05).all()
+        assert np.unique(frozen.family, return_counts=True)[1].min() > 30
+    elif name != "uniform":
+        assert (np.bincount(frozen.band) == len(frozen.share) / len(BANDS)).all()
 
 
-@pytest.mark.parametrize("env_id", SETS)
-def test_no_scene_is_in_two_sets(env_id):
-    starts = [tuple(start) for name in SETS[env_id] for start in load(name, env_id).scenes.start]
-    assert len(set(starts)) == len(starts)
+@pytest.mark.parametrize("task", TASKS)
+def test_no_scene_is_in_two_sets(task):
+    sets = [load(path) for path in SHIPPED if path.stem.rpartition("_")[0] == task]
+    ends = np.concatenate([np.hstack((each.scenes.start, each.scenes.goal)) for each in sets])
+    assert len(np.unique(ends, axis=0)) == len(ends)
 
 
-def test_every_scene_can_begin_and_the_planner_certifies_it(shipped, simulations):
-    """The first of each set, and those that the straight line may solve, which is only where nothing is in the way."""
-    simulation = simulations(shipped.env_id)
-    check_scenes(shipped.scenes, simulation.task.collision_model)
-    first = shipped.take(slice(0, 60))
-    assert simulation(first.scenes, first.solution).success.all()
-    straight = simulation(first.scenes, np.zeros_like(first.solution)).success
-    assert straight.all() if "Reach" in shipped.env_id else not straight.any()
+def test_every_task_has_the_sets_of_its_scenes():
+    for env_id in ENV_IDS:
+        task = registered_task(env_id)
+        own = shipped_set("test", task)
+        if env_id not in ("viapoint/Reach-v0", "viapoint/Obstacles-v0"):  # those of the Panda
+            assert own == shipped_path("test", twin_of(env_id))
+        assert load(own).task["arm"] == task.arm.name
 
 
-@pytest.mark.parametrize("name", ["hard", "uniform"])
-def test_scenes_made_again_by_their_numbers_are_the_same_on_any_threads(name):
-    some = load(name, ENV_ID).take(slice(0, 5))
-    assert remake(some, threads=1).sha256 == some.sha256
+def test_sets_made_again_are_the_same():
+    made = make.Maker(REACH).make("validation")
+    assert made.sha256 == load(shipped_path("validation", REACH)).sha256
 
 
-def test_scenes_that_are_searched_for_are_of_the_kind_asked_for_and_solved_and_can_be_drawn_again(simulation):
-    def gates():
-        return next(lot for lot in lots(simulation.task, "hard", 500) if lot.family == "gate")
-
-    lot = gates()
-    found = search(simulation, lot.source, dataclasses.replace(lot.kinds, quota=2), seed=1, label="gates")
-    assert len(found.share) == 2
-    assert ((found.share > 0.0) & (found.share < 0.05)).all()
-    assert simulation(found.scenes, found.solution).success.all()
-    for one, other in zip(redrawn(gates().source, found.number), found.scenes, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_uniform_scenes_are_those_of_the_sampler_that_have_a_solution(simulation):
-    task = simulation.task
-    (lot,) = lots(task, "uniform", 3)
-    found = first_solved(simulation, dataclasses.replace(lot.source, block=4), 3, "uniform")
-    assert simulation(found.scenes, found.solution).success.all()
-    drawn = UniformSampler(task.collision_model, task.scenes)([np.random.default_rng(SEEDS["uniform"])] * 4)
-    for one, other in zip(drawn.take(found.number), found.scenes, strict=True):
-        np.testing.assert_array_equal(one, other)
-    left = np.setdiff1d(np.arange(found.number[-1]), found.number)
-    for row in left:  # no other method solves them either
-        action = GeometrySearch(task, 512).decide(simulation.observe(drawn.take([row])))
-        assert not simulation(drawn.take([row]), action).success.any()
+def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypatch):
+    monkeypatch.setattr(make, "NUMBERS", {"test": 8, "hard": 6, "uniform": 8})
+    monkeypatch.setattr(make, "TOGETHER", 100)
+    maker = make.Maker(ENV)
+    test, hard, uniform = (maker.make(name) for name in ("test", "hard", "uniform"))
+    np.testing.assert_array_equal(np.bincount(test.band), [2, 2, 2, 2])
+    assert sorted(hard.family) == sorted(set(hard.family))
+    assert (hard.share < 0.05).all()
+    method = make_method("search4096", ENV)
+    for each in (test, hard, uniform):
+        assert len(each.share) == len(each.scenes.start) == make.NUMBERS[each.name]
+        done = simulation(each.scenes, method.decide(simulation.observe(each.scenes), each.scenes))
+        assert done.success.mean() > 0.8
 
 
-def test_what_is_too_rare_ends_the_search(simulation):
-    impossible = Kinds(of_share=lambda share: np.where(share > 2.0, 1, 0), names=("any", "more"), quota=1)
-    sampler, generator = simulation.task.sampler(), np.random.default_rng(0)
-    source = Source(draw=lambda number: sampler([generator] * number), block=64)
-    with pytest.raises(RuntimeError):
-        search(simulation, source, impossible, seed=0, label="some", most_drawn=128)
+@pytest.mark.parametrize("same", [True, False])
+def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(same, monkeypatch, capsys):
+    path = shipped_path("test", REACH)
+    frozen, before = load(path), path.read_bytes()
+    other = dataclasses.replace(frozen, scenes=frozen.scenes._replace(goal=0.99 * frozen.scenes.goal))
+    monkeypatch.setattr(make.Maker, "make", lambda *_: frozen if same else other)
+    monkeypatch.setattr(sys, "argv", ["make", "--env", REACH, "--sets", "test", "--check"])
+    with pytest.raises(SystemExit) as left:
+        make.main()
+    assert left.value.code == (0 if same else 1)
+    assert ("DIFFERENT" in capsys.readouterr().out) is not same
+    assert path.read_bytes() == before
 
 
 def test_the_stated_share_is_what_one_measures(simulation):
-    """Other draws than those of the file give the same shares, within what chance allows."""
-    frozen = load("validation", ENV_ID)
-    some = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
+    """Other random actions give the same shares in physics, within what chance and the least clearance allow."""
+    frozen = load(shipped_path("validation", ENV))
+    few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (200, 3))
     rows = np.repeat(np.arange(12), 200)
-    success = simulation(some.scenes.take(rows), np.tile(draws, (12, 1))).success
+    success = simulation(few.scenes.take(rows), np.tile(draws, (12, 1))).success
     measured = success.reshape(12, 200).mean(axis=-1)
-    spread = np.sqrt(some.share * (1.0 - some.share) * (1.0 / 200 + 1.0 / 512))
-    assert (np.abs(measured - some.share) < 4.5 * spread).all()
+    spread = np.sqrt(few.share * (1.0 - few.share) * (1.0 / 200 + 1.0 / 512))
+    assert (np.abs(measured - few.share) < 4.0 * spread + 0.03).all()
 
 
-def test_share_counts_only_what_fails_for_certain_as_failed(simulation):
-    scenes = simulation.task.sampler()([np.random.default_rng(i) for i in range(40)])
-    rows = np.repeat(np.arange(40), 32)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (len(rows), 3))
-    fails = screen(simulation.task, scenes.take(rows), actions).fails
-    assert not simulation(scenes.take(rows), actions).success[fails].any()
-    assert 0.3 < fails.mean() < 0.98
-    assert solution_share(simulation, scenes.take(slice(0, 2))).shape == (2,)
+def test_bands_by_their_edges(some):
+    share = np.array([0.9, 0.21, 0.2, 0.051, 0.05, 0.011, 0.01, 0.0])
+    np.testing.assert_array_equal(bands(share), [0, 0, 1, 1, 2, 2, 3, 3])
+    np.testing.assert_array_equal(dataclasses.replace(some, share=np.full(5, np.nan)).band, [-1] * 5)
+    assert some.take(slice(0, 0)).band.shape == (0,)
 
 
-def test_what_succeeds_for_certain_does(simulations):
-    simulation = simulations(IN_SPACE)
-    scenes = simulation.task.sampler()([np.random.default_rng(i) for i in range(40)])
-    rows = np.repeat(np.arange(40), 16)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (len(rows), 4))
-    certain = screen(simulation.task, scenes.take(rows), actions).succeeds
-    assert 40 < certain.sum() < 300
-    assert simulation(scenes.take(rows[certain]), actions[certain]).success.all()
+@pytest.mark.parametrize("kwargs", [{}, {"n_via": 2}, {"duration_range": (0.7, 1.3)}, {"decide_at": "steps"}])
+def test_frozen_scenes_are_met_where_they_fit(kwargs, capsys):
+    task = registered_task(ENV, **kwargs)
+    for name in SETS:
+        assert scenes_for(name, task).sha256 == load(shipped_path(name, ENV)).sha256
+    assert capsys.readouterr().err == ""
 
 
-def test_the_planner_solves_unseen_scenes(simulation):
-    scenes = simulation.task.sampler()([np.random.default_rng(500 + i) for i in range(40)])
-    planned = Planner(simulation, budget=PlannerBudget(first=32, generations=4))(scenes)
-    assert planned.success.all()
-    done = simulation(scenes, planned.action)
-    assert done.success.all()
-    np.testing.assert_allclose(done.reward, planned.reward)
-    again = Planner(simulation, budget=PlannerBudget(first=32, generations=4))(scenes.take(slice(3, 5)))
-    np.testing.assert_array_equal(again.action, planned.action[3:5])
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "rows"),
+    [
+        (ENV, {"n_obstacles": 3}, 3),
+        (ENV, {"arm": "panda"}, 5),
+        ("viapoint/Obstacles-v0", {"arm": "planar"}, 16),
+        ("viapoint/PlanarMovingObstacles-v0", {"n_obstacles": 2}, 2),
+    ],
+)
+def test_others_are_drawn_always_the_same_and_it_is_said(env_id, kwargs, rows, capsys):
+    task = registered_task(env_id, **kwargs)
+    test, again, validation = (scenes_for(name, task, 20) for name in ("test", "test", "validation"))
+    assert "they are drawn" in capsys.readouterr().err
+    assert test.scenes.obstacles.kind.shape == (20, rows)
+    assert (test.band == -1).all()
+    assert test.sha256 == again.sha256
+    assert not (validation.scenes.goal[:, None] == test.scenes.goal).all(axis=-1).any()
+    with pytest.raises(ValueError):
+        scenes_for("hard", task)
 
 
-def test_bands_by_their_edges():
-    np.testing.assert_array_equal(
-        bands(np.array([0.9, 0.21, 0.2, 0.051, 0.05, 0.011, 0.01, 0.0])), [0, 0, 1, 1, 2, 2, 3, 3]
-    )
-    assert load("test", ENV_ID).take(slice(0, 0)).band.shape == (0,)
+def test_a_file_is_met_wherever_its_scenes_are_possible(some, tmp_path):
+    path = tmp_path / "some.npz"
+    some.save(path)
+    found = scenes_for(path, registered_task(ENV, n_obstacles=8, whole_arm=True)).scenes
+    assert found.obstacles.kind.shape == (5, 8)
+    np.testing.assert_array_equal(found.obstacles.centre[:, :5], some.scenes.obstacles.centre)
+    assert not found.obstacles.present[:, 5:].any()
+    for kwargs in ({"n_obstacles": 2}, {"arm": "panda"}, {"shapes": "sphere"}):
+        with pytest.raises(ValueError):
+            scenes_for(path, registered_task(ENV, **kwargs))
 
 
 def refused(path):
     with pytest.raises(ValueError) as error:
-        load(path, ENV_ID)
+        load(path)
     assert path.name in str(error.value)
 
 
 def test_a_file_comes_back_as_it_was_and_any_damage_is_noticed(some, tmp_path, monkeypatch):
     path = tmp_path / "some.npz"
+    refused(path)
     some.save(path)
-    assert load(path, ENV_ID).sha256 == some.sha256
+    assert load(path).sha256 == some.sha256
     whole = path.read_bytes()
     np.save(tmp_path / "one.npy", np.zeros(3))
     for content in (b"", b"no archive", b"PK", whole[: len(whole) // 2], (tmp_path / "one.npy").read_bytes()):
@@ -188,10 +189,17 @@ def test_a_file_comes_back_as_it_was_and_any_damage_is_noticed(some, tmp_path, m
     for at in range(30, len(whole) - 30, 67):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
         with contextlib.suppress(ValueError):  # a bit may lie where nothing is read
-            load(path, ENV_ID)
-    np.savez_compressed(path, start=np.zeros((1_000_000, 2)))
-    monkeypatch.setattr(scene_set, "LARGEST", 1_000_000)
+            assert load(path).sha256 == some.sha256
+    path.write_bytes(whole)
+    monkeypatch.setattr(scene_set, "LARGEST", 1_000)
     refused(path)
+
+
+def test_meshes_are_not_frozen(some, tmp_path):
+    corners = 0.02 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    obstacles = pack([[ConvexMesh(corners)]] * 5)
+    with pytest.raises(ValueError):
+        dataclasses.replace(some, scenes=some.scenes._replace(obstacles=obstacles)).save(tmp_path / "no.npz")
 
 
 @pytest.mark.parametrize(
@@ -200,17 +208,20 @@ def test_a_file_comes_back_as_it_was_and_any_damage_is_noticed(some, tmp_path, m
         ("share", lambda share: share[:3]),
         ("share", lambda share: share[0]),
         ("share", lambda share: share * 0.5),
-        ("share", lambda share: share * 9.0),
+        ("share", lambda share: share + 9.0),
         ("start", lambda start: start[:, :1]),
         ("start", lambda start: start.astype(str)),
+        ("start", lambda start: start * np.nan),
         ("goal", lambda goal: goal.astype(complex)),
-        ("obstacles", lambda rows: rows[..., :4]),
-        ("obstacles", lambda rows: rows[:0]),
-        ("solution", lambda solution: solution[:2]),
+        ("kind", lambda kind: kind[:, :0]),
+        ("kind", lambda kind: kind + 9),
+        ("centre", lambda centre: centre[..., :2]),
         ("family", lambda family: np.arange(len(family))),
         ("family", lambda family: np.full(len(family), "gate")),
-        ("number", lambda number: number[:1]),
-        ("number", lambda number: np.array([None] * len(number))),
+        ("task", lambda task: np.array("{")),
+        ("task", lambda task: np.array("5")),
+        ("task", lambda task: np.array([None])),
+        ("sha256", lambda sha256: np.array("0")),
     ],
 )
 def test_arrays_that_do_not_fit_together_are_refused(some, tmp_path, name, forge):

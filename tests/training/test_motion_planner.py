@@ -5,29 +5,33 @@ import sys
 import numpy as np
 import pytest
 
-from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs import Cylinder
+from viapoint.envs.geometry.clearance import configuration_clearances
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.scenes.scene import resting
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning import ompl_planner
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.ompl_planner import points_on
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import load
+from viapoint.training.scene_sets.scene_set import load, shipped_path
 
-WHOLE = "viapoint/PlanarObstacles-v0"
+PLANE = "viapoint/PlanarObstacles-v0"
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
     with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
-        make_method("ompl", WHOLE)
+        make_method("ompl", PLANE)
 
 
 def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     pytest.importorskip("ompl")
-    frozen = load("validation", WHOLE)
+    frozen = load(shipped_path("validation", PLANE))
     frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:3] for band in range(4)]))
     result = evaluate_methods(
-        [make_method("ompl", WHOLE)], frozen, WHOLE, batch=20, time_decisions=False
+        [make_method("ompl", PLANE)], frozen, PLANE, batch=20, time_decisions=False
     ).results[0]
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
@@ -51,7 +55,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     start, goal = np.array([-0.25, 0.35]), np.array([0.15, 0.35])
     ring = [[0.07, 0.0, 0.0, 0.07], [-0.07, 0.0, 0.0, 0.07], [0.0, 0.07, 0.07, 0.0], [0.0, -0.07, 0.07, 0.0]]
     rows = np.array([[*(start + bar[:2]), *bar[2:], 0.01] for bar in ring])
-    simulation = SceneSimulation(WHOLE, 1)
+    simulation = SceneSimulation(PLANE, 1)
     scenes = Scenes(start[None], goal[None], np.concatenate((rows, np.zeros((1, 5))))[None])
     monkeypatch.setattr(ompl_planner, "MARGINS", ompl_planner.MARGINS[:1])
     monkeypatch.setattr(ompl_planner, "PATIENCE", 0.05)
@@ -60,7 +64,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     assert not done.success.any()
 
 
-@pytest.mark.parametrize("env_id", [WHOLE, "viapoint/PandaObstacles-v0"])
+@pytest.mark.parametrize("env_id", [PLANE, "viapoint/PandaObstacles-v0"])
 def test_a_line_is_clear_where_the_arm_keeps_the_margin_along_it(env_id):
     """Against the clearance at many places along random lines."""
     pytest.importorskip("ompl")

@@ -319,7 +319,6 @@ COPIES = [
     (lambda env: env.set_options([{}] * 5), ValueError),
     (lambda env: env.set_options([5] * 6), ValueError),
     (lambda env: env.set_options(5), ValueError),
-    (lambda env: env.set_options([{"obstacles": np.zeros((k % 2, 5))} for k in range(6)]), ValueError),
     (lambda env: env.get_attr("num_envs", 6), IndexError),
     (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
     (lambda env: env.env_is_wrapped(gym.Wrapper, indices=[9]), IndexError),

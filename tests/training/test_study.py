@@ -265,4 +265,4 @@ def test_an_unknown_field_comes_with_the_closest_one():
 def test_pages_show_intervals_in_percent(whole):
     text = markdown(whole[1], "small")
     assert text.startswith("# small")
-    assert "100.0 % (75." in text  # Wilson's interval of 12 of 12
+    assert "| 0.0 % (0.0-24.2) " in text  # Wilson's interval of 0 of 12

@@ -10,6 +10,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
+from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -127,12 +128,16 @@ def test_seeds_options_and_attributes(env):
     env.seed(5)
     again = env.reset()
     assert all((first[name] == part).all() for name, part in again.items())
-    scene = {name: value[0] for name, value in env.venv.unwrapped.scenes.take([0]).as_options().items()}
-    env.set_options(scene)
-    given = env.reset()
-    assert np.ptp(given["goal"], axis=0).max() == 0.0
-    env.set_options([scene] * 6)
-    assert all((given[name] == part).all() for name, part in env.reset().items())
+    native = env.venv.unwrapped
+    scenes = [
+        scene_from_json(scene_to_json(native.scenes, native.arm, native.task.space_name, scene=row))
+        for row in range(6)
+    ]
+    env.set_options(scenes[0])
+    assert np.ptp(env.reset()["goal"], axis=0).max() == 0.0
+    env.set_options(scenes)
+    for name, part in env.reset().items():
+        np.testing.assert_allclose(part, first[name], atol=1e-6)
     assert env.get_attr("num_envs", [-1, 5]) == [6, 6]
     env.set_attr("mark", 1)
     assert env.get_attr("mark", indices=[2, 3]) == [1, 1]

@@ -359,7 +359,7 @@ def _evaluate_one(
             pieces.append({**outcome.info, "reward": outcome.reward, "": action})
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
-        if time_decisions and getattr(method, "timed", True):
+        if time_decisions:
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True

@@ -13,6 +13,7 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
+from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.replanning import NEARBY, revised_waypoints
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
@@ -160,7 +161,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
             times, cost = table_costs(table, flat)
             fast = shortest_durations(table, times, flat, limits).reshape(batch) > 1.02 * duration
     length = np.maximum(norm(problem.goal - problem.start), NEARBY[layout.space])
-    whole = layout.zero_duration(problem.start, problem.goal)
+    whole = np.maximum(layout.zero_duration(problem.start, problem.goal), SHORTEST_DURATION)
     straight = straight_jerk_cost(length, whole)[:, None]
     rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
     return Moves(table, offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)

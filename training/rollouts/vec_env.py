@@ -142,7 +142,7 @@ class ViaVecEnv(VecEnv):
             options: Batched options as the environment accepts them, or a list of one mapping per copy.
 
         Raises:
-            ValueError: There is not one mapping per copy, or their names or shapes differ.
+            ValueError: There is not one mapping per copy, or their names differ.
         """
         if options is None or isinstance(options, Mapping):
             self._batched_options = options
@@ -267,8 +267,8 @@ class ViaVecEnv(VecEnv):
         return rows
 
 
-def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
-    """Return the options of all copies in one mapping of batched arrays."""
+def _batched(options: Any, num_envs: int) -> dict[str, list[Any]]:
+    """Return the options of all copies in one mapping of lists."""
     listed = isinstance(options, Sequence) and len(options) == num_envs
     if not listed or not all(isinstance(each, Mapping) for each in options):
         raise ValueError(
@@ -276,4 +276,4 @@ def _batched(options: Any, num_envs: int) -> dict[str, NDArray[Any]]:
         )
     if any(each.keys() != options[0].keys() for each in options):
         raise ValueError(f"options must give the same names for every copy, got {options!r}")
-    return {name: np.stack([np.asarray(each[name]) for each in options]) for name in options[0]}
+    return {name: [each[name] for each in options] for name in options[0]}

@@ -207,13 +207,16 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
                 content[name] = content[name].astype(np.float64)
         content["kind"] = content["kind"].astype(np.int64)
         _check_content(content)
+        json.loads(str(content["task"]))
     except Exception as error:  # an archive can be broken in any of its layers
         raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
     return content
 
 
 def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
-    """Raise ValueError unless all arrays are of N > 0 scenes with n obstacles each."""
+    """Raise ValueError unless the task is a record and all arrays are of N > 0 scenes with n obstacles each."""
+    if not isinstance(json.loads(str(content["task"])), dict):
+        raise ValueError("its task is no record")
     if content["start"].ndim != 2 or content["kind"].ndim != 2 or not len(content["start"]):
         raise ValueError("it holds no scenes")
     number, joints = content["start"].shape
