@@ -32,6 +32,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan, SpaceName, Timing
 from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
 from viapoint.envs.rewards import RewardWeights
+from viapoint.envs.geometry.obstacles import check_simulated
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import END, Task
@@ -215,6 +216,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         # Nothing changes before all scenes are there: impossible ones raise an error.
         tried = [copy.deepcopy(generators[i]) for i in rows]
         scenes = draw_given(options, self._samplers[0], tried)
+        check_simulated(scenes.obstacles)
         for i, generator in zip(rows, tried, strict=True):
             generators[i] = generator
         self.generators = generators

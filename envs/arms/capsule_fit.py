@@ -83,6 +83,11 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         found = cover_points(corners, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
+    if found is None:
+        raise ValueError(
+            f"geom {model.geom(geom).name or geom}: tolerance {tolerance:.4g} m takes more than "
+            f"{MOST_CAPSULES} capsules; allow a greater one, or give the link simpler geoms"
+        )
     return [each._replace(excess=each.excess + larger) for each in found]
 
 
@@ -136,11 +141,10 @@ def _rim(number: int) -> Float:
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
-def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
+def cover_points(points: Float, tolerance: float) -> list[FittedCapsule] | None:
     """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
-    Raises:
-        ValueError: More than MOST_CAPSULES capsules are needed.
+    None stands for more than MOST_CAPSULES of them.
     """
     body = _body(points)
     pieces = [fit_capsule(np.asarray(body.shape.vertices), body)]
@@ -151,9 +155,7 @@ def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
             found.append(capsule)
             continue
         if len(pieces) + len(found) + 2 > MOST_CAPSULES:
-            raise ValueError(
-                f"tolerance {tolerance:.2g} m takes more than {MOST_CAPSULES} capsules for one geom"
-            )
+            return None
         pieces += _best_halves(capsule.corners, body, tolerance)
     return found
 

@@ -172,8 +172,9 @@ def _read(file: Any) -> tuple[mujoco.MjSpec, str]:
     if not isinstance(file, str | os.PathLike) or isinstance(os.fspath(file), bytes):
         raise TypeError(f"file must be the name or the text of an MJCF file, or an MjSpec, got {file!r:.60}")
     text = os.fspath(file)
-    path = Path(text)
     is_text = text.lstrip().startswith("<")
+    text = text if is_text else os.path.expanduser(text)
+    path = Path(text)
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
     try:

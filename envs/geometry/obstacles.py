@@ -31,7 +31,7 @@ from viapoint.envs.geometry.shapes import (
 
 __all__ = [
     "ABSENT", "BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "KINDS", "MESH", "POINT_CLOUD", "POSE_SIZE", "SPHERE",
-    "Geoms", "Obstacles", "add_to_model", "geoms_of", "no_obstacles", "observation_rows", "obstacles_from_rows",
+    "Geoms", "Obstacles", "add_to_model", "check_simulated", "geoms_of", "no_obstacles", "observation_rows", "obstacles_from_rows",
     "pack", "unpack",
 ]  # fmt: skip
 
@@ -391,11 +391,21 @@ class Geoms(NamedTuple):
     """Registered names of meshes, empty for other shapes, shape (N, n)."""
 
 
+def check_simulated(obstacles: Obstacles) -> None:
+    """Check that obstacles can be simulated; plans need no simulation.
+
+    Raises:
+        ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
+    """
+    if (obstacles.kind >= MESH).any():
+        geoms_of(obstacles)
+
+
 def geoms_of(obstacles: Obstacles) -> Geoms:
     """Return the MuJoCo geoms of obstacles.
 
     Raises:
-        ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
+        ValueError: An obstacle cannot be simulated, see :func:`check_simulated`.
     """
     kind = obstacles.kind
     present, meshes = obstacles.present, kind == MESH

@@ -42,6 +42,7 @@ class Canvas:
 
         Raises:
             GLUnavailableError: No OpenGL library can be used.
+            ValueError: The picture is too large for OpenGL.
         """
         self._factor = supersampling if supersampling * max(width, height) <= MAX_SIDE else 1
         columns, rows = self._factor * width, self._factor * height
@@ -51,13 +52,19 @@ class Canvas:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # GLFW warns before the exception with the same message
                 self._context = _gl_context()
-                with self._context.as_current():
-                    self._renderer = mujoco.Renderer(model, rows, columns, MAX_GEOMS)
         except Exception as error:  # platforms raise errors of many kinds, among them MuJoCo's FatalError
             platform = os.environ.get("MUJOCO_GL", "not set")
             raise GLUnavailableError(
                 f"no picture can be rendered ({error}). Install OpenGL ({INSTALL}), or choose a library that is there "
                 f"by starting Python with MUJOCO_GL=egl, osmesa or glfw; MUJOCO_GL is {platform}"
+            ) from error
+        try:
+            with self._context.as_current():
+                self._renderer = mujoco.Renderer(model, rows, columns, MAX_GEOMS)
+        except Exception as error:
+            self._context.free()
+            raise ValueError(
+                f"a picture of {width} x {height} pixels cannot be rendered here ({error}); take a smaller one"
             ) from error
 
     @property

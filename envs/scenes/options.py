@@ -14,7 +14,7 @@ from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.obstacles import MESH, Obstacles, geoms_of, no_obstacles, pack, unpack
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     REGISTERED_MESHES,
     ConvexMesh,
@@ -82,8 +82,6 @@ def draw_given(
     number, arm = len(generators), sampler.arm
     shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
-    if (obstacles.kind >= MESH).any():
-        geoms_of(obstacles)  # refuses what cannot be simulated
     names = [[shape.name for shape in each] for each in shapes or ()]
     ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
     home = np.tile(arm.home, (number, 1))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from episodes import OBSTACLES
 
+from viapoint.envs.rendering import gl
 from viapoint.envs.rendering.renderer import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
@@ -68,10 +69,18 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch, reason, mode
         raise reason("no library")
 
     monkeypatch.setenv("MUJOCO_GL", mode)
-    monkeypatch.setattr(mujoco, "Renderer", missing)
+    monkeypatch.setattr(gl, "_gl_context", missing)
     env = gym.make(OBSTACLES, render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(GLUnavailableError, match=r"apt-get install libegl1 libgl1.*MUJOCO_GL"):
+        env.render()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_picture_too_large_for_opengl_is_refused_with_its_size():
+    env = gym.make(OBSTACLES, render_mode="rgb_array", width=40000, height=40000)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="40000 x 40000"):
         env.render()
 
 

@@ -9,8 +9,11 @@ from gymnasium.spaces import Box
 
 from viapoint.envs.registration import TASKS
 from viapoint.envs.task import Task
+from viapoint.training import load_agent
+from viapoint.training.agents.agent import SAC, TQC
 from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_policy import ViaQPolicy
+from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.candidates import sobol_actions
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import merits
@@ -147,3 +150,20 @@ def test_it_learns_within_seconds_what_chance_does_not():
     assert checked > 0.7
     env.close()
     simulation.close()
+
+
+@pytest.mark.parametrize("kind", [SAC, TQC])
+def test_a_learnt_entropy_coefficient_is_saved_and_loaded(kind, tmp_path):
+    env = ViaVecEnv("viapoint/PlanarReach-v0", 4, seed=0)
+    model = kind("MultiInputPolicy", env, learning_starts=16, buffer_size=500, learning_rate=3e-2, seed=0)
+    model.learn(100)
+    model.save(tmp_path / "model")
+    loaded = load_agent(tmp_path / "model", env=env)
+    assert model.log_ent_coef.item() < -0.1
+    assert loaded.log_ent_coef.item() == model.log_ent_coef.item()
+
+
+def test_an_environment_of_another_task_is_to_blame_and_not_the_file():
+    with pytest.raises(ValueError, match="env does not fit the agent") as raised:
+        load_agent(PLANE, env=ViaVecEnv(PLANE, 2, n_via=2))
+    assert not isinstance(raised.value, BadFileError)

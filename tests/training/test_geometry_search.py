@@ -33,6 +33,17 @@ def made(env_id, number=16, **kwargs):
     return env, observation, Problem.of_observation(observation, env.task)
 
 
+@pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
+def test_what_the_search_holds_for_clear_is_clear_when_executed(env_id):
+    simulation = SceneSimulation(env_id)
+    scenes = scenes_for("validation", simulation.task, 200).take(slice(200)).scenes
+    problem = Problem.of_scenes(scenes, simulation.task)
+    actions = GeometrySearch(simulation.task, n_checks=256).solve(problem)
+    clear = plan_clearances(simulation.task, problem, actions[:, None], 0.0, 0.0, exact=True)[:, 0] >= 0.0
+    assert clear.mean() > 0.7
+    np.testing.assert_array_equal(simulation(scenes, actions).success[clear], True)
+
+
 def random_actions(task, *shape, seed=0):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (*shape, task.action.size))
 

@@ -106,7 +106,7 @@ class Agent(BaseAlgorithm):
         Raises:
             ValueError: The agent has no environment of this package, or holds objects that JSON cannot represent.
         """
-        write_folder(Path(os.fspath(path).removesuffix(".zip")), lambda folder: save_model(self, folder))
+        write_folder(Path(os.fspath(path).removesuffix(".zip")).expanduser(), lambda folder: save_model(self, folder))
 
     @classmethod
     def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]
@@ -191,7 +191,7 @@ def find_model(source: str | Path) -> Path:
     Raises:
         ValueError: It is none of them.
     """
-    folder, known = Path(source), ", ".join(SHIPPED_IDS)
+    folder, known = Path(source).expanduser(), ", ".join(SHIPPED_IDS)
     if str(source) in SHIPPED_IDS:
         return SHIPPED / folder.name
     if str(source) in gym.registry:

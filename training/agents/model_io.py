@@ -21,7 +21,12 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import (
+    ConstantSchedule,
+    FloatSchedule,
+    LinearSchedule,
+    check_for_correct_spaces,
+)
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
@@ -82,6 +87,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
 
     Raises:
         BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
+        ValueError: The environment is another one than the agent needs.
     """
     path, tensors = folder / "model.json", folder / "weights.safetensors"
     record = read_json(path, LARGEST_MODEL_JSON)
@@ -96,12 +102,17 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
-            chosen = env or own_environment(record["env"])
-            model = build(record["algorithm"], record["policy"], chosen, hyperparameters)
+            own = own_environment(record["env"])
+            if env is not None:
+                check_for_correct_spaces(env, own.observation_space, own.action_space)
+            model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
         raise
     except Exception as error:
+        if env is not None:
+            load_model(folder)  # raises the error of the file if that is to blame
+            raise ValueError(f"env does not fit the agent in {folder}: {error}") from None
         reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
         raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
     put_weights(model, arrays, tensors)
@@ -199,30 +210,38 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def weights(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the policy's tensors by name, with targets and critics."""
-    return {name: tensor.detach().cpu().numpy() for name, tensor in model.policy.state_dict().items()}
+    """Return the tensors of :func:`_tensors` as arrays."""
+    return {name: tensor.detach().cpu().numpy() for name, tensor in _tensors(model).items()}
+
+
+def _tensors(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """Return the policy's tensors by name, with targets and critics, and those of the algorithm: SAC's and TQC's entropy."""
+    _, others = model._get_torch_save_params()
+    return {**model.policy.state_dict(), **{name: getattr(model, name) for name in others}}
 
 
 def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
-    """Set the policy's tensors after checking all of them.
+    """Set the tensors of :func:`_tensors` after checking all of them.
 
     Raises:
         BadFileError: Names, shapes or types differ, or a value is not finite.
     """
-    wanted = model.policy.state_dict()
+    wanted = _tensors(model)
     if set(arrays) != set(wanted):
         name = sorted(set(arrays) ^ set(wanted))[0]
         raise BadFileError(
             path, f"tensor {name!r} is {'missing' if name in wanted else 'unknown to the model'}"
         )
     for name, array in arrays.items():
-        expected = wanted[name].cpu().numpy()
+        expected = wanted[name].detach().cpu().numpy()
         if array.shape != expected.shape or array.dtype != expected.dtype:
             got, must = (f"{a.dtype} {a.shape}" for a in (array, expected))
             raise BadFileError(path, f"tensor {name!r} must be {must}, is {got}")
         if not np.isfinite(array).all():
             raise BadFileError(path, f"tensor {name!r} holds values that are not finite")
-    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in arrays.items()})
+    with torch.no_grad():
+        for name, array in arrays.items():
+            wanted[name].copy_(torch.from_numpy(array))
 
 
 def _digest(path: Path) -> str:

@@ -24,7 +24,7 @@ from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, merits
+from viapoint.training.planning.search import INFEASIBLE, best_of, merits
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -201,7 +201,7 @@ class ViaQPolicy(BasePolicy):
         checked = np.take_along_axis(actions, promising[..., None], axis=1)
         worth = merits(self.task, problem, checked)
         unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
-        best: Numbers = checked[every, worth.argmax(axis=1)].copy()
+        best = best_of(self.task, problem, checked, worth)
         some = every if self.replanning else unsolved
         if local and len(some):
             best[some] = self._improved(problem.take(some), checked[some], worth[some], local)
@@ -216,7 +216,7 @@ class ViaQPolicy(BasePolicy):
                 near = self._around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
                 checked = np.concatenate((checked, near), axis=1)
                 worth = np.concatenate((worth, merits(self.task, problem, near)), axis=1)
-        return np.asarray(checked[np.arange(len(checked)), worth.argmax(axis=1)])
+        return best_of(self.task, problem, checked, worth)
 
     def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
         """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).

@@ -11,8 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
 
+import numpy as np
 import tyro
 
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
@@ -66,6 +69,28 @@ def _to_words(values: Mapping[str, Any]) -> list[str]:
     return words
 
 
+def _plain(name: str, value: Any) -> Any:
+    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, registered arms by name.
+
+    Raises:
+        ValueError: JSON has no form of it.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Arm) and value.name in arm_names() and arm_of(value.name) is value:
+        return value.name
+    if isinstance(value, Mapping):
+        return {f"{key}": _plain(f"{key} in {name}", each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(name, each) for each in value]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise ValueError(
+        f"{name} must be numbers, texts, lists and dictionaries, which a file of the training can hold, or a registered "
+        f"arm, got {value!r:.80}"
+    )
+
+
 # tyro reads a dictionary of one type of values only.
 NamedValues = Annotated[
     dict[str, Any],
@@ -92,7 +117,9 @@ class Config:
         for each in dataclasses.fields(self):
             value = getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
-                object.__setattr__(self, each.name, Path(value))
+                object.__setattr__(self, each.name, Path(value).expanduser())
+            if str(each.type) == "NamedValues":
+                object.__setattr__(self, each.name, _plain(each.name, value))
             if each.name in self.least and not (value is None and each.default is None):
                 object.__setattr__(self, each.name, check_whole(each.name, value, self.least[each.name]))
         self._check()

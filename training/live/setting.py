@@ -17,7 +17,7 @@ from viapoint.envs import ReachVectorEnv, Scenes, Task, inverse_kinematics
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
-from viapoint.envs.geometry.obstacles import KINDS, quaternions_of
+from viapoint.envs.geometry.obstacles import KINDS, check_simulated, quaternions_of
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
@@ -218,7 +218,8 @@ class Shared:
         scene = LiveScene.from_json(content, self.own.task)
         setting = self.setting_of(scene)
         try:
-            draw_given(scene.options(), setting.sampler, [np.random.default_rng(0)])
+            given = draw_given(scene.options(), setting.sampler, [np.random.default_rng(0)])
+            check_simulated(given.obstacles)
         except ValueError as error:
             raise ValueError(f"the scene file is impossible: {error}") from None
         return scene

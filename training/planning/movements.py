@@ -29,6 +29,8 @@ from viapoint.envs.plans import SHORTEST_DURATION
 
 INSTANTS = 64
 """Instants of a movement that are checked; a power of two."""
+FINE_INSTANTS = 256
+"""Instants of a movement that is checked once more before it is executed; a power of two."""
 OUTSIDE = -2.0
 """Clearance of movements that leave the reach or the joint ranges, [m]."""
 TABLES: dict[int, list[tuple[float, ...]]] = {
@@ -45,18 +47,18 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
 
 
 class MovementTable(NamedTuple):
-    """Movements through K via-points in unit time, with M sets of passage times."""
+    """Movements through K via-points in unit time at N instants, with M sets of passage times."""
 
     durations: Float
     """Durations of the segments, shape (M, K + 1)."""
     basis: Float
-    """Influence of each offset on the position at each instant, shape (M, INSTANTS, K + 3)."""
+    """Influence of each offset on the position at each instant, shape (M, N, K + 3)."""
     rate: Float
-    """Influence of each offset on the velocity at each instant, shape (M, INSTANTS, K + 3)."""
+    """Influence of each offset on the velocity at each instant, shape (M, N, K + 3)."""
     cost: Float
     """Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)."""
     order: Int
-    """Instants in an order that looks everywhere soon, shape (INSTANTS,)."""
+    """Instants in an order that looks everywhere soon, shape (N,)."""
 
 
 class Setting(NamedTuple):
@@ -80,7 +82,7 @@ def movement_table(n_via: int) -> MovementTable:
     return table_with(np.array([np.diff((0.0, *times, 1.0)) for times in sets]))
 
 
-def table_with(durations: Float) -> MovementTable:
+def table_with(durations: Float, number_of_instants: int = INSTANTS) -> MovementTable:
     """Return the table of movements whose segments take some durations in unit time, shape (M, K + 1)."""
     n_via = durations.shape[1] - 1
     number, columns = len(durations), n_via + 3
@@ -93,7 +95,7 @@ def table_with(durations: Float) -> MovementTable:
     acceleration[:, n_via + 2] = 1.0
     each = np.repeat(durations[:, None], columns, axis=1)
     movements = primitives.through(waypoints, each, start_velocity=velocity, start_acceleration=acceleration)
-    instants = np.linspace(0.0, 1.0, INSTANTS)
+    instants = np.linspace(0.0, 1.0, number_of_instants)
     basis = np.ascontiguousarray(movements(instants)[..., 0].transpose(0, 2, 1))
     rate = np.ascontiguousarray(movements(instants, 1)[..., 0].transpose(0, 2, 1))
     # The square of the jerk has degree four in each segment: three Gauss-Legendre nodes are exact.
@@ -103,8 +105,8 @@ def table_with(durations: Float) -> MovementTable:
     jerk = movements(np.repeat(times.reshape(number, 1, -1), columns, axis=1), 3)[..., 0]
     share = (0.5 * durations[..., None] * weights).reshape(number, -1)
     cost = 0.5 * np.einsum("mit,mjt,mt->mij", jerk, jerk, share)
-    bits = INSTANTS.bit_length() - 1
-    order = np.array([int(f"{k:0{bits}b}"[::-1], 2) for k in range(INSTANTS)])
+    bits = number_of_instants.bit_length() - 1
+    order = np.array([int(f"{k:0{bits}b}"[::-1], 2) for k in range(number_of_instants)])
     return MovementTable(durations, basis, rate, cost, order)
 
 
@@ -242,7 +244,7 @@ def least_clearance(
     """
     for k in range(len(table.order)):
         instant = table.order[k]
-        time = duration * instant / (INSTANTS - 1)
+        time = duration * instant / (len(table.order) - 1)
         if time > until:  # obstacles may change course until then, joint ranges do not
             if not joints_at(setting, table, times, instant, start, offsets, place_of_hand, joints):
                 return OUTSIDE
@@ -287,7 +289,7 @@ def shortest_durations(table: MovementTable, times: Int, offsets: Float, rate_li
     found = np.empty(len(offsets))
     for h in range(len(offsets)):
         most = 0.0
-        for instant in range(1, INSTANTS - 1):
+        for instant in range(1, len(table.order) - 1):
             for d in range(offsets.shape[2]):
                 rate = 0.0
                 for i in range(offsets.shape[1]):

@@ -18,6 +18,8 @@ from viapoint.envs.replanning import NEARBY, revised_waypoints
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import (
+    FINE_INSTANTS,
+    INSTANTS,
     MovementTable,
     Setting,
     movement_table,
@@ -114,8 +116,12 @@ class Moves(NamedTuple):
     """True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them."""
 
 
-def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
-    """Return the plans of actions of shape (B, H, m)."""
+def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:
+    """Return the plans of actions of shape (B, H, m).
+
+    Their passage times are the best of a table. With `exact`, plans from rest have those of the environment, and more
+    instants.
+    """
     layout, table = task.action, movement_table(task.n_via)
     vectors = np.asarray(actions, dtype=np.float64)
     start, goal = problem.start[:, None], problem.goal[:, None]
@@ -138,9 +144,9 @@ def moves_of(task: Task, problem: Problem, actions: Numbers) -> Moves:
         _set_motion(problem, duration, offsets)
     offsets[..., : task.n_via + 1, :] = waypoints[..., 1:, :] - waypoints[..., :1, :]
     flat = offsets.reshape(-1, columns, dimension)
-    if layout.timing == "learned" and problem.remaining is None:
-        shares = layout.shares(waypoints, vectors)
-        table = table_with(shares.reshape(-1, task.n_via + 1))  # each plan has passage times of its own
+    if (exact or layout.timing == "learned") and problem.remaining is None:
+        shares = layout.shares(waypoints, vectors).reshape(-1, task.n_via + 1)
+        table = table_with(shares, FINE_INSTANTS if exact else INSTANTS)  # each plan has times of its own
         times = np.arange(len(flat))
         cost = np.einsum("hij,hid,hjd->h", table.cost, flat, flat)
     else:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.common.types import Float, Single
+from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
@@ -35,6 +35,8 @@ KEEP_BONUS = 0.1
 """Reward by which another plan must be better than the present one, as each change of plan costs jerk."""
 HORIZONS = (1e9, 1.2, 0.9, 0.6, 0.3)
 """Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course."""
+VERIFIED = 4
+"""Number of best candidates that are checked once more before one is taken."""
 N_CENTRES = 4
 """Number of best candidates that a round of refinement samples around."""
 SPREAD = 0.25
@@ -120,8 +122,7 @@ class GeometrySearch:
             near = np.clip(centres[:, np.arange(self.per_round) % centres.shape[1]] + steps, -1.0, 1.0)
             candidates = np.concatenate((candidates, near), axis=1)
             merit = np.concatenate((merit, merits(self.task, problem, near)), axis=1)
-        best = merit.argmax(axis=1)
-        return np.asarray(candidates[np.arange(len(best)), best], dtype=np.float64)
+        return best_of(self.task, problem, candidates, merit).astype(np.float64)
 
     def predict(
         self,
@@ -165,15 +166,39 @@ class GeometrySearch:
         return np.insert(sobol_actions(self.per_round + 1, size - 1)[1:], at, 0.0, axis=1)
 
 
-def merits(task: Task, problem: Problem, actions: Numbers) -> Float:
+def best_of(task: Task, problem: Problem, actions: Numbers, merit: Float) -> Numbers:
+    """Return the best of actions of shape (B, H, m), shape (B, m), by their merits, shape (B, H).
+
+    Merits are of movements that differ a little from the executed ones. So a movement from rest is checked once more, as
+    it will be executed; if it is not clear, the best of the others is taken, several times if need be.
+    """
+    best = merit.argmax(axis=1)
+    if problem.remaining is None:
+        barred = np.zeros(merit.shape, bool)
+        rows = np.flatnonzero(merit.max(axis=1) > 0.5 * INFEASIBLE)
+        for _ in range(VERIFIED if rows.size else 0):
+            some, chosen = problem.take(rows), actions[rows, best[rows]][:, None]
+            least = 0.5 * CLEARANCE_MARGIN
+            rows = rows[plan_clearances(task, some, chosen, least, least, exact=True)[:, 0] < least]
+            if not rows.size:
+                break
+            barred[rows, best[rows]] = True
+            again = merits(task, problem.take(rows), actions[rows], barred[rows])
+            best[rows] = again.argmax(axis=1)
+    return np.asarray(actions[np.arange(len(best)), best])
+
+
+def merits(task: Task, problem: Problem, actions: Numbers, barred: Bool | None = None) -> Float:
     """Return the merit of actions of shape (B, H, m), by which the best one has the greatest, shape (B, H).
 
     The merit of a clear plan is its reward if the physics follows it, and that of others is near INFEASIBLE. It is a
     lower bound for plans that are certainly no better than another one. When replanning, a first action of zero, which
-    keeps the plan, gains KEEP_BONUS.
+    keeps the plan, gains KEEP_BONUS. Actions that are barred, by a mask of shape (B, H), are not considered.
     """
     moves = moves_of(task, problem, actions)
     worth = worth_of(task, problem, moves)
+    if barred is not None:
+        worth[barred] = 3.0 * INFEASIBLE
     replanning = problem.remaining is not None
     if replanning and not actions[:, 0].any():
         worth[:, 0] += KEEP_BONUS
@@ -183,7 +208,9 @@ def merits(task: Task, problem: Problem, actions: Numbers) -> Float:
     return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
 
 
-def plan_clearances(task: Task, problem: Problem, actions: Numbers, most: float, least: float) -> Float:
+def plan_clearances(
+    task: Task, problem: Problem, actions: Numbers, most: float, least: float, *, exact: bool = False
+) -> Float:
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
     Args:
@@ -192,8 +219,9 @@ def plan_clearances(task: Task, problem: Problem, actions: Numbers, most: float,
         actions: Actions.
         most: Greatest clearance of interest, [m].
         least: Clearance below which the exact value does not matter, [m].
+        exact: True for movements as they are executed, at many instants; they take longer.
     """
-    moves = moves_of(task, problem, actions)
+    moves = moves_of(task, problem, actions, exact=exact)
     setting = setting_of(task, problem.obstacles)
     return np.asarray(_clearances(setting, moves.table, problem.start, moves, problem.obstacles, most, least))
 

@@ -56,7 +56,7 @@ def record_video(
         ValueError: The path has another suffix or is a file of something else, the environment has another render
             mode, or there is no scene.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     check_ours(path)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"path must end in .mp4, got {path}")

@@ -73,7 +73,7 @@ class Run:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        folder = Path(folder)
+        folder = Path(folder).expanduser()
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder

@@ -269,7 +269,7 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
     """
     name = str(name_or_path)
     if name not in SETS:
-        frozen = load(Path(name_or_path))
+        frozen = load(Path(name_or_path).expanduser())
         _check_fit(frozen, task)
         return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows))
     path = shipped_set(name, task)

@@ -83,7 +83,7 @@ def run_study(
         >>> table.success.tolist()
         [1.0]
     """
-    folder = Path(study.out if out is None else out).absolute()
+    folder = Path(study.out if out is None else out).expanduser().absolute()
     _claim(folder, study.name)
     missing = [trial for trial in study.trials if finished_record(trial, folder) is None]
     searches = [search for search in study.searches if not search.is_finished(folder)]
