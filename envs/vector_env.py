@@ -28,11 +28,11 @@ from viapoint.envs.common.validation import (
 )
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.events import Trigger
+from viapoint.envs.geometry.obstacles import check_simulated
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan, SpaceName, Timing
 from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
 from viapoint.envs.rewards import RewardWeights
-from viapoint.envs.geometry.obstacles import check_simulated
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import END, Task

@@ -31,8 +31,8 @@ from viapoint.envs.geometry.shapes import (
 
 __all__ = [
     "ABSENT", "BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "KINDS", "MESH", "POINT_CLOUD", "POSE_SIZE", "SPHERE",
-    "Geoms", "Obstacles", "add_to_model", "check_simulated", "geoms_of", "no_obstacles", "observation_rows", "obstacles_from_rows",
-    "pack", "unpack",
+    "Geoms", "Obstacles", "add_to_model", "check_simulated", "geoms_of", "no_obstacles", "observation_rows",
+    "obstacles_from_rows", "pack", "unpack",
 ]  # fmt: skip
 
 POSE_SIZE = 16

@@ -249,7 +249,10 @@ def test_invalid_arguments_are_refused(arguments, error):
 
 def test_a_tolerance_that_takes_too_many_capsules_is_named():
     with pytest.raises(ValueError, match=r"tolerance 0\.005 m"):
-        ur5e(changed((r'<geom type="box"', '<geom type="ellipsoid" size="0.3 0.02 0.1"/><geom type="box"')), tolerance=0.005)
+        ur5e(
+            changed((r'<geom type="box"', '<geom type="ellipsoid" size="0.3 0.02 0.1"/><geom type="box"')),
+            tolerance=0.005,
+        )
 
 
 @pytest.mark.parametrize(

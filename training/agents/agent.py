@@ -106,7 +106,9 @@ class Agent(BaseAlgorithm):
         Raises:
             ValueError: The agent has no environment of this package, or holds objects that JSON cannot represent.
         """
-        write_folder(Path(os.fspath(path).removesuffix(".zip")).expanduser(), lambda folder: save_model(self, folder))
+        write_folder(
+            Path(os.fspath(path).removesuffix(".zip")).expanduser(), lambda folder: save_model(self, folder)
+        )
 
     @classmethod
     def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]

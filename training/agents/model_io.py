@@ -215,7 +215,7 @@ def weights(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _tensors(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
-    """Return the policy's tensors by name, with targets and critics, and those of the algorithm: SAC's and TQC's entropy."""
+    """Return the tensors of a model by name: those of the policy, and coefficients that SAC and TQC learn."""
     _, others = model._get_torch_save_params()
     return {**model.policy.state_dict(), **{name: getattr(model, name) for name in others}}
 

@@ -20,18 +20,23 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import memory, place_group, self_clearance
+from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
+from viapoint.envs.geometry.clearance import memory as memory_of
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.kernels import kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, MovementTable, Setting, place_arm
+from viapoint.training.planning.movements import INSTANTS, Setting, place_arm
 from viapoint.training.planning.problem import Moves, Problem, setting_of
 
 SCALE = 8.0
 """Scale of lengths at the input of the network, [1/m]."""
 UNIT = 0.05
 """Length of one output unit of the network, [m]."""
+REFINED = 4
+"""Number of the nearest pairs whose closest approach is found between the instants that are looked at."""
+STEPS = 2
+"""Greatest number of instants by which it may lie beside the nearest of them."""
 NEAREST = 12
 """Number of pairs of a movement that the network sees."""
 CLEAR = 0.1
@@ -70,31 +75,14 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
         until: Time after which instants do not count, shape (B, H), [s]; the first instant always counts.
     """
     obstacles = problem.obstacles
-    centre, half = bounding_boxes(obstacles)
     columns = np.array([task.shapes.index(kind) if kind in task.shapes else 0 for kind in KINDS])
     number, plans = moves.duration.shape
     late = np.full((number, plans), np.inf) if until is None else until
-    setting = setting_of(task, obstacles)
-    wide = LENGTHS + len(task.shapes)
-    features = np.zeros((number, plans, NEAREST, wide), np.float32)
+    given = Given(setting_of(task, obstacles), problem.start, moves, obstacles, *bounding_boxes(obstacles))
+    features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
     least, inside = np.full((number, plans), CLEAR), np.ones((number, plans), np.bool_)
-    _gather(
-        setting,
-        moves.table,
-        problem.start,
-        moves,
-        obstacles,
-        centre,
-        half,
-        columns,
-        instants,
-        late,
-        features,
-        gaps,
-        least,
-        inside,
-    )
+    _gather(given, columns, instants, late, features, gaps, least, inside)
     return Pairs(
         torch.from_numpy(features),
         torch.from_numpy(gaps.astype(np.float32)),
@@ -104,12 +92,53 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
     )
 
 
+class Given(NamedTuple):
+    """Movements and obstacles, as compiled functions take them."""
+
+    setting: Setting
+    start: Float
+    """Present references, shape (B, D)."""
+    moves: Moves
+    obstacles: Obstacles
+    centre: Float
+    """Centres of the obstacles' bounding boxes, shape (B, n, 3), [m]."""
+    half: Float
+    """Their half lengths, shape (B, n, 3), [m]."""
+
+
+class Memory(NamedTuple):
+    """Memory of compiled functions."""
+
+    position: Float
+    """Shape (D,)."""
+    joints: Float
+    """Shape (J,)."""
+    placed: Placed
+    places: Float
+    """Places of a sphere in the frame of an obstacle: before, at and after its closest instant, shape (3, 3), [m]."""
+
+
 @kernel
-def _box_gap(rotation: Float, dx: float, dy: float, dz: float, half: Float, local: Float) -> float:
-    """Fill in a point in the frame of a box, and return its signed distance from the box, [m]."""
+def _arm_at(given: Given, b: int, h: int, instant: int, memory: Memory) -> bool:
+    """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
+    setting, moves = given.setting, given.moves
+    position, joints, placed = memory.position, memory.joints, memory.placed
+    offsets, times = moves.offsets[b, h], moves.times[b, h]
+    return bool(
+        place_arm(setting, moves.table, times, instant, given.start[b], offsets, position, joints, placed)
+    )
+
+
+@kernel
+def _gap(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> float:
+    """Fill in a point in the frame of an obstacle, and return its signed distance from the obstacle's box, [m]."""
+    obstacles, half = given.obstacles, given.half[b, row]
     largest, outside = -NOWHERE, 0.0
     for axis in range(3):
-        local[axis] = rotation[0, axis] * dx + rotation[1, axis] * dy + rotation[2, axis] * dz
+        local[axis] = 0.0
+        for k in range(3):
+            away = point[k] - given.centre[b, row, k] - obstacles.velocity[b, row, k] * time
+            local[axis] += obstacles.rotation[b, row, k, axis] * away
         over = abs(local[axis]) - half[axis]
         largest = max(largest, over)
         if over > 0.0:
@@ -118,15 +147,78 @@ def _box_gap(rotation: Float, dx: float, dy: float, dz: float, half: Float, loca
     return distance
 
 
+@kernel
+def _gap_at(
+    given: Given,
+    b: int,
+    h: int,
+    row: int,
+    group: int,
+    sphere: int,
+    instant: int,
+    memory: Memory,
+    local: Float,
+) -> float:
+    """Fill in a sphere's centre in the frame of an obstacle at an instant, and return its distance from the box, [m].
+
+    Out of reach the distance is NOWHERE.
+    """
+    if not _arm_at(given, b, h, instant, memory):
+        return NOWHERE
+    place_group(given.setting.spheres, group, memory.placed)
+    time = given.moves.duration[b, h] * instant / (INSTANTS - 1)
+    return float(_gap(given, b, row, memory.placed.centre[sphere], time, local))
+
+
+@kernel
+def _closest(
+    given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, last: int, memory: Memory
+) -> float:
+    """Fill in the middle of the places with that where sphere and box are closest, and return the distance, [m].
+
+    From an instant the search goes to the nearest ones beside it, up to the last one that counts, and between these
+    along a parabola through three places.
+    """
+    places = memory.places
+    least = _gap_at(given, b, h, row, group, sphere, instant, memory, places[1])
+    before, after = NOWHERE, NOWHERE
+    for step in range(-1, 2, 2):
+        for _ in range(STEPS):
+            other = instant + step
+            if other < 0 or other > last:
+                break
+            beside = _gap_at(given, b, h, row, group, sphere, other, memory, places[1 + step])
+            nearer = beside < least
+            if nearer:  # the place in the middle becomes the one behind, and this one that in the middle
+                for axis in range(3):
+                    places[1 - step, axis] = places[1, axis]
+                    places[1, axis] = places[1 + step, axis]
+            if step < 0:
+                before, after = (NOWHERE, least) if nearer else (beside, after)
+            else:
+                before, after = (least, NOWHERE) if nearer else (before, beside)
+            if not nearer:
+                break
+            least, instant = beside, other
+    bend = before - 2.0 * least + after
+    if max(before, after) >= NOWHERE or bend <= 0.0:
+        return least
+    share = min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+    outside, largest = 0.0, -NOWHERE
+    for axis in range(3):
+        slope = 0.5 * (places[2, axis] - places[0, axis])
+        curve = 0.5 * (places[2, axis] + places[0, axis]) - places[1, axis]
+        places[1, axis] += share * (slope + share * curve)
+        over = abs(places[1, axis]) - given.half[b, row, axis]
+        largest = max(largest, over)
+        outside += max(over, 0.0) ** 2
+    closest: float = np.sqrt(outside) + min(largest, 0.0)
+    return closest
+
+
 @compiled
 def _gather(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    moves: Moves,
-    obstacles: Obstacles,
-    centre: Float,
-    half: Float,
+    given: Given,
     columns: Int,
     instants: Int,
     until: Float,
@@ -136,70 +228,66 @@ def _gather(
     inside: Bool,
 ) -> None:
     """Fill in the nearest pairs of movements, see :func:`pairs_of`."""
+    moves, obstacles, spheres = given.moves, given.obstacles, given.setting.spheres
     number, plans = moves.duration.shape
-    spheres = setting.spheres
     rows, groups = obstacles.kind.shape[1], len(spheres.link)
-    placed = memory(setting.chain, spheres)
-    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
-    gap, away = np.empty((rows, groups)), np.empty((rows, groups))
-    point, radius = np.empty((rows, groups, 3)), np.empty((rows, groups))
-    local = np.empty(3)
+    placed = memory_of(given.setting.chain, spheres)
+    position, joints = np.empty(given.start.shape[1]), np.empty(len(given.setting.joint_range))
+    memory = Memory(position, joints, placed, np.empty((3, 3)))
+    gap, local = np.empty((rows, groups)), np.empty(3)
+    nearest_sphere, nearest_instant = np.empty((rows, groups), np.int64), np.empty((rows, groups), np.int64)
     for b in range(number):
         for h in range(plans):
             gap[:] = NOWHERE
+            last = 0  # instant that counts
             for k in range(len(instants)):
                 instant = instants[k]
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
                 if k > 0 and time > until[b, h]:
                     break
-                if not place_arm(
-                    setting, table, moves.times[b, h], instant, start[b], moves.offsets[b, h], position, joints,
-                    placed,
-                ):  # fmt: skip
+                if not _arm_at(given, b, h, instant, memory):
                     inside[b, h] = False
                     break
+                last = instant
                 least[b, h] = self_clearance(spheres, placed, least[b, h], -CLEAR)
                 for row in range(rows):
                     if obstacles.kind[b, row] == ABSENT:
                         continue
-                    cx = centre[b, row, 0] + obstacles.velocity[b, row, 0] * time
-                    cy = centre[b, row, 1] + obstacles.velocity[b, row, 1] * time
-                    cz = centre[b, row, 2] + obstacles.velocity[b, row, 2] * time
-                    turn, size = obstacles.rotation[b, row], half[b, row]
                     for group in range(groups):
                         if spheres.link[group] == 0:
                             continue
-                        ball = placed.ball[group]
-                        bound = _box_gap(turn, ball[0] - cx, ball[1] - cy, ball[2] - cz, size, local)
+                        bound = _gap(given, b, row, placed.ball[group], time, local)
                         if bound - spheres.ball_radius[group] >= gap[row, group]:
                             continue
                         place_group(spheres, group, placed)
                         for sphere in range(spheres.first[group], spheres.first[group + 1]):
-                            here = placed.centre[sphere]
-                            apart = _box_gap(turn, here[0] - cx, here[1] - cy, here[2] - cz, size, local)
+                            apart = _gap(given, b, row, placed.centre[sphere], time, local)
                             if apart - spheres.radius[sphere] < gap[row, group]:
                                 gap[row, group] = apart - spheres.radius[sphere]
-                                away[row, group] = apart
-                                radius[row, group] = spheres.radius[sphere]
-                                for axis in range(3):
-                                    point[row, group, axis] = local[axis]
+                                nearest_sphere[row, group], nearest_instant[row, group] = sphere, instant
             for pair in range(NEAREST):
-                nearest, at_row, at_group = NOWHERE, -1, -1
-                for row in range(rows):
-                    for group in range(groups):
-                        if gap[row, group] < nearest:
-                            nearest, at_row, at_group = gap[row, group], row, group
-                if at_row < 0:
+                nearest, row, group = NOWHERE, -1, -1
+                for i in range(rows):
+                    for j in range(groups):
+                        if gap[i, j] < nearest:
+                            nearest, row, group = gap[i, j], i, j
+                if row < 0:
                     break
-                gap[at_row, at_group] = NOWHERE
-                gaps[b, h, pair] = away[at_row, at_group]
-                kind = obstacles.kind[b, at_row]
+                gap[row, group] = NOWHERE
+                sphere, instant = nearest_sphere[row, group], nearest_instant[row, group]
+                if pair < REFINED and inside[b, h]:
+                    gaps[b, h, pair] = _closest(given, b, h, row, group, sphere, instant, last, memory)
+                else:
+                    gaps[b, h, pair] = _gap_at(
+                        given, b, h, row, group, sphere, instant, memory, memory.places[1]
+                    )
+                kind = obstacles.kind[b, row]
                 for axis in range(3):
-                    there = point[at_row, at_group, axis]
+                    there = memory.places[1, axis]
                     # Kinds without a table of vertices or points look the same when an axis is reversed.
                     features[b, h, pair, axis] = abs(there) if kind < MESH else there
-                    features[b, h, pair, 3 + axis] = half[b, at_row, axis]
-                features[b, h, pair, 6] = radius[at_row, at_group]
+                    features[b, h, pair, 3 + axis] = given.half[b, row, axis]
+                features[b, h, pair, 6] = spheres.radius[sphere]
                 features[b, h, pair, LENGTHS + columns[kind]] = 1.0
 
 

@@ -194,7 +194,7 @@ class ViaQPolicy(BasePolicy):
         actions, values = self.propose(problem)
         every = np.arange(len(actions))
         if not self.checks:
-            return np.asarray(actions[every, values.argmax(axis=1)])
+            return best_of(self.task, problem, actions, values, among_obstacles=False)
         count = min(self.checks, values.shape[1])
         local = max(count - PROPOSALS, 0)
         promising = self._promising(values, count - local)

@@ -45,7 +45,11 @@ def train(config: TrainConfig) -> None:
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     agent = None if config.agent is None else load_agent(config.agent)
-    run = Run(str(config.agent)) if config.agent and (Path(config.agent).expanduser() / "config.json").is_file() else None
+    run = (
+        Run(str(config.agent))
+        if config.agent and (Path(config.agent).expanduser() / "config.json").is_file()
+        else None
+    )
     env_id, env_kwargs = environment_of(agent, config.env, None)
     task = registered_task(env_id, **env_kwargs)
     check_baselines(config.baselines, agent, task)

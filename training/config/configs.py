@@ -86,8 +86,8 @@ def _plain(name: str, value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     raise ValueError(
-        f"{name} must be numbers, texts, lists and dictionaries, which a file of the training can hold, or a registered "
-        f"arm, got {value!r:.80}"
+        f"{name} must be numbers, texts, lists and dictionaries, which a file can hold, or a registered arm, "
+        f"got {value!r:.80}"
     )
 
 

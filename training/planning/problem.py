@@ -166,11 +166,25 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
             _set_motion(problem, duration, offsets)
             times, cost = table_costs(table, flat)
             fast = shortest_durations(table, times, flat, limits).reshape(batch) > 1.02 * duration
-    length = np.maximum(norm(problem.goal - problem.start), NEARBY[layout.space])
-    whole = np.maximum(layout.zero_duration(problem.start, problem.goal), SHORTEST_DURATION)
+    length, whole = _straight_movement(task, problem)
     straight = straight_jerk_cost(length, whole)[:, None]
     rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
     return Moves(table, offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)
+
+
+def _straight_movement(task: Task, problem: Problem) -> tuple[Float, Float]:
+    """Return length and duration of the straight movement that rewards are relative to, shape (B,) each.
+
+    In a joint movement under way both are estimates from the total time of the present plan, as an observation has only
+    what is left of the way.
+    """
+    layout = task.action
+    length = np.maximum(norm(problem.goal - problem.start), NEARBY[layout.space])
+    whole = np.maximum(layout.zero_duration(problem.start, problem.goal), SHORTEST_DURATION)
+    if layout.space == "joints" and problem.remaining is not None and problem.time_left is not None:
+        whole = np.maximum(whole, task.time_limit - problem.time_left + problem.remaining)
+        length = np.maximum(length, whole * min(layout.rate_limit) / (1.875 * layout.centre))
+    return length, whole
 
 
 def _set_motion(problem: Problem, duration: Float, offsets: Float) -> None:

@@ -241,7 +241,9 @@ def _study(
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
     trials = sorted((each for each in found if isinstance(each, Trial)), key=lambda each: each.seed)
     every = tuple(each for each in found if isinstance(each, Search))
-    return Study(name=default, out=Path(out or f"runs/{default}").expanduser(), trials=tuple(trials), searches=every)
+    return Study(
+        name=default, out=Path(out or f"runs/{default}").expanduser(), trials=tuple(trials), searches=every
+    )
 
 
 def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
