@@ -284,7 +284,7 @@ def _measure(
         row: Index of the episode.
         placed: Memory.
     """
-    begin = state.steps[row]
+    begin, commanded = state.steps[row], steps
     for k in range(steps):
         if contact[k]:
             # The state before this step is the last one that counts.
@@ -331,7 +331,7 @@ def _measure(
     state.min_clearance[row] = min(state.min_clearance[row], done[0])
     state.self_clearance[row] = min(state.self_clearance[row], done[1])
     command = movement_clearance(
-        chain, spheres, reach, path[: steps + 1], obstacles, scene, 0.0, timestep, placed
+        chain, spheres, reach, path[: commanded + 1], obstacles, scene, 0.0, timestep, placed
     )
     state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
     return steps

@@ -5,9 +5,9 @@ learns from the outcome of single movements which pair determined it:
 
     m(s, a) = min over obstacles i, spheres h, instants t of q(centre of h in the frame of i at t, size and kind of i)
 
-Kinematics places the spheres. For each obstacle and link the pair whose sphere is nearest to the obstacle's box
-stands for all instants; of these, the network sees the nearest ones. The distance from the surface is learned, not
-computed.
+Kinematics places the spheres. For each obstacle and link two pairs stand for all instants: those whose sphere is
+nearest to the obstacle's box, and to this box with round edges. Of these, the network sees the nearest ones. The
+distance from the surface is learned, not computed.
 """
 
 from __future__ import annotations
@@ -33,11 +33,13 @@ SCALE = 8.0
 """Scale of lengths at the input of the network, [1/m]."""
 UNIT = 0.05
 """Length of one output unit of the network, [m]."""
-REFINED = 4
+REFINED = 6
 """Number of the nearest pairs whose closest approach is found between the instants that are looked at."""
 STEPS = 2
 """Greatest number of instants by which it may lie beside the nearest of them."""
-NEAREST = 12
+PARTS = 8
+"""Parts in which the way to the next instant is looked at."""
+NEAREST = 16
 """Number of pairs of a movement that the network sees."""
 CLEAR = 0.1
 """Greatest clearance of the arm from itself that matters, [m]."""
@@ -64,7 +66,15 @@ class Pairs(NamedTuple):
     """True for movements within reach and joint ranges, shape (B, H)."""
 
 
-def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: Float | None = None) -> Pairs:
+def pairs_of(
+    task: Task,
+    problem: Problem,
+    moves: Moves,
+    instants: Int,
+    until: Float | None = None,
+    *,
+    exact: bool = False,
+) -> Pairs:
     """Return the nearest pairs of movements.
 
     Args:
@@ -73,12 +83,14 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
         moves: H movements in each of them.
         instants: Instants that are looked at, some of 0 to INSTANTS - 1 in increasing order.
         until: Time after which instants do not count, shape (B, H), [s]; the first instant always counts.
+        exact: True for movements as they are executed, see :func:`~viapoint.training.planning.problem.moves_of`.
     """
     obstacles = problem.obstacles
     columns = np.array([task.shapes.index(kind) if kind in task.shapes else 0 for kind in KINDS])
     number, plans = moves.duration.shape
     late = np.full((number, plans), np.inf) if until is None else until
-    given = Given(setting_of(task, obstacles), problem.start, moves, obstacles, *bounding_boxes(obstacles))
+    setting = setting_of(task, obstacles, exact=exact)
+    given = Given(setting, problem.start, moves, obstacles, *bounding_boxes(obstacles))
     features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
     least, inside = np.full((number, plans), CLEAR), np.ones((number, plans), np.bool_)
@@ -116,6 +128,8 @@ class Memory(NamedTuple):
     placed: Placed
     places: Float
     """Places of a sphere in the frame of an obstacle: before, at and after its closest instant, shape (3, 3), [m]."""
+    local: Float
+    """Shape (3,), [m]."""
 
 
 @kernel
@@ -130,25 +144,31 @@ def _arm_at(given: Given, b: int, h: int, instant: int, memory: Memory) -> bool:
 
 
 @kernel
-def _gap(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> float:
-    """Fill in a point in the frame of an obstacle, and return its signed distance from the obstacle's box, [m]."""
-    obstacles, half = given.obstacles, given.half[b, row]
-    largest, outside = -NOWHERE, 0.0
+def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
+    """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
+    obstacles = given.obstacles
     for axis in range(3):
         local[axis] = 0.0
         for k in range(3):
             away = point[k] - given.centre[b, row, k] - obstacles.velocity[b, row, k] * time
             local[axis] += obstacles.rotation[b, row, k, axis] * away
-        over = abs(local[axis]) - half[axis]
+
+
+@kernel
+def _gap(local: Float, half: Float, rounded: int) -> float:
+    """Return the signed distance of a point from a box; with `rounded` 1, from one with round edges inside it, [m]."""
+    edge = rounded * min(half[0], half[1], half[2])
+    largest, outside = -NOWHERE, 0.0
+    for axis in range(3):
+        over = abs(local[axis]) - half[axis] + edge
         largest = max(largest, over)
-        if over > 0.0:
-            outside += over * over
-    distance: float = np.sqrt(outside) + min(largest, 0.0)
+        outside += max(over, 0.0) ** 2
+    distance: float = np.sqrt(outside) + min(largest, 0.0) - edge
     return distance
 
 
 @kernel
-def _gap_at(
+def _place_sphere(
     given: Given,
     b: int,
     h: int,
@@ -158,62 +178,77 @@ def _gap_at(
     instant: int,
     memory: Memory,
     local: Float,
-) -> float:
-    """Fill in a sphere's centre in the frame of an obstacle at an instant, and return its distance from the box, [m].
-
-    Out of reach the distance is NOWHERE.
-    """
+) -> bool:
+    """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
     if not _arm_at(given, b, h, instant, memory):
-        return NOWHERE
+        return False
     place_group(given.setting.spheres, group, memory.placed)
     time = given.moves.duration[b, h] * instant / (INSTANTS - 1)
-    return float(_gap(given, b, row, memory.placed.centre[sphere], time, local))
+    _local(given, b, row, memory.placed.centre[sphere], time, local)
+    return True
 
 
 @kernel
-def _closest(
-    given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, last: int, memory: Memory
-) -> float:
-    """Fill in the middle of the places with that where sphere and box are closest, and return the distance, [m].
+def _go_closest(
+    given: Given,
+    b: int,
+    h: int,
+    row: int,
+    group: int,
+    sphere: int,
+    instant: int,
+    last: int,
+    rounded: int,
+    memory: Memory,
+) -> None:
+    """Move the middle of the places, a sphere's centre at an instant, to where sphere and obstacle are closest.
 
-    From an instant the search goes to the nearest ones beside it, up to the last one that counts, and between these
-    along a parabola through three places.
+    The search goes to the nearest instants beside it, up to the last one that counts, and then along a parabola through
+    the places at three instants.
     """
-    places = memory.places
-    least = _gap_at(given, b, h, row, group, sphere, instant, memory, places[1])
-    before, after = NOWHERE, NOWHERE
+    places, half = memory.places, given.half[b, row]
+    least = _gap(places[1], half, rounded)
+    before, after = False, False  # True if the place beside is known
     for step in range(-1, 2, 2):
         for _ in range(STEPS):
             other = instant + step
             if other < 0 or other > last:
                 break
-            beside = _gap_at(given, b, h, row, group, sphere, other, memory, places[1 + step])
+            if not _place_sphere(given, b, h, row, group, sphere, other, memory, places[1 + step]):
+                break
+            beside = _gap(places[1 + step], half, rounded)
             nearer = beside < least
             if nearer:  # the place in the middle becomes the one behind, and this one that in the middle
                 for axis in range(3):
                     places[1 - step, axis] = places[1, axis]
                     places[1, axis] = places[1 + step, axis]
             if step < 0:
-                before, after = (NOWHERE, least) if nearer else (beside, after)
+                before, after = not nearer, after or nearer
             else:
-                before, after = (least, NOWHERE) if nearer else (before, beside)
+                before, after = before or nearer, not nearer
             if not nearer:
                 break
             least, instant = beside, other
-    bend = before - 2.0 * least + after
-    if max(before, after) >= NOWHERE or bend <= 0.0:
-        return least
-    share = min(max(0.5 * (before - after) / bend, -0.5), 0.5)
-    outside, largest = 0.0, -NOWHERE
+    if not (before and after):
+        return
+    best = 0.0
+    for k in range(-PARTS, PARTS + 1):
+        _along(places, k / PARTS, memory.local)
+        apart = _gap(memory.local, half, rounded)
+        if apart < least:
+            least, best = apart, k / PARTS
+    _along(places, best, memory.local)
+    for axis in range(3):
+        places[1, axis] = memory.local[axis]
+
+
+@kernel
+def _along(places: Float, share: float, local: Float) -> None:
+    """Fill in the place on a parabola through three places, at a share of -1 to 1 from the middle."""
     for axis in range(3):
         slope = 0.5 * (places[2, axis] - places[0, axis])
         curve = 0.5 * (places[2, axis] + places[0, axis]) - places[1, axis]
-        places[1, axis] += share * (slope + share * curve)
-        over = abs(places[1, axis]) - given.half[b, row, axis]
-        largest = max(largest, over)
-        outside += max(over, 0.0) ** 2
-    closest: float = np.sqrt(outside) + min(largest, 0.0)
-    return closest
+        local[axis] = places[1, axis] + share * (slope + share * curve)
 
 
 @compiled
@@ -233,9 +268,10 @@ def _gather(
     rows, groups = obstacles.kind.shape[1], len(spheres.link)
     placed = memory_of(given.setting.chain, spheres)
     position, joints = np.empty(given.start.shape[1]), np.empty(len(given.setting.joint_range))
-    memory = Memory(position, joints, placed, np.empty((3, 3)))
-    gap, local = np.empty((rows, groups)), np.empty(3)
-    nearest_sphere, nearest_instant = np.empty((rows, groups), np.int64), np.empty((rows, groups), np.int64)
+    memory = Memory(position, joints, placed, np.empty((3, 3)), np.empty(3))
+    local = memory.local
+    gap = np.empty((2, rows, groups))
+    nearest_sphere, nearest_instant = np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64)
     for b in range(number):
         for h in range(plans):
             gap[:] = NOWHERE
@@ -253,40 +289,45 @@ def _gather(
                 for row in range(rows):
                     if obstacles.kind[b, row] == ABSENT:
                         continue
+                    half = given.half[b, row]
                     for group in range(groups):
                         if spheres.link[group] == 0:
                             continue
-                        bound = _gap(given, b, row, placed.ball[group], time, local)
-                        if bound - spheres.ball_radius[group] >= gap[row, group]:
+                        _local(given, b, row, placed.ball[group], time, local)
+                        bound = _gap(local, half, 0) - spheres.ball_radius[group]
+                        if bound >= max(gap[0, row, group], gap[1, row, group]):
                             continue
                         place_group(spheres, group, placed)
                         for sphere in range(spheres.first[group], spheres.first[group + 1]):
-                            apart = _gap(given, b, row, placed.centre[sphere], time, local)
-                            if apart - spheres.radius[sphere] < gap[row, group]:
-                                gap[row, group] = apart - spheres.radius[sphere]
-                                nearest_sphere[row, group], nearest_instant[row, group] = sphere, instant
+                            _local(given, b, row, placed.centre[sphere], time, local)
+                            for rounded in range(2):
+                                apart = _gap(local, half, rounded) - spheres.radius[sphere]
+                                if apart < gap[rounded, row, group]:
+                                    gap[rounded, row, group] = apart
+                                    nearest_sphere[rounded, row, group] = sphere
+                                    nearest_instant[rounded, row, group] = instant
             for pair in range(NEAREST):
-                nearest, row, group = NOWHERE, -1, -1
-                for i in range(rows):
-                    for j in range(groups):
-                        if gap[i, j] < nearest:
-                            nearest, row, group = gap[i, j], i, j
+                nearest, rounded, row, group = NOWHERE, 0, -1, -1
+                for way in range(2):
+                    for i in range(rows):
+                        for j in range(groups):
+                            if gap[way, i, j] < nearest:
+                                nearest, rounded, row, group = gap[way, i, j], way, i, j
                 if row < 0:
                     break
-                gap[row, group] = NOWHERE
-                sphere, instant = nearest_sphere[row, group], nearest_instant[row, group]
+                gap[rounded, row, group] = NOWHERE
+                sphere, instant = nearest_sphere[rounded, row, group], nearest_instant[rounded, row, group]
+                _place_sphere(given, b, h, row, group, sphere, instant, memory, memory.places[1])
                 if pair < REFINED and inside[b, h]:
-                    gaps[b, h, pair] = _closest(given, b, h, row, group, sphere, instant, last, memory)
-                else:
-                    gaps[b, h, pair] = _gap_at(
-                        given, b, h, row, group, sphere, instant, memory, memory.places[1]
-                    )
+                    _go_closest(given, b, h, row, group, sphere, instant, last, rounded, memory)
+                half = given.half[b, row]
+                gaps[b, h, pair] = _gap(memory.places[1], half, 0)
                 kind = obstacles.kind[b, row]
                 for axis in range(3):
                     there = memory.places[1, axis]
                     # Kinds without a table of vertices or points look the same when an axis is reversed.
                     features[b, h, pair, axis] = abs(there) if kind < MESH else there
-                    features[b, h, pair, 3 + axis] = given.half[b, row, axis]
+                    features[b, h, pair, 3 + axis] = half[axis]
                 features[b, h, pair, 6] = spheres.radius[sphere]
                 features[b, h, pair, LENGTHS + columns[kind]] = 1.0
 

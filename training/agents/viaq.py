@@ -199,7 +199,12 @@ class ViaQ(Agent, OffPolicyAlgorithm):
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
         policy, critic = self.policy, self.policy.critic
-        until = batch.elapsed[:, None].astype(np.float64) if policy.replanning else None
+        until = None
+        if (
+            policy.replanning
+        ):  # after a contact, the clearance is that of the movement up to the next decision
+            until = batch.elapsed + policy.task.horizon * (batch.outcomes.contact > 0.5)
+            until = until[:, None].astype(np.float64)
         problem = Problem.of_observation(batch.observations, policy.task)
         inputs = policy.inputs(problem, batch.actions[:, None], until)
         values = Values(*(each[:, 0] for each in critic(inputs)))

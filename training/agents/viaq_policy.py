@@ -15,6 +15,7 @@ from torch import Tensor
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Int
+from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
@@ -22,9 +23,9 @@ from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
-from viapoint.training.planning.movements import INSTANTS
+from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, best_of, merits
+from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -194,7 +195,7 @@ class ViaQPolicy(BasePolicy):
         actions, values = self.propose(problem)
         every = np.arange(len(actions))
         if not self.checks:
-            return best_of(self.task, problem, actions, values, among_obstacles=False)
+            return self._best_within_reach(problem, actions, values.copy())
         count = min(self.checks, values.shape[1])
         local = max(count - PROPOSALS, 0)
         promising = self._promising(values, count - local)
@@ -206,6 +207,25 @@ class ViaQPolicy(BasePolicy):
         if local and len(some):
             best[some] = self._improved(problem.take(some), checked[some], worth[some], local)
         return best
+
+    def _best_within_reach(self, problem: Problem, actions: Numbers, values: Numbers) -> Numbers:
+        """Return the best actions of B problems, shape (B, m).
+
+        Movements from rest are looked at once more, as they will be executed: where kinematics says that one leaves
+        reach or joint ranges, or that the arm touches itself, the best of the others is taken.
+        """
+        best = values.argmax(axis=1)
+        rows = np.arange(0 if self.replanning else len(best))
+        for _ in range(VERIFIED if rows.size else 0):
+            alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
+            moves = moves_of(self.task, alone, actions[rows, best[rows]][:, None], exact=True)
+            pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
+            rows = rows[~(pairs.inside & (pairs.self_clearance > 0.0)).numpy()[:, 0]]
+            if not rows.size:
+                break
+            values[rows, best[rows]] = -np.inf
+            best[rows] = values[rows].argmax(axis=1)
+        return np.asarray(actions[np.arange(len(best)), best])
 
     def _improved(self, problem: Problem, checked: Numbers, worth: Numbers, count: int) -> Numbers:
         """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m)."""

@@ -35,7 +35,7 @@ OUTSIDE = -2.0
 """Clearance of movements that leave the reach or the joint ranges, [m]."""
 TABLES: dict[int, list[tuple[float, ...]]] = {
     0: [()],
-    1: [(float(t),) for t in np.linspace(0.1, 0.9, 41)],
+    1: [(float(t),) for t in np.linspace(0.1, 0.9, 161)],
     2: [
         (float(a), float(b))
         for a, b in itertools.product(np.linspace(0.1, 0.7, 16), np.linspace(0.3, 0.9, 16))
@@ -44,6 +44,8 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
     3: list(itertools.combinations([float(t) for t in np.linspace(0.1, 0.9, 13)], 3)),
 }
 """Passage times in unit time by the number of via-points; more via-points are passed at even times."""
+STRIDE = 4
+"""With one via-point, the cost is computed for every fourth passage time, then for those beside the best of them."""
 
 
 class MovementTable(NamedTuple):
@@ -127,14 +129,27 @@ def best_times(table: MovementTable, offsets: Float, gram: Float) -> tuple[int, 
                 total += offsets[i, d] * offsets[j, d]
             gram[i, j] = total if i == j else 2.0 * total
     least, found = 1e300, 0
-    for m in range(len(table.cost)):
-        cost = 0.0
-        for i in range(columns):
-            for j in range(i + 1):
-                cost += table.cost[m, i, j] * gram[i, j]
+    stride = STRIDE if columns == 4 and len(table.cost) > STRIDE else 1
+    for m in range(0, len(table.cost), stride):
+        cost = _cost(table, m, gram)
+        if cost < least:
+            least, found = cost, m
+    coarse = found
+    for m in range(max(coarse - stride + 1, 0), min(coarse + stride, len(table.cost))):
+        cost = _cost(table, m, gram)
         if cost < least:
             least, found = cost, m
     return found, least
+
+
+@kernel
+def _cost(table: MovementTable, times: int, gram: Float) -> float:
+    """Return the jerk cost of a movement in unit time from the scalar products of its offsets."""
+    cost = 0.0
+    for i in range(len(gram)):
+        for j in range(i + 1):
+            cost += table.cost[times, i, j] * gram[i, j]
+    return cost
 
 
 @kernel

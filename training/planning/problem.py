@@ -33,6 +33,8 @@ Numbers = NDArray[np.floating[Any]]
 NEAR = 0.05
 """Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
 
+ELBOW_ROOM = 0.04
+"""Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]."""
 PROLONGED = 1.5
 """Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints."""
 
@@ -204,14 +206,20 @@ def worth_of(task: Task, problem: Problem, moves: Moves) -> Float:
     return np.asarray(worth)
 
 
-def setting_of(task: Task, obstacles: Obstacles) -> Setting:
-    """Return arm and space for compiled functions; without spheres that no obstacle can come near."""
+def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Setting:
+    """Return arm and space for compiled functions; without spheres that no obstacle can come near.
+
+    With `exact`, movements of the hand keep ELBOW_ROOM from the joint ranges, which the executed movement needs.
+    """
     arm = task.arm
+    ranges = arm.joint_range
+    if exact and task.space.of_hand:
+        ranges = ranges + ELBOW_ROOM * np.array([1.0, -1.0])
     spheres, alone = arm.spheres, False
     if task.space.of_hand:
         spheres = _within_height(spheres, arm.chain.origin[:, 2], obstacles)
         alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
-    return Setting(arm.chain, spheres, arm.joint_range, task.space.of_hand, alone)
+    return Setting(arm.chain, spheres, ranges, task.space.of_hand, alone)
 
 
 def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Spheres:

@@ -12,7 +12,7 @@ from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
@@ -166,27 +166,16 @@ class GeometrySearch:
         return np.insert(sobol_actions(self.per_round + 1, size - 1)[1:], at, 0.0, axis=1)
 
 
-def best_of(
-    task: Task, problem: Problem, actions: Numbers, merit: Numbers, *, among_obstacles: bool = True
-) -> Numbers:
+def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> Numbers:
     """Return the best of actions of shape (B, H, m), shape (B, m), by their merits, shape (B, H).
 
     Merits are of movements that differ a little from the executed ones. So a movement from rest is checked once more,
     as it will be executed; if it is not clear, the best of the others is taken, several times if need be.
-
-    Args:
-        task: Task.
-        problem: B problems.
-        actions: Actions.
-        merit: Merits, as :func:`merits` returns them or, without obstacles, of any kind.
-        among_obstacles: False to check only what kinematics says: reach, joint ranges, contact of the arm with itself.
     """
     best = merit.argmax(axis=1)
     if problem.remaining is None:
         barred = np.zeros(merit.shape, bool)
         least = 0.5 * CLEARANCE_MARGIN
-        if not among_obstacles:
-            problem = problem._replace(obstacles=no_obstacles(len(best)))
         rows = np.flatnonzero(merit.max(axis=1) > 0.5 * INFEASIBLE)
         for _ in range(VERIFIED if rows.size else 0):
             some, chosen = problem.take(rows), actions[rows, best[rows]][:, None]
@@ -194,10 +183,7 @@ def best_of(
             if not rows.size:
                 break
             barred[rows, best[rows]] = True
-            if among_obstacles:  # merits are lower bounds for all but the best
-                again = merits(task, problem.take(rows), actions[rows], barred[rows])
-            else:
-                again = np.where(barred[rows], 2.0 * INFEASIBLE, merit[rows])
+            again = merits(task, problem.take(rows), actions[rows], barred[rows])
             best[rows] = again.argmax(axis=1)
     return np.asarray(actions[np.arange(len(best)), best])
 
@@ -236,7 +222,7 @@ def plan_clearances(
         exact: True for movements as they are executed, at many instants; they take longer.
     """
     moves = moves_of(task, problem, actions, exact=exact)
-    setting = setting_of(task, problem.obstacles)
+    setting = setting_of(task, problem.obstacles, exact=exact)
     return np.asarray(_clearances(setting, moves.table, problem.start, moves, problem.obstacles, most, least))
 
 
