@@ -19,7 +19,7 @@ from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import SETS, shipped_set
 
-BASELINES = ("straight", "sobol512", "search512")
+BASELINES = ("untrained", "straight", "sobol512", "search512")
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
 

@@ -53,6 +53,8 @@ def opened(browser):
         (session,) = wait_for(lambda: set(page.sessions) - before)
         wait_for(lambda: session.idle and session.proposal is not None)
         wait_for(lambda: "plan" in tabs[-1].text(MESSAGE))
+        # The library's notice on software rendering would hide a part of the scene.
+        tabs[-1].run("document.querySelector('.mantine-Notification-closeButton')?.click()")
         wait_for(lambda: steady(tabs[-1]))
         return tabs[-1], session
 

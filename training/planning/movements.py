@@ -45,7 +45,7 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
 }
 """Passage times in unit time by the number of via-points; more via-points are passed at even times."""
 STRIDE = 4
-"""With one via-point, the cost is computed for every fourth passage time, then for those beside the best of them."""
+"""Step between the passage times whose cost is computed first, with one via-point; those beside the best follow."""
 
 
 class MovementTable(NamedTuple):
