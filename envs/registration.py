@@ -12,24 +12,15 @@ STEPWISE: dict[str, Any] = {"decide_at": "steps", "reward_weights": {"progress":
 """Keyword arguments that turn a task of whole movements into one of control steps."""
 PANDA_OBSTACLES: dict[str, Any] = {"arm": "panda", "n_obstacles": (1, 16)}
 
-TASKS: dict[str, dict[str, Any]] = {
-    "viapoint/PlanarReach-v0": {"n_obstacles": 0},
-    "viapoint/PlanarObstacles-v0": {},
-    "viapoint/PlanarWholeArm-v0": {"whole_arm": True},
-    "viapoint/PandaReach-v0": {"arm": "panda", "n_obstacles": 0},
-    "viapoint/PandaObstacles-v0": PANDA_OBSTACLES,
-    "viapoint/Reach-v0": {"arm": "panda", "n_obstacles": 0},
-    "viapoint/Obstacles-v0": PANDA_OBSTACLES,
-    "viapoint/PlanarObstaclesStep-v0": STEPWISE,
-    "viapoint/PlanarWholeArmStep-v0": {"whole_arm": True, **STEPWISE},
-    "viapoint/PandaObstaclesStep-v0": {**PANDA_OBSTACLES, **STEPWISE},
-    "viapoint/PlanarTargetJump-v0": {"n_obstacles": 0, "n_jumps": (1, 2), "decide_at": EVENTS},
-    "viapoint/PlanarMovingObstacles-v0": {
-        "n_obstacles": (1, 4),
-        "moving_obstacles": True,
-        "decide_at": EVENTS,
-    },
-    "viapoint/PandaMovingObstacles-v0": {
+NAMED: dict[str, dict[str, Any]] = {
+    "PlanarReach": {"n_obstacles": 0},
+    "PlanarObstacles": {},
+    "PlanarWholeArm": {"whole_arm": True},
+    "PandaReach": {"arm": "panda", "n_obstacles": 0},
+    "PandaObstacles": PANDA_OBSTACLES,
+    "PlanarTargetJump": {"n_obstacles": 0, "n_jumps": (1, 2), "decide_at": EVENTS},
+    "PlanarMovingObstacles": {"n_obstacles": (1, 4), "moving_obstacles": True, "decide_at": EVENTS},
+    "PandaMovingObstacles": {
         "arm": "panda",
         "n_obstacles": (1, 4),
         "families": "clutter",
@@ -38,7 +29,14 @@ TASKS: dict[str, dict[str, Any]] = {
         "horizon": 0.5,
     },
 }
-"""Ids and the keyword arguments in which they differ from the defaults; `Reach` and `Obstacles` are for other arms."""
+"""Names of tasks and the keyword arguments in which they differ from the defaults."""
+TASKS: dict[str, dict[str, Any]] = {
+    **{f"viapoint/{name}-v0": kwargs for name, kwargs in NAMED.items()},
+    **{f"viapoint/{name}Step-v0": {**kwargs, **STEPWISE} for name, kwargs in NAMED.items()},
+    "viapoint/Reach-v0": {"arm": "panda", "n_obstacles": 0},
+    "viapoint/Obstacles-v0": PANDA_OBSTACLES,
+}
+"""Keyword arguments by id; `Reach` and `Obstacles` are for other arms."""
 
 ENV_IDS = tuple(TASKS)
 """All ids."""

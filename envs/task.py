@@ -225,7 +225,8 @@ class Task:
         if self.whole_movement:
             return 1e9
         movement = self.duration_range[1] if self.space_name == "hand" else JOINT_MOVEMENT
-        return (1 if self.stepwise else 2 + self.n_jumps[1]) * movement + SETTLING
+        changes = self.replanning or self.moving_obstacles or self.n_jumps[1] > 0
+        return (2 + self.n_jumps[1] if changes else 1) * movement + SETTLING
 
     @functools.cached_property
     def observation(self) -> ObservationLayout:
