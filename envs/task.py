@@ -219,6 +219,14 @@ class Task:
         """Names of the components of an action."""
         return self.steering.names if self.stepwise else self.action.names
 
+    def of_movements(self) -> Task:
+        """Return the same task with decisions on movements in place of control steps."""
+        if not self.stepwise:
+            return self
+        changes = self.moving_obstacles or self.n_jumps[1] > 0
+        weights = dataclasses.replace(self.weights, progress=0.0)
+        return dataclasses.replace(self, decide_at=TRIGGERS if changes else END, weights=weights)
+
     @property
     def time_limit(self) -> float:
         """Time limit of an episode, [s]; very long where an episode is one movement."""

@@ -51,9 +51,7 @@ class Setting:
 
     def __init__(self, task: Task, agent: Any = None) -> None:
         self.agent, self.stepwise = agent, task if task.stepwise else None
-        if task.stepwise:
-            weights = dataclasses.replace(task.weights, progress=0.0)
-            task = dataclasses.replace(task, decide_at="end", weights=weights)
+        task = task.of_movements()
         if task.replanning:
             task = dataclasses.replace(task, horizon=min(task.horizon, DECISION_INTERVAL))
         self.task = task

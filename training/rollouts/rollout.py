@@ -13,7 +13,6 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.task import END
 from viapoint.training.planning.search import registered_task
 
 if TYPE_CHECKING:
@@ -176,8 +175,8 @@ def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     task = registered_task(env_id, **kwargs)
     if not task.stepwise:
         return dict(kwargs)
-    weights = {**vars(task.weights), "progress": 0.0}
-    return {**kwargs, "decide_at": END, "reward_weights": weights}
+    twin = task.of_movements()
+    return {**kwargs, "decide_at": twin.decide_at, "reward_weights": {**vars(twin.weights)}}
 
 
 class StepAgentMethod:
