@@ -67,6 +67,17 @@ def test_the_whole_movement_of_a_step_wise_task_has_no_reward_for_progress():
     assert whole_task(MOVING, {"n_via": 2}) == {"n_via": 2}
 
 
+def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode():
+    step = "viapoint/PlanarMovingObstaclesStep-v0"
+    twin = SceneSimulation(step, 2, **whole_task(step, {}))
+    assert twin.task.replanning
+    scenes = twin.draw(2, seed=0)
+    method = StepAgentMethod("forwards", Forwards(), step, {})
+    decided = method.decide(twin.observe(scenes), scenes)
+    assert decided.shape == (2, 2)
+    assert method.execute(scenes, decided).success.shape == (2,)
+
+
 def test_what_a_method_carries_out_is_what_the_single_environment_does():
     method = StepAgentMethod("forwards", Forwards(), STEP, {})
     simulation = SceneSimulation(STEP, 6)

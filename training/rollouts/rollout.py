@@ -192,7 +192,7 @@ class StepAgentMethod:
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
-        if "time_left" not in observation:
+        if "time_left" not in observation or "remaining" in observation:  # that of the twin
             observation = self._simulation.observe(scenes)
         actions, _ = self._model.predict(observation, deterministic=True)
         return np.asarray(actions, dtype=np.float64)
