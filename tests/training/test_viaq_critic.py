@@ -22,7 +22,7 @@ from viapoint.training.agents.viaq_critic import Values, _Saturated
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE
+from viapoint.training.planning.search import INFEASIBLE, plan_clearances
 from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
 
 PLANE, WHOLE, SPACE, MOVING = (
@@ -275,3 +275,15 @@ def test_candidates_are_different_allowed_and_begin_with_the_straight_movement(e
     relative = np.exp(best_duration(task) * task.action.log_half_range)
     slope = 5.0 * task.weights.smoothness / (relative**6 + relative)
     assert slope == pytest.approx(task.weights.duration, rel=0.05)
+
+
+def test_the_nearest_pairs_are_those_of_the_closest_approach_between_the_instants():
+    task, problem, _, _ = movements(PLANE, 60, shapes=("box",))
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 32, task.action.size))
+    pairs = pairs_of(task, problem, moves_of(task, problem, actions), np.arange(0, INSTANTS, 3))
+    radius = pairs.features[..., 6]
+    nearest = torch.where(pairs.present, pairs.distance - radius, 1.0).amin(dim=-1).numpy()
+    clearance = plan_clearances(task, problem, actions, 0.02, -0.05, exact=True)
+    near = (np.abs(clearance) < 0.01) & pairs.inside.numpy()
+    assert near.sum() > 100
+    assert np.quantile(np.abs(nearest - clearance)[near], 0.95) < 1e-3

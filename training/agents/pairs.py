@@ -275,7 +275,7 @@ def _gather(
     for b in range(number):
         for h in range(plans):
             gap[:] = NOWHERE
-            last = 0  # instant that counts
+            last = 0  # last instant that counts
             for k in range(len(instants)):
                 instant = instants[k]
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
